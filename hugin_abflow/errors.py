@@ -1,0 +1,105 @@
+"""Everything that can go wrong, one class per cause, each with its own exit code.
+
+The library raises these; only the command line prints them and exits. A message names the file,
+says what is wrong and what to do about it.
+"""
+
+from __future__ import annotations
+
+from enum import IntEnum
+
+
+class ExitCode(IntEnum):
+    """Exit codes of ``hugin-abflow``; documented in README and tested."""
+
+    OK = 0
+    FAILED = 1  # an error without a code of its own
+    USAGE = 2  # the command line itself is wrong (click's own code)
+    PROJECT = 3  # the .pto file cannot be read or makes no panorama
+    LAYERS_MISSING = 4  # layers or photos are not there
+    LAYERS_MISMATCH = 5  # layers do not belong together
+    IMAGE_READ = 6  # an image cannot be decoded
+    OUTPUT = 7  # the panorama cannot be written
+    NONA = 8  # nona is missing or failed
+    DEVICE = 9  # no usable OpenCL device
+    PARTIAL = 10  # several projects: some succeeded, some failed
+    INTERRUPTED = 130  # Ctrl-C
+
+
+class AbflowError(Exception):
+    """Base of all errors that hugin-abflow raises on purpose."""
+
+    exit_code: ExitCode = ExitCode.FAILED
+
+
+class ProjectError(AbflowError):
+    """The project is well-formed but makes no panorama (no active image, an empty crop ...)."""
+
+    exit_code = ExitCode.PROJECT
+
+
+class PtoError(ProjectError):
+    """A .pto file breaks the grammar.
+
+    Attributes: ``file`` (name or ``<bytes>``), ``line`` (from 1; 0 for the file as a whole),
+    ``token`` (the offending text) and ``expected``.
+    """
+
+    def __init__(self, file: str, line: int, token: str, expected: str) -> None:
+        self.file, self.line, self.token, self.expected = file, line, token, expected
+        where = f"{file}, line {line}" if line else file
+        super().__init__(f"{where}: found {token!r}, expected {expected}")
+
+
+class LayersMissingError(AbflowError):
+    """Layers are not there and cannot be made."""
+
+    exit_code = ExitCode.LAYERS_MISSING
+
+
+class PhotoMissingError(AbflowError):
+    """A photo that nona would need is not there."""
+
+    exit_code = ExitCode.LAYERS_MISSING
+
+
+class LayersMismatchError(AbflowError):
+    """Layers differ in canvas size, depth or channel count."""
+
+    exit_code = ExitCode.LAYERS_MISMATCH
+
+
+class ImageReadError(AbflowError):
+    """A layer cannot be opened or decoded."""
+
+    exit_code = ExitCode.IMAGE_READ
+
+
+class OutputError(AbflowError):
+    """The panorama cannot be written."""
+
+    exit_code = ExitCode.OUTPUT
+
+
+class NonaMissingError(AbflowError):
+    """nona is not installed or not in PATH."""
+
+    exit_code = ExitCode.NONA
+
+
+class NonaFailedError(AbflowError):
+    """nona ran and failed."""
+
+    exit_code = ExitCode.NONA
+
+
+class DeviceError(AbflowError):
+    """No OpenCL device, none that fits ``--device``, or the device failed."""
+
+    exit_code = ExitCode.DEVICE
+
+
+class SettingsError(AbflowError):
+    """A setting is out of its range."""
+
+    exit_code = ExitCode.USAGE

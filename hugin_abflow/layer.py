@@ -1,0 +1,103 @@
+"""The nouns every step shares: box, canvas, layer.
+
+Frame: canvas pixels, x to the right, y down, origin at the canvas's upper left corner; pixel (x, y)
+covers [x, x+1) x [y, y+1), so its centre is at (x + 0.5, y + 0.5).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+# Rows `top` to `bottom` (exclusive) of a layer: (bottom - top, width, channels + 1), alpha last.
+RowReader = Callable[[int, int], npt.NDArray[Any]]
+
+
+@dataclass(frozen=True)
+class Box:
+    """A rectangle of canvas pixels; right and bottom are exclusive."""
+
+    left: int
+    top: int
+    right: int
+    bottom: int
+
+    @property
+    def width(self) -> int:
+        """Columns."""
+        return self.right - self.left
+
+    @property
+    def height(self) -> int:
+        """Rows."""
+        return self.bottom - self.top
+
+    def intersect(self, other: Box) -> Box:
+        """The common part; its width or height is 0 where there is none."""
+        left, top = max(self.left, other.left), max(self.top, other.top)
+        return Box(left, top, max(left, min(self.right, other.right)), max(top, min(self.bottom, other.bottom)))
+
+
+@dataclass(frozen=True)
+class Canvas:
+    """The panorama's pixel grid (p-line).
+
+    crop        the part that is output (p-line S).
+    wraps       the left and right borders are one (hfov 360 on a projection that wraps).
+    spherical   equirectangular: rows are latitudes, columns longitudes; flow and distances are
+                calculated on the sphere. Other projections are planes.
+    hfov        horizontal field of view in degrees (scale of the sphere: width / hfov px per degree).
+    """
+
+    width: int
+    height: int
+    crop: Box
+    wraps: bool = False
+    spherical: bool = False
+    hfov: float = 0.0
+
+    @classmethod
+    def plane(cls, width: int, height: int, wraps: bool = False) -> Canvas:
+        """A flat canvas without crop."""
+        return cls(width, height, Box(0, 0, width, height), wraps)
+
+    @classmethod
+    def sphere(cls, width: int, height: int, hfov: float = 360.0) -> Canvas:
+        """An equirectangular canvas without crop; it wraps if `hfov` is 360 degrees."""
+        return cls(width, height, Box(0, 0, width, height), hfov == 360.0, True, hfov)
+
+
+@dataclass(frozen=True)
+class Layer:
+    """One remapped photo: pixels, validity mask and place on the canvas.
+
+    box         where the layer lies on the canvas; its size is the stored image's.
+    dtype       uint8, uint16, float16 or float32.
+    channels    1 (grey) or 3 (RGB); rows have one more, alpha.
+    read        ``read(top, bottom)`` gives rows of the layer (its own row 0 is box.top) as an array
+                (bottom - top, box.width, channels + 1) of `dtype`, C-contiguous. Alpha is unassociated;
+                a pixel is valid where alpha is at least half of full scale (1.0 for floats). The
+                reader is safe to call again and in any order; ascending order is fast.
+    icc         the ICC profile, if any.
+    """
+
+    name: str
+    box: Box
+    dtype: np.dtype[Any]
+    channels: int
+    read: RowReader = field(repr=False)
+    icc: bytes | None = field(default=None, repr=False)
+
+    @classmethod
+    def from_array(
+        cls, name: str, pixels: npt.NDArray[Any], left: int = 0, top: int = 0, icc: bytes | None = None
+    ) -> Layer:
+        """A layer from pixels in memory: (height, width, 2 or 4), alpha last."""
+        height, width, samples = pixels.shape
+        stored = np.ascontiguousarray(pixels)
+        box = Box(left, top, left + width, top + height)
+        return cls(name, box, stored.dtype, samples - 1, lambda first, last: stored[first:last], icc)

@@ -1,0 +1,54 @@
+"""The engine's settings: each with its default, unit and range."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+from hugin_abflow.errors import SettingsError
+
+MergeMode = Literal["joint", "sequential"]
+Interpolation = Literal["bicubic", "nearest"]
+
+
+@dataclass(frozen=True)
+class Settings:
+    """Frozen set of engine settings. Raises `SettingsError` for a value out of range.
+
+    merge               "joint": all layers at once; "sequential": the paper's iteration, two at a time.
+    softmax_sharpness   kSoftmaxSharpness of the paper (Code 1); 0..1000, no unit.
+    flow_magnitude      kFlowMagCoef of the paper (Code 1); 0..10000, no unit.
+    exposure            match exposure and colour of the layers, and blend low frequencies over the overlap.
+    interpolation       how layers are sampled; "nearest" is for comparison with the paper's own code.
+    working_pixels      upper bound of the pixels of the working canvas (flow, coefficients, colour).
+    border_feather      width of the ramp that brings a layer's weight to 0 at its own border, in working
+                        pixels; 0: none, as published.
+    band_rows           rows of a full-resolution band; 0: chosen from the canvas width.
+    device              index in ``--list-devices`` or part of a device's name; None: the fastest GPU, else CPU.
+    """
+
+    merge: MergeMode = "joint"
+    softmax_sharpness: float = 10.0
+    flow_magnitude: float = 100.0
+    exposure: bool = True
+    interpolation: Interpolation = "bicubic"
+    working_pixels: int = 2_100_000
+    border_feather: float = 6.0
+    band_rows: int = 0
+    device: str | None = None
+
+    def __post_init__(self) -> None:
+        for name, low, high in (
+            ("softmax_sharpness", 0, 1000),
+            ("flow_magnitude", 0, 10_000),
+            ("working_pixels", 1024, 1 << 28),
+            ("border_feather", 0, 1000),
+            ("band_rows", 0, 1 << 20),
+        ):
+            value = getattr(self, name)
+            if not low <= value <= high:
+                raise SettingsError(f"{name} is {value}; choose a value from {low} to {high}")
+        if self.merge not in ("joint", "sequential"):
+            raise SettingsError(f"merge is {self.merge!r}; choose 'joint' or 'sequential'")
+        if self.interpolation not in ("bicubic", "nearest"):
+            raise SettingsError(f"interpolation is {self.interpolation!r}; choose 'bicubic' or 'nearest'")
