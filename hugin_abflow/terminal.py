@@ -1,0 +1,147 @@
+"""The terminal: messages, results, progress bars, and the signals that end a run.
+
+Only results go to stdout; messages and progress go to stderr.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import signal
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import AbstractContextManager, contextmanager, suppress
+from functools import partial
+from pathlib import Path
+from types import FrameType
+
+import click
+
+from hugin_abflow.progress import Advance, Progress, silent
+
+PROGRAM = "hugin-abflow"
+
+_log = logging.getLogger("hugin_abflow.terminal")
+
+
+def say(text: str) -> None:
+    """Print to stderr; if nobody reads that any more, the panorama is still worth finishing."""
+    with suppress(OSError):
+        click.echo(text, err=True)
+
+
+def complain(text: str) -> None:
+    """Print an error to stderr."""
+    say(f"{PROGRAM}: error: {text}")
+
+
+def print_path(path: Path) -> None:
+    """Print a result to stdout, in the bytes of the file's name whatever the locale."""
+    try:
+        click.echo(os.fspath(path) if os.name == "nt" else os.fsencode(path))
+    except BrokenPipeError:
+        # Nobody reads stdout any more (`| head -1`): go on, and keep Python's own flush at exit quiet.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+
+
+class _MessageHandler(logging.Handler):
+    def emit(self, record: logging.LogRecord) -> None:
+        label = f"{PROGRAM}: {record.levelname.lower()}: " if record.levelno >= logging.WARNING else ""
+        say(label + record.getMessage())
+
+
+@contextmanager
+def messages(level: int) -> Iterator[None]:
+    """Print the package's log messages from `level` upwards to stderr."""
+    logger = logging.getLogger("hugin_abflow")
+    handler = _MessageHandler()
+    before = logger.level
+    logger.addHandler(handler)
+    logger.setLevel(level)
+    try:
+        yield
+    finally:
+        logger.removeHandler(handler)
+        logger.setLevel(before)
+
+
+def display_progress(heading: str, quiet: bool, verbose: bool) -> AbstractContextManager[Progress]:
+    """How phases are shown: bars on a terminal, lines with -v elsewhere, else not at all."""
+    on_terminal = sys.stderr is not None and sys.stderr.isatty() and os.environ.get("TERM") != "dumb"
+    if quiet:
+        return _as_given(silent)
+    if on_terminal:
+        return _bars(heading)
+    return _as_given(partial(_lines, heading) if verbose else silent)
+
+
+@contextmanager
+def _as_given(progress: Progress) -> Iterator[Progress]:
+    yield progress
+
+
+@contextmanager
+def _lines(heading: str, phase: str, total: int) -> Iterator[Advance]:
+    """A phase as two lines of the log."""
+    started = time.monotonic()
+    _log.info("%s%s ...", heading, phase)
+    yield lambda units: None
+    _log.info("%s%s: %.2f s", heading, phase, time.monotonic() - started)
+
+
+@contextmanager
+def _bars(heading: str) -> Iterator[Progress]:
+    """A bar for each phase on the terminal; they go when the project is done."""
+    from rich import progress as rich_progress  # takes a while to load, and is needed here only
+    from rich.console import Console
+
+    columns = (
+        rich_progress.TextColumn("{task.description}", markup=False),
+        rich_progress.BarColumn(),
+        rich_progress.TaskProgressColumn(),
+        rich_progress.TimeElapsedColumn(),
+    )
+    # stdout is for results: it must not be led through the display, which writes to stderr.
+    with rich_progress.Progress(
+        *columns, console=Console(stderr=True), transient=True, redirect_stdout=False
+    ) as display:
+
+        @contextmanager
+        def phase_bar(phase: str, total: int) -> Iterator[Advance]:
+            task = display.add_task(heading + phase, total=total)
+            yield lambda units: display.advance(task, units)
+            display.update(task, completed=total)
+            display.stop_task(task)
+
+        yield phase_bar
+
+
+@contextmanager
+def interruptible() -> Iterator[None]:
+    """Let SIGTERM and SIGHUP unwind the program as Ctrl-C does, so that temporary files go."""
+    if threading.current_thread() is not threading.main_thread():
+        yield  # only the main thread may set handlers
+        return
+    last = -float("inf")
+
+    def interrupt(number: int, frame: FrameType | None) -> None:
+        nonlocal last
+        if time.monotonic() - last < 2.0:
+            return  # an impatient second Ctrl-C would break off the tidying up
+        last = time.monotonic()
+        raise KeyboardInterrupt
+
+    names = ("SIGINT", "SIGTERM", "SIGHUP")  # Windows has no SIGHUP
+    numbers = [getattr(signal, name) for name in names if hasattr(signal, name)]
+    # What is ignored stays ignored: that is how nohup works.
+    before = {number: signal.getsignal(number) for number in numbers}
+    changed = [number for number in numbers if before[number] is not signal.SIG_IGN]
+    for number in changed:
+        signal.signal(number, interrupt)
+    try:
+        yield
+    finally:
+        for number in changed:
+            signal.signal(number, before[number])
