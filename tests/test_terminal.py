@@ -1,0 +1,222 @@
+"""Messages, progress, signals and pipes, through the command line. `merge_project` is replaced."""
+
+from __future__ import annotations
+
+import logging
+import os
+import re
+import signal
+import subprocess
+import sys
+import textwrap
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from hugin_abflow import cli
+from hugin_abflow.errors import ExitCode
+
+Replace = Callable[[Callable[..., Path]], None]
+
+
+@pytest.fixture
+def replace(monkeypatch: pytest.MonkeyPatch) -> Replace:
+    """Put a function in the place of `merge_project`."""
+    return lambda function: monkeypatch.setattr(cli, "merge_project", function)
+
+
+# Messages and progress
+
+
+def working(path: Path, **keywords: Any) -> Path:
+    """A `merge_project` that logs and reports phases."""
+    log = logging.getLogger("hugin_abflow.merge")
+    log.info("device [red]PoCL[/red]")
+    log.warning("layers are older than the project")
+    for phase in ("Flow", "Blend"):
+        with keywords["progress"](phase, 4) as advance:
+            advance(1)
+            advance(3)
+    return path.with_suffix(".tif")
+
+
+def test_warnings_are_shown_and_info_is_not(replace: Replace, capsys: pytest.CaptureFixture[str]) -> None:
+    replace(working)
+    for arguments in (["a.pto"], ["-q", "a.pto"]):
+        assert cli.main(arguments) == 0
+        assert capsys.readouterr().err == "hugin-abflow: warning: layers are older than the project\n"
+
+
+def test_verbose_shows_info_and_phases(replace: Replace, capsys: pytest.CaptureFixture[str]) -> None:
+    replace(working)
+    assert cli.main(["-v", "a.pto"]) == 0
+    output = capsys.readouterr()
+    lines = [re.sub(r"\d+\.\d+", "0.0", line) for line in output.err.splitlines()]
+    assert lines == [
+        "device [red]PoCL[/red]",
+        "hugin-abflow: warning: layers are older than the project",
+        *("Flow ...", "Flow: 0.0 s", "Blend ...", "Blend: 0.0 s"),
+    ]
+    assert output.out == "a.tif\n"
+
+
+def test_messages_are_not_doubled_by_a_second_run(
+    replace: Replace, capsys: pytest.CaptureFixture[str]
+) -> None:
+    replace(working)
+    cli.main(["a.pto"])
+    capsys.readouterr()
+    cli.main(["a.pto"])
+    assert capsys.readouterr().err.count("older") == 1
+    assert logging.getLogger("hugin_abflow").handlers == []
+
+
+def test_phases_of_several_projects_name_them(replace: Replace, capsys: pytest.CaptureFixture[str]) -> None:
+    replace(working)
+    assert cli.main(["-v", "a.pto", "b.pto"]) == 0
+    assert "a.pto: Flow ..." in (text := capsys.readouterr().err) and "b.pto: Blend ..." in text
+
+
+# A process of its own, with the function `merge` as its merge_project.
+CHILD = """
+import os, signal, sys, time
+from pathlib import Path
+from hugin_abflow import cli
+{merge}
+cli.merge_project = merge
+sys.exit(cli.main(sys.argv[1:]))
+"""
+
+
+def child(merge: str, *arguments: str | bytes) -> list[str | bytes]:
+    return [sys.executable, "-c", CHILD.format(merge=textwrap.dedent(merge)), *arguments]
+
+
+PHASES = """
+def merge(path, progress, **keywords):
+    for phase in ("Flow", "Blend"):
+        with progress(phase, 3) as advance:
+            for step in range(3):
+                time.sleep(0.06)
+                advance(1)
+    return path.with_suffix(".tif")
+"""
+
+
+@pytest.mark.skipif(os.name == "nt", reason="Windows has no pseudo-terminals")
+@pytest.mark.parametrize(
+    ("term", "quiet", "bars"), [("xterm", [], True), ("xterm", ["-q"], False), ("dumb", [], False)]
+)
+def test_bars_on_a_terminal_only_and_on_stderr(term: str, quiet: list[str], bars: bool) -> None:
+    import pty
+
+    ours, theirs = pty.openpty()
+    environment = os.environ | {"TERM": term}
+    process = subprocess.Popen(
+        child(PHASES, "a.pto", *quiet), stdout=subprocess.PIPE, stderr=theirs, env=environment
+    )
+    os.close(theirs)
+    shown = b""
+    try:
+        while part := os.read(ours, 4096):
+            shown += part
+    except OSError:  # the other end is closed
+        pass
+    out, _ = process.communicate(timeout=30)
+    os.close(ours)
+    assert process.returncode == 0
+    assert out == (b"" if quiet else b"a.tif\n")
+    assert (b"Flow" in shown and b"100%" in shown and b"Blend" in shown) if bars else shown == b""
+
+
+# Interruptions and broken pipes
+
+
+@pytest.mark.skipif(os.name == "nt", reason="Windows has no such signals")
+@pytest.mark.parametrize("name", ["SIGINT", "SIGTERM", "SIGHUP"])
+def test_signal_unwinds_and_ends_with_130(
+    replace: Replace, capsys: pytest.CaptureFixture[str], name: str
+) -> None:
+    number = getattr(signal, name)
+    before = signal.getsignal(number)
+    unwound, merged = [], []
+
+    def merge(path: Path, **keywords: Any) -> Path:
+        merged.append(path)
+        try:
+            os.kill(os.getpid(), number)
+            signal.pause()
+        finally:
+            os.kill(os.getpid(), number)  # an impatient user: the tidying up goes on
+            unwound.append(True)
+        return path
+
+    replace(merge)
+    assert cli.main(["a.pto", "b.pto"]) == ExitCode.INTERRUPTED
+    output = capsys.readouterr()
+    assert output.err.strip() == "hugin-abflow: interrupted" and output.out == ""
+    assert len(merged) == 1 and unwound == [True]
+    assert signal.getsignal(number) is before
+
+
+@pytest.mark.skipif(os.name == "nt", reason="Windows has no SIGHUP")
+def test_nohup_is_obeyed() -> None:
+    merge = """
+    signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    def merge(path, **keywords):
+        os.kill(os.getpid(), signal.SIGHUP)
+        return path.with_suffix(".tif")
+    """
+    done = subprocess.run(child(merge, "a.pto"), capture_output=True, timeout=30)
+    assert (done.returncode, done.stdout, done.stderr) == (0, b"a.tif\n", b"")
+
+
+SUCCESS = """
+def merge(path, **keywords):
+    return path.with_suffix(".tif")
+"""
+
+
+@pytest.mark.skipif(os.name == "nt", reason="pipes break differently on Windows")
+@pytest.mark.parametrize("arguments", [["a.pto", "b.pto"], ["--help"], ["--list-devices"]])
+def test_broken_pipe_is_no_traceback(arguments: list[str]) -> None:
+    read, write = os.pipe()
+    os.close(read)
+    process = subprocess.Popen(child(SUCCESS, *arguments), stdout=write, stderr=subprocess.PIPE)
+    os.close(write)
+    _, messages = process.communicate(timeout=30)
+    assert messages == b""
+    if arguments[0] == "a.pto":
+        assert process.returncode == 0  # the panoramas are there
+
+
+@pytest.mark.skipif(os.name == "nt", reason="names are Unicode on Windows")
+def test_closed_stderr_does_not_lose_the_panorama() -> None:
+    read, write = os.pipe()
+    os.close(read)
+    process = subprocess.Popen(child(PHASES, "-v", "a.pto"), stdout=subprocess.PIPE, stderr=write)
+    os.close(write)
+    out, _ = process.communicate(timeout=30)
+    assert (process.returncode, out) == (0, b"a.tif\n")
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="only Linux has names that are not UTF-8")
+def test_name_that_is_not_utf8_is_printed_in_its_bytes() -> None:
+    done = subprocess.run(child(SUCCESS, b"caf\xe9.pto"), capture_output=True, timeout=30)
+    assert (done.returncode, done.stdout, done.stderr) == (0, b"caf\xe9.tif\n", b"")
+
+
+UNREADABLE = """
+from hugin_abflow.errors import ImageReadError
+def merge(path, **keywords):
+    raise ImageReadError(f"{path}: not a TIFF")
+"""
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="only Linux has names that are not UTF-8")
+def test_error_about_a_name_that_is_not_utf8_can_be_printed() -> None:
+    done = subprocess.run(child(UNREADABLE, b"caf\xe9.pto"), capture_output=True, timeout=30)
+    assert done.returncode == ExitCode.IMAGE_READ
+    assert done.stderr.startswith(b"hugin-abflow: error: caf") and done.stderr.endswith(b".pto: not a TIFF\n")
