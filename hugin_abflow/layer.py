@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -15,6 +16,12 @@ import numpy.typing as npt
 
 # Rows `top` to `bottom` (exclusive) of a layer: (bottom - top, width, channels + 1), alpha last.
 RowReader = Callable[[int, int], npt.NDArray[Any]]
+
+
+def full_scale(dtype: npt.DTypeLike) -> float:
+    """Alpha of an opaque pixel: 255, 65535, or 1.0 for floats."""
+    kind = np.dtype(dtype)
+    return float(np.iinfo(kind).max) if kind.kind == "u" else 1.0
 
 
 @dataclass(frozen=True)
@@ -39,7 +46,9 @@ class Box:
     def intersect(self, other: Box) -> Box:
         """The common part; its width or height is 0 where there is none."""
         left, top = max(self.left, other.left), max(self.top, other.top)
-        return Box(left, top, max(left, min(self.right, other.right)), max(top, min(self.bottom, other.bottom)))
+        return Box(
+            left, top, max(left, min(self.right, other.right)), max(top, min(self.bottom, other.bottom))
+        )
 
 
 @dataclass(frozen=True)
@@ -83,6 +92,8 @@ class Layer:
                 a pixel is valid where alpha is at least half of full scale (1.0 for floats). The
                 reader is safe to call again and in any order; ascending order is fast.
     icc         the ICC profile, if any.
+    canvas_size (width, height) of the canvas that the layer was made for, if its file tells it.
+    file        the file that `read` decodes; None for pixels in memory.
     """
 
     name: str
@@ -91,6 +102,8 @@ class Layer:
     channels: int
     read: RowReader = field(repr=False)
     icc: bytes | None = field(default=None, repr=False)
+    canvas_size: tuple[int, int] | None = None
+    file: Path | None = None
 
     @classmethod
     def from_array(

@@ -1,0 +1,249 @@
+"""Read layers, write panoramas (`ImageWriter`, `write_image`): the only door to OpenImageIO.
+
+Everything outside sees arrays of (rows, width, channels + 1), unassociated alpha last. OpenImageIO
+multiplies colours by alpha unless told on both sides not to.
+"""
+
+from __future__ import annotations
+
+import threading
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import OpenImageIO as oiio  # noqa: N813
+
+from hugin_abflow import tifftags
+from hugin_abflow.errors import ImageReadError
+from hugin_abflow.imagewriter import ENDINGS, ImageWriter, write_image
+from hugin_abflow.layer import Box, Layer, full_scale
+
+__all__ = ["ENDINGS", "ImageWriter", "read_layer", "read_layers", "write_image"]
+
+Pixels = npt.NDArray[Any]
+
+_DTYPES = {"uint8": np.uint8, "uint16": np.uint16, "half": np.float16, "float": np.float32}
+_UNASSOCIATED = "oiio:UnassociatedAlpha"
+_SEPARATED, _PALETTE = 5, 3  # TIFF PhotometricInterpretation
+_MAX_CHUNK = 32 << 20  # a strip above this size (bytes) is not decoded whole to get a few rows of it
+_MAX_KEPT = 32 << 20  # bytes of already decoded rows that a layer keeps for its next read
+
+
+def read_layer(path: Path | str) -> Layer:
+    """The one layer in a file: TIFF (cropped or not, BigTIFF, tiled), EXR, PNG or JPEG.
+
+    8, 16 bit, half or float; grey or RGB, with or without alpha. Pixels are decoded when
+    `Layer.read` is called. Raises `ImageReadError` for what cannot be decoded, for palette, CMYK and
+    1-bit images, and for a file of several layers (see `read_layers`).
+    """
+    layers = read_layers(path)
+    if len(layers) > 1:
+        raise ImageReadError(
+            f"{path} holds {len(layers)} layers where one is expected; give one file a layer"
+        )
+    return layers[0]
+
+
+def read_layers(path: Path | str) -> list[Layer]:
+    """All layers in a file, thumbnails left out: the pages of nona's ``TIFF_multilayer``, else one."""
+    path = Path(path)
+    source = _open(path, 0)
+    is_tiff = source.format_name() == "tiff"
+    places = tifftags.read_places(path) if is_tiff else [None]
+    wanted = [page for page, place in enumerate(places) if place is None or not place.reduced]
+    layers = []
+    for page in wanted:
+        if not source.seek_subimage(page, 0):
+            raise _unreadable(path, source.geterror())
+        name = path.name if len(wanted) == 1 else f"{path.name}[{page}]"
+        layers.append(_describe(path, name, page, source, places[page]))
+    source.close()
+    if not layers:
+        raise ImageReadError(f"{path} holds no full-size image; make the layer again")
+    return layers
+
+
+def _open(path: Path, page: int) -> Any:
+    """An ImageInput that leaves colours as they are stored."""
+    config = oiio.ImageSpec()
+    config[_UNASSOCIATED] = 1
+    source = oiio.ImageInput.open(str(path), config)
+    if source is None:
+        raise _unreadable(path, oiio.geterror())
+    if page and not source.seek_subimage(page, 0):
+        raise _unreadable(path, source.geterror())
+    return source
+
+
+def _unreadable(path: Path, why: str) -> ImageReadError:
+    if not path.exists():
+        return ImageReadError(f"{path} is not there")
+    return ImageReadError(f"{path} cannot be read ({why.strip() or 'unknown format'}); make the layer again")
+
+
+def _describe(path: Path, name: str, page: int, source: Any, place: tifftags.Place | None) -> Layer:
+    """The layer of the page that `source` stands at."""
+    spec = source.spec()
+    _refuse_unusable(path, spec)
+    left, top, canvas = spec.x, spec.y, None
+    if place is not None:
+        left, top, canvas = place.x, place.y, place.canvas
+    elif spec.full_x == 0 and spec.full_y == 0:
+        canvas = spec.full_width, spec.full_height
+    rows = _Rows(path, page, spec)
+    profile = spec.getattribute("ICCProfile")
+    return Layer(
+        name=name,
+        box=Box(left, top, left + spec.width, top + spec.height),
+        dtype=rows.dtype,
+        channels=rows.channels,
+        read=rows.read,
+        icc=None if profile is None else bytes(profile),
+        canvas_size=canvas,
+        file=path,
+    )
+
+
+def _refuse_unusable(path: Path, spec: Any) -> None:
+    """Raise `ImageReadError` for pixels that are no plain grey or RGB."""
+    photometric = spec.get_int_attribute("tiff:PhotometricInterpretation", 1)
+    bits = spec.get_int_attribute("oiio:BitsPerSample", 0)
+    found = None
+    if photometric == _PALETTE:
+        found = "a palette image"
+    elif photometric == _SEPARATED or spec.get_string_attribute("jpeg:ColorSpace").upper() in (
+        "CMYK",
+        "YCCK",
+    ):
+        found = "a CMYK image"
+    elif 0 < bits < 8:
+        found = f"a {bits}-bit image"
+    elif str(spec.format) not in _DTYPES:
+        found = f"of sample type {spec.format}"
+    elif spec.nchannels > 4 and not {"R", "G", "B"} <= set(spec.channelnames):
+        found = f"an image of {spec.nchannels} samples"
+    if found:
+        raise ImageReadError(
+            f"{path} is {found}; layers must be grey or RGB with 8, 16 bit, half or float samples"
+        )
+
+
+class _Rows:
+    """Rows of one stored image, decoded when asked for; the `read` of a `Layer`.
+
+    OpenImageIO decodes from the top again after each step back, and everything in between on a step
+    forward that does not begin at a strip. So whole strips are decoded, and the rows below the last
+    answer are kept for the next.
+    """
+
+    def __init__(self, path: Path, page: int, spec: Any) -> None:
+        self.path, self.page = path, page
+        self.x, self.y, self.width, self.height = spec.x, spec.y, spec.width, spec.height
+        self.samples: int = spec.nchannels
+        self.dtype = np.dtype(_DTYPES[str(spec.format)])
+        self.tiled = spec.tile_width > 0
+        names = list(spec.channelnames)
+        alpha = spec.alpha_channel
+        if alpha < 0 and self.samples in (2, 4):
+            alpha = self.samples - 1  # ExtraSamples "unspecified": what older tools write for alpha
+        colours = [names.index(c) for c in "RGB"] if {"R", "G", "B"} <= set(names) else [0]
+        self.channels = len(colours)
+        self.order = [*colours, alpha] if alpha >= 0 else colours
+        self.has_alpha = alpha >= 0
+        self.associated = spec.alpha_channel >= 0 and not spec.get_int_attribute(_UNASSOCIATED, 0)
+        self.chunk = self._chunk_rows(spec)
+        self._lock = threading.Lock()
+        self._source: Any = None
+        self._kept: Pixels | None = None  # rows that end at self._end
+        self._end = 0
+
+    def _chunk_rows(self, spec: Any) -> int:
+        """Rows that are decoded together; 1 where decoding is strictly sequential."""
+        rows = spec.tile_height if self.tiled else spec.get_int_attribute("oiio:RowsPerChunk", 1)
+        too_large = not self.tiled and rows * spec.scanline_bytes(True) > _MAX_CHUNK
+        return 1 if too_large else max(1, int(rows))
+
+    def read(self, top: int, bottom: int) -> Pixels:
+        """Rows `top` to `bottom`: (bottom - top, width, channels + 1), read-only."""
+        if not 0 <= top <= bottom <= self.height:
+            raise IndexError(f"rows {top}..{bottom} of an image of {self.height} rows")
+        if top == bottom:
+            return np.empty((0, self.width, self.channels + 1), self.dtype)
+        with self._lock:
+            kept_from = self._end - (0 if self._kept is None else len(self._kept))
+            if self._kept is not None and kept_from <= top < bottom <= self._end:
+                return self._kept[top - kept_from : bottom - kept_from]
+            if self._kept is not None and kept_from <= top <= self._end:
+                first, start = top, self._end
+                above = [self._kept[top - kept_from :]]
+            else:
+                first = start = top - top % self.chunk
+                above = []
+            end = min(self.height, bottom + -bottom % self.chunk)
+            above.append(self._decode(start, end))
+            rows = above[0] if len(above) == 1 else np.concatenate(above)
+            rows.setflags(write=False)  # the next answer is cut from the same memory
+            self._keep(rows, end)
+            return rows[top - first : bottom - first]
+
+    def _keep(self, rows: Pixels, end: int) -> None:
+        """Remember the last rows; once the image is done let go of the file and the memory."""
+        if end == self.height and self.chunk > 1:
+            self._kept = self._source = None
+            return
+        if rows.nbytes > _MAX_KEPT:
+            rows = rows[-max(self.chunk, _MAX_KEPT // rows[0].nbytes) :].copy()
+        self._kept, self._end = rows, end
+
+    def _decode(self, first: int, last: int) -> Pixels:
+        if self._source is None:
+            self._source = _open(self.path, self.page)
+        whole = self.height - self.height % self.chunk
+        if last <= whole or self.tiled or not whole:
+            return self._normalise(self._stored(first, last))
+        # OpenImageIO decodes from the top to get at the last, shorter strip unless it comes from the
+        # strip above it
+        above = self._stored(min(first, whole - self.chunk), whole)
+        below = self._stored(whole, last)
+        return self._normalise(below if first == whole else np.concatenate([above, below]))
+
+    def _stored(self, first: int, last: int) -> Pixels:
+        """Samples as they are in the file."""
+        top, bottom = self.y + first, self.y + last
+        if self.tiled:
+            right = self.x + self.width
+            raw = self._source.read_tiles(self.x, right, top, bottom, 0, 1, 0, self.samples, "unknown")
+        else:
+            raw = self._source.read_scanlines(top, bottom, 0, 0, self.samples, "unknown")
+        if raw is None:
+            why = self._source.geterror()
+            self._source = None
+            raise _unreadable(self.path, why)
+        return np.asarray(raw)
+
+    def _normalise(self, raw: Pixels) -> Pixels:
+        """Stored samples -> colours and unassociated alpha; NaN and infinity -> alpha 0."""
+        full = full_scale(raw.dtype)
+        if self.order == list(range(raw.shape[2])) and self.has_alpha:
+            rows = raw
+        else:
+            rows = np.full((*raw.shape[:2], self.channels + 1), full, raw.dtype)
+            rows[..., : len(self.order)] = raw[..., self.order]
+        if self.associated:
+            _unpremultiply(rows)
+        if rows.dtype.kind == "f":
+            rows[~np.isfinite(rows).all(axis=2)] = 0
+        return rows
+
+
+def _unpremultiply(rows: Pixels) -> None:
+    """Divide colours by alpha in place; nona's alpha is binary, so that its colours stay as they are."""
+    full = full_scale(rows.dtype)
+    partial = (rows[..., -1] > 0) & (rows[..., -1] < full)
+    if partial.any():
+        soft = rows[partial].astype(np.float64)
+        colours = soft[:, :-1] * (full / soft[:, -1:])
+        if rows.dtype.kind == "u":
+            colours = np.minimum(np.rint(colours), full)
+        rows[partial, :-1] = colours.astype(rows.dtype)

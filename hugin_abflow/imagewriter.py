@@ -1,0 +1,309 @@
+"""Write panoramas: whole files or none. Used through `hugin_abflow.images`.
+
+With `hugin_abflow.images` the only module that uses OpenImageIO.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import os
+import secrets
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import OpenImageIO as oiio  # noqa: N813
+
+from hugin_abflow import tifftags
+from hugin_abflow.errors import OutputError
+from hugin_abflow.layer import full_scale
+
+Pixels = npt.NDArray[Any]
+
+log = logging.getLogger("hugin_abflow.images")
+
+# Without it OpenImageIO silently writes half pixels to TIFF as 32-bit float.
+oiio.attribute("tiff:half", 1)
+
+_OIIO_NAMES = {
+    np.dtype(np.uint8): "uint8",
+    np.dtype(np.uint16): "uint16",
+    np.dtype(np.float16): "half",
+    np.dtype(np.float32): "float",
+}
+ENDINGS = {
+    ".tif": "tiff",
+    ".tiff": "tiff",
+    ".jpg": "jpeg",
+    ".jpeg": "jpeg",
+    ".png": "png",
+    ".exr": "openexr",
+}
+_TIFF_COMPRESSIONS = {
+    "none": "none",
+    "lzw": "lzw",
+    "packbits": "packbits",
+    "deflate": "zip",
+    "zip": "zip",
+    # OpenImageIO silently writes these as deflate for RGBA; so ask for it, and say so
+    "jpeg": "zip",
+    "zstd": "zip",
+}
+_EXR_COMPRESSIONS = {"none": "none", "rle": "rle", "zip": "zip", "zips": "zips", "piz": "piz"}
+_JPEG_LIMIT = 65500  # pixels a side, of libjpeg
+_CLASSIC_LIMIT = 0xFFFFFFFF - (16 << 20)  # bytes of a classic TIFF, with room for tags and metadata
+_LZW_WORST = 1.5  # LZW codes of up to 12 bits may stand for a byte each
+
+
+class ImageWriter:
+    """Write an image from top to bottom; the file appears, whole, when the ``with`` block ends.
+
+    path            format by its ending, see `ENDINGS`; an existing file is replaced.
+    width, height   pixels.
+    channels        1 (grey) or 3 (RGB); rows have one more, alpha.
+    dtype           of the rows: uint8, uint16, float16, float32. JPEG is written with 8 bit, PNG with 8
+                    or 16 (floats: 0..1 becomes 0..65535); EXR needs floats.
+    offset          (x, y) on the canvas: TIFF position at 150 dpi as enblend writes it, EXR data window.
+    canvas_size     (width, height) for the EXR display window; default: the data window.
+    compression     TIFF: none, lzw (default), packbits, deflate; jpeg and zstd become deflate, with a
+                    warning. EXR: none, rle, zips, zip (default), piz. JPEG and PNG: not used.
+    jpeg_quality    1..100, default 90 as Hugin's.
+
+    The attribute `compression` says what is really used. JPEG loses alpha: laid over black.
+    Raises `OutputError` for an unknown ending, a depth or size the format cannot hold, an unwritable
+    folder, a full disk, and if rows are missing in the end.
+    """
+
+    def __init__(
+        self,
+        path: Path | str,
+        width: int,
+        height: int,
+        channels: int,
+        dtype: npt.DTypeLike,
+        *,
+        offset: tuple[int, int] = (0, 0),
+        icc: bytes | None = None,
+        compression: str | None = None,
+        jpeg_quality: int | None = None,
+        canvas_size: tuple[int, int] | None = None,
+    ) -> None:
+        self.path = Path(path)
+        self.width, self.height, self.channels, self.dtype = width, height, channels, np.dtype(dtype)
+        self.format = _format_of(self.path)
+        self.stored = _stored_dtype(self.path, self.format, self.dtype)
+        if self.format == "jpeg" and max(width, height) > _JPEG_LIMIT:
+            raise OutputError(f"{path}: JPEG ends at {_JPEG_LIMIT} pixels a side; choose .tif or .png")
+        self.compression, self._option = _compression(self.path, self.format, compression, jpeg_quality)
+        self._spec = self._make_spec(offset, icc, canvas_size)
+        self._done = 0
+        self._clipped = False
+        self._output: Any = None
+        self._final = self._part = self.path
+
+    def _make_spec(
+        self, offset: tuple[int, int], icc: bytes | None, canvas_size: tuple[int, int] | None
+    ) -> Any:
+        samples = self.channels if self.format == "jpeg" else self.channels + 1
+        spec = oiio.ImageSpec(self.width, self.height, samples, _OIIO_NAMES[self.stored])
+        colours = ("R", "G", "B") if self.channels == 3 else ("Y",)
+        spec.channelnames = colours if self.format == "jpeg" else (*colours, "A")
+        spec.alpha_channel = -1 if self.format == "jpeg" else self.channels
+        spec["oiio:UnassociatedAlpha"] = 1  # else OpenImageIO takes colours for premultiplied
+        if self._option is not None:
+            spec["compression"] = self._option
+        if icc is not None:
+            spec["ICCProfile"] = np.frombuffer(icc, np.uint8)
+        if self.format == "tiff":
+            if min(offset) < 0:
+                raise OutputError(f"{self.path}: TIFF holds no negative position {offset}; choose .exr")
+            # a full size that equals the image's makes OpenImageIO leave PIXAR's tags out, as enblend does
+            spec.x, spec.y = offset
+            spec["XResolution"] = spec["YResolution"] = 150.0
+            spec["ResolutionUnit"] = "in"
+            spec["DateTime"] = ""  # no time of writing; the empty tag is dropped in the end
+            worst = _LZW_WORST if self.compression == "lzw" else 1.01
+            spec["tiff:bigtiff"] = int(spec.image_bytes() * worst > _CLASSIC_LIMIT)
+        elif self.format == "openexr":
+            spec.x, spec.y = spec.full_x, spec.full_y = offset
+            if canvas_size is not None:
+                spec.full_x, spec.full_y = 0, 0
+                spec.full_width, spec.full_height = canvas_size
+        elif self.format == "jpeg":
+            spec["jpeg:subsampling"] = "4:4:4"  # as enblend: colour edges stay sharp
+        return spec
+
+    def __enter__(self) -> ImageWriter:
+        # through a link: replace what it points to, not the link
+        self._final = self.path.resolve()
+        self._part = self._final.with_name(f".abflow-{secrets.token_hex(6)}{self.path.suffix}")
+        if self._final.is_dir():
+            raise OutputError(f"{self.path} is a folder; name a file with -o")
+        try:
+            # made here, not by OpenImageIO: a clear reason, and never somebody else's file
+            os.close(os.open(self._part, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o666))
+        except OSError as error:
+            raise OutputError(
+                f"{self.path} cannot be written: {self._final.parent}: {error.strerror}; "
+                "choose another folder with -o"
+            ) from None
+        try:
+            self._output = oiio.ImageOutput.create(str(self._part))
+            if self._output is None or not self._output.open(str(self._part), self._spec):
+                raise self._failure(self._output.geterror() if self._output else oiio.geterror())
+        except BaseException:
+            self._discard()
+            raise
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        try:
+            if kind is None:
+                self._finish()
+        finally:
+            self._discard()
+
+    def write_rows(self, rows: Pixels) -> None:
+        """Append rows: (rows, width, channels + 1) of the writer's dtype, unassociated alpha last."""
+        expected = (self.width, self.channels + 1)
+        if rows.ndim != 3 or rows.shape[1:] != expected or rows.dtype != self.dtype:
+            raise ValueError(f"rows of {rows.shape} {rows.dtype}, not (n, {expected}) {self.dtype}")
+        if self._done + len(rows) > self.height:
+            raise ValueError(f"row {self._done + len(rows)} of an image of {self.height} rows")
+        if not len(rows):
+            return
+        samples = np.ascontiguousarray(self._convert(rows))
+        top = self._spec.y + self._done
+        if not self._output.write_scanlines(top, top + len(rows), 0, samples):
+            raise self._failure(self._output.geterror())
+        self._done += len(rows)
+
+    def _convert(self, rows: Pixels) -> Pixels:
+        """To the stored depth and the format's kind of alpha."""
+        if self.dtype.kind == "f" and self.stored.kind == "u" and not self._clipped:
+            self._clipped = bool((rows[..., :-1] > 1).any())
+            if self._clipped:
+                log.warning("%s: values above 1.0 are clipped; choose .exr or .tif to keep them", self.path)
+        rows = _to_depth(rows, self.stored)
+        if self.format == "jpeg":
+            alpha = rows[..., -1:].astype(np.uint16)
+            return ((rows[..., :-1] * alpha + 127) // 255).astype(np.uint8)
+        if self.format == "openexr" and bool((rows[..., -1] != 1).any()):
+            return np.concatenate([rows[..., :-1] * rows[..., -1:], rows[..., -1:]], axis=2)
+        return rows
+
+    def _finish(self) -> None:
+        """Close and move to the final name."""
+        if self._done < self.height:
+            raise OutputError(f"{self.path}: only {self._done} of {self.height} rows were made; not written")
+        output, self._output = self._output, None
+        if not output.close():
+            raise self._failure(output.geterror())
+        try:
+            if self.format == "tiff":
+                tifftags.drop_tag(self._part, tifftags.DATE_TIME)
+            self._part.replace(self._final)
+        except OSError as error:
+            raise self._failure(error.strerror or str(error)) from None
+
+    def _discard(self) -> None:
+        """Close and remove what is not finished; nothing is left of it after `_finish`."""
+        output, self._output = self._output, None
+        if output is not None:
+            with contextlib.suppress(RuntimeError):
+                output.close()
+        self._part.unlink(missing_ok=True)
+
+    def _failure(self, why: str) -> OutputError:
+        return OutputError(
+            f"{self.path} cannot be written: {why.strip() or 'no reason given'}; "
+            "is there room in the folder? Choose another with -o"
+        )
+
+
+def write_image(
+    path: Path | str,
+    pixels: Pixels,
+    *,
+    offset: tuple[int, int] = (0, 0),
+    icc: bytes | None = None,
+    compression: str | None = None,
+    jpeg_quality: int | None = None,
+    canvas_size: tuple[int, int] | None = None,
+) -> None:
+    """Write pixels (height, width, 2 or 4), unassociated alpha last; see `ImageWriter`."""
+    height, width, samples = pixels.shape
+    with ImageWriter(
+        path,
+        width,
+        height,
+        samples - 1,
+        pixels.dtype,
+        offset=offset,
+        icc=icc,
+        compression=compression,
+        jpeg_quality=jpeg_quality,
+        canvas_size=canvas_size,
+    ) as writer:
+        writer.write_rows(pixels)
+
+
+def _format_of(path: Path) -> str:
+    try:
+        return ENDINGS[path.suffix.lower()]
+    except KeyError:
+        raise OutputError(f"{path}: the ending must be one of {', '.join(ENDINGS)}") from None
+
+
+def _stored_dtype(path: Path, format_name: str, dtype: np.dtype[Any]) -> np.dtype[Any]:
+    if dtype not in _OIIO_NAMES:
+        raise OutputError(f"{path}: samples of type {dtype}; possible are uint8, uint16, float16, float32")
+    if format_name == "openexr" and dtype.kind != "f":
+        raise OutputError(
+            f"{path}: EXR holds half or float, the layers have {dtype}; choose .tif, .png or .jpg"
+        )
+    if format_name == "jpeg":
+        return np.dtype(np.uint8)
+    return np.dtype(np.uint16) if format_name == "png" and dtype.kind == "f" else dtype
+
+
+def _compression(
+    path: Path, format_name: str, name: str | None, jpeg_quality: int | None
+) -> tuple[str, str | None]:
+    """(what is really used, OpenImageIO's name for it)."""
+    if format_name == "jpeg":
+        quality = 90 if jpeg_quality is None else jpeg_quality
+        if not 1 <= quality <= 100:
+            raise OutputError(f"{path}: JPEG quality {quality}; choose 1 to 100")
+        return f"jpeg:{quality}", f"jpeg:{quality}"
+    if format_name == "png":
+        return "deflate", None
+    known = _TIFF_COMPRESSIONS if format_name == "tiff" else _EXR_COMPRESSIONS
+    wanted = (name or ("lzw" if format_name == "tiff" else "zip")).lower()
+    if wanted.partition(":")[0] not in known:
+        raise OutputError(f"{path}: compression {name!r}; choose one of {', '.join(known)}")
+    option = known[wanted.partition(":")[0]]
+    used = "deflate" if format_name == "tiff" and option == "zip" else option
+    if used != wanted and wanted != "zip":
+        log.warning("%s: %s is not possible for TIFF with alpha; deflate is used", path, wanted)
+    return used, option
+
+
+def _to_depth(rows: Pixels, stored: np.dtype[Any]) -> Pixels:
+    """Rescale samples to another depth, rounded to nearest; 0 and full scale stay what they are."""
+    if rows.dtype == stored:
+        return rows
+    if rows.dtype.kind == "f":
+        full = full_scale(stored)
+        scaled: Pixels = np.rint(np.clip(rows.astype(np.float32), 0, 1) * full).astype(stored)
+        return scaled
+    eight: Pixels = ((rows.astype(np.uint32) + 128) // 257).astype(stored)  # 65535 = 255 * 257
+    return eight
