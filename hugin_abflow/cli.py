@@ -150,12 +150,13 @@ _information = partial(click.option, cls=_Option, group="Information")
 @_result(
     "--compression",
     metavar="NAME",
-    help="Compression of the file. TIFF: none, packbits, lzw or deflate. [default: the project's, else lzw]",
+    help="Compression of the file. TIFF: none, packbits, lzw, deflate; EXR: none, rle, zips, zip, piz. "
+    "[default: the project's; TIFF: else lzw; EXR: else zip]",
 )
 @_result(
     "--jpeg-quality",
     metavar="PERCENT",
-    type=click.IntRange(0, 100),
+    type=click.IntRange(1, 100),
     help="JPEG quality. [default: the project's]",
 )
 @_layers(

@@ -1,0 +1,327 @@
+"""The command line with nothing replaced, on a tiny project and on the sample."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import OpenImageIO as oiio
+import pytest
+import tifffile
+
+from hugin_abflow import cli
+from hugin_abflow.errors import ExitCode
+
+ROOM = Path(__file__).resolve().parent.parent / "sample_projects" / "room"
+WIDTH, HEIGHT = 250, 125  # pixels of the tiny canvas
+
+PROJECT = f"""# hugin project file
+#hugin_ptoversion 2
+p f2 w{WIDTH} h{HEIGHT} v360  k0 E0 R0 n"TIFF_m c:LZW r:CROP"
+m i0
+
+# image lines
+#-hugin  cropFactor=1
+i w120 h120 f3 v240 Ra0 Rb0 Rc0 Rd0 Re0 Eev0 Er1 Eb1 r0 p0 y-90 TrX0 TrY0 TrZ0 Tpy0 Tpp0 j0 a0 b0 c0 d0 e0 g0 t0 \
+Va1 Vb0 Vc0 Vd0 Vx0 Vy0  Vm5 n"left.png"
+#-hugin  cropFactor=1
+i w120 h120 f3 v=0 Ra=0 Rb=0 Rc=0 Rd=0 Re=0 Eev0 Er1 Eb1 r0 p0 y90 TrX0 TrY0 TrZ0 Tpy0 Tpp0 j0 a=0 b=0 c=0 d=0 \
+e=0 g=0 t=0 Va=0 Vb=0 Vc=0 Vd=0 Vx=0 Vy=0  Vm5 n"right.png"
+
+#hugin_outputImageType tif
+#hugin_outputImageTypeCompression LZW
+"""
+
+
+def textured(height: int, width: int) -> np.ndarray:
+    """A smooth pattern, (height, width, 3) uint8, without a repeat."""
+    y, x = np.mgrid[:height, :width]
+    waves = [
+        120 + 60 * np.sin(x / a + y * y / 900) + 50 * np.cos(y / b) for a, b in ((7, 5), (11, 9), (5, 13))
+    ]
+    return np.stack(waves, axis=2).astype(np.uint8)
+
+
+@pytest.fixture
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+    """A folder with tiny.pto, its layers tiny0000.tif and tiny0001.tif, and no photos; what is done in
+    it must leave no temporary file anywhere."""
+    project, scratch = tmp_path / "project", tmp_path / "scratch"
+    project.mkdir()
+    scratch.mkdir()
+    (project / "tiny.pto").write_text(PROJECT)
+    pixels = textured(HEIGHT, WIDTH)
+    x = np.arange(WIDTH)
+    for number, covered in enumerate([x < 0.6 * WIDTH, (x > 0.4 * WIDTH) | (x < 0.1 * WIDTH)]):
+        alpha = np.broadcast_to(covered, (HEIGHT, WIDTH))[..., None] * np.uint8(255)
+        layer = np.concatenate([pixels * (alpha > 0), alpha], axis=2)
+        tifffile.imwrite(
+            project / f"tiny{number:04}.tif", layer, photometric="rgb", extrasamples=["unassalpha"]
+        )
+    monkeypatch.setenv("TMPDIR", str(scratch))
+    monkeypatch.setattr(tempfile, "tempdir", None)  # what tempfile found before
+    yield project
+    assert list(scratch.iterdir()) == []
+
+
+def names(folder: Path) -> set[str]:
+    return {path.name for path in folder.iterdir()}
+
+
+def read(path: Path) -> np.ndarray:
+    image = oiio.ImageBuf(str(path))
+    assert not image.has_error, image.geterror()
+    return np.asarray(image.get_pixels(image.spec().format))
+
+
+def run(folder: Path, *arguments: str) -> ExitCode:
+    """Run in this process on tiny.pto and its layers; nothing but the results may appear beside them."""
+    return ExitCode(cli.main([str(folder / "tiny.pto"), "--prefix", "tiny", *arguments]))
+
+
+def process(*arguments: object) -> subprocess.Popen[str]:
+    command = [sys.executable, "-m", "hugin_abflow", *map(str, arguments)]
+    return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+
+
+# What is written
+
+
+def test_default_output_lies_beside_the_project(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    before = {path: path.read_bytes() for path in folder.iterdir()}
+    assert run(folder) == 0
+    (line,) = capsys.readouterr().out.splitlines()
+    panorama = Path(line)
+    assert panorama.parent == folder and panorama.suffix == ".tif"
+    assert names(folder) == {path.name for path in before} | {panorama.name}
+    assert {path: path.read_bytes() for path in before} == before
+    pixels = read(panorama)
+    assert pixels.shape == (HEIGHT, WIDTH, 4) and pixels.dtype == np.uint8
+    assert (pixels[..., 3] == 255).all()
+    # Both layers show the same picture, so it has to come back.
+    np.testing.assert_array_equal(pixels[..., :3], textured(HEIGHT, WIDTH))
+
+
+@pytest.mark.parametrize(("ending", "samples"), [("tif", 4), ("TIFF", 4), ("png", 4), ("jpg", 3)])
+def test_ending_chooses_the_format(folder: Path, tmp_path: Path, ending: str, samples: int) -> None:
+    output = tmp_path / f"out put.{ending}"
+    assert run(folder, "-o", str(output), "--jpeg-quality", "95") == 0
+    pixels = read(output)
+    assert pixels.shape == (HEIGHT, WIDTH, samples)
+    difference = np.abs(pixels[..., :3].astype(int) - textured(HEIGHT, WIDTH))
+    assert difference.mean() < 4 if ending == "jpg" else difference.max() == 0  # chroma is subsampled in JPEG
+    assert names(tmp_path) == {"project", "scratch", output.name}
+
+
+def test_compression_is_obeyed(folder: Path) -> None:
+    for name in ("none", "lzw", "deflate", "packbits"):
+        output = folder / f"{name}.tif"
+        assert run(folder, "-o", str(output), "--compression", name.upper()) == 0
+        with tifffile.TiffFile(output) as written:
+            assert name in written.pages[0].compression.name.lower().replace("adobe_", "")
+
+
+def test_existing_panorama_is_replaced(folder: Path) -> None:
+    output = folder / "out.tif"
+    output.write_bytes(b"older")
+    assert run(folder, "-o", str(output)) == 0
+    assert read(output).shape == (HEIGHT, WIDTH, 4)
+
+
+def test_layers_named_outright(folder: Path, tmp_path: Path) -> None:
+    layers = [str(path.rename(tmp_path / path.name)) for path in sorted(folder.glob("*.tif"))]
+    arguments = [str(folder / "tiny.pto"), "-o", str(folder / "out.png"), "--layers", *layers]
+    assert cli.main(arguments) == 0
+    np.testing.assert_array_equal(read(folder / "out.png")[..., :3], textured(HEIGHT, WIDTH))
+
+
+def test_float_layers_make_exr(folder: Path) -> None:
+    for path in folder.glob("*.tif"):
+        pixels = tifffile.imread(path).astype(np.float32) / 255
+        tifffile.imwrite(path, pixels, photometric="rgb", extrasamples=["unassalpha"])
+    assert run(folder, "-o", str(folder / "out.exr")) == 0
+    pixels = read(folder / "out.exr")
+    assert pixels.dtype == np.float32
+    np.testing.assert_allclose(pixels[..., :3], textured(HEIGHT, WIDTH) / np.float32(255), atol=1e-6)
+
+
+# What goes wrong: each exit code, and nothing left behind
+
+
+def broken(folder: Path, arguments: list[str], capsys: pytest.CaptureFixture[str]) -> tuple[ExitCode, str]:
+    """Run, expect failure; gives the exit code and the message."""
+    before = names(folder)
+    code = ExitCode(cli.main(arguments))
+    output = capsys.readouterr()
+    assert names(folder) == before
+    assert (
+        output.out == "" and output.err.startswith("hugin-abflow: error: ") and "Traceback" not in output.err
+    )
+    return code, output.err
+
+
+def test_project_that_is_none(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = folder / "photo.pto"
+    path.write_bytes(b"\x89PNG\r\n\x1a\n\0\0\0\rIHDR")
+    code, message = broken(folder, [str(path)], capsys)
+    assert code == ExitCode.PROJECT and "photo.pto" in message
+
+
+def test_project_that_is_not_there(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    code, message = broken(folder, [str(folder / "gone.pto")], capsys)
+    assert code == ExitCode.PROJECT and "gone.pto" in message
+
+
+def test_layers_that_are_not_there(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (folder / "tiny0001.tif").unlink()
+    arguments = [str(folder / "tiny.pto"), "--prefix", "tiny", "--remap", "never"]
+    code, message = broken(folder, arguments, capsys)
+    assert code == ExitCode.LAYERS_MISSING and "tiny0001.tif" in message
+
+
+def test_photos_that_are_not_there(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    code, message = broken(folder, [str(folder / "tiny.pto"), "--remap", "always"], capsys)
+    assert code == ExitCode.LAYERS_MISSING and "left.png" in message
+
+
+def test_layers_that_do_not_belong_together(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = folder / "tiny0001.tif"
+    pixels = tifffile.imread(path).astype(np.uint16) * 257
+    tifffile.imwrite(path, pixels, photometric="rgb", extrasamples=["unassalpha"])
+    code, message = broken(folder, [str(folder / "tiny.pto"), "--prefix", "tiny"], capsys)
+    assert code == ExitCode.LAYERS_MISMATCH and "tiny0001.tif" in message
+
+
+def test_layer_that_cannot_be_decoded(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (folder / "tiny0001.tif").write_bytes(b"no picture at all")
+    code, message = broken(folder, [str(folder / "tiny.pto"), "--prefix", "tiny"], capsys)
+    assert code == ExitCode.IMAGE_READ and "tiny0001.tif" in message
+
+
+@pytest.mark.parametrize("output", ["no/such/folder/out.tif", "out.xyz", "."])
+def test_output_that_cannot_be_written(
+    folder: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, output: str
+) -> None:
+    monkeypatch.chdir(folder)
+    code, message = broken(folder, ["tiny.pto", "--prefix", "tiny", "-o", output], capsys)
+    assert code == ExitCode.OUTPUT and (output in message or output == ".")
+
+
+def test_nona_that_is_not_installed(
+    folder: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name in ("left.png", "right.png"):
+        (folder / name).write_bytes(b"nobody looks at this")
+    monkeypatch.setenv("PATH", str(folder))
+    code, message = broken(folder, [str(folder / "tiny.pto"), "--remap", "always"], capsys)
+    assert code == ExitCode.NONA and "nona" in message
+
+
+@pytest.mark.skipif(shutil.which("nona") is None, reason="needs nona (Debian: hugin-tools)")
+def test_nona_that_fails(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for name in ("left.png", "right.png"):
+        (folder / name).write_bytes(b"no picture at all")
+    code, _ = broken(folder, [str(folder / "tiny.pto"), "--remap", "always"], capsys)
+    assert code == ExitCode.NONA
+
+
+def test_device_that_is_none(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    arguments = [str(folder / "tiny.pto"), "--prefix", "tiny", "--device", "no such device"]
+    code, message = broken(folder, arguments, capsys)
+    assert code == ExitCode.DEVICE and "no such device" in message
+
+
+def test_one_of_two_projects_is_broken(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (folder / "empty.pto").write_bytes(b"")
+    arguments = [str(folder / "empty.pto"), str(folder / "tiny.pto"), "--prefix", "tiny"]
+    assert cli.main(arguments) == ExitCode.PARTIAL
+    output = capsys.readouterr()
+    assert len(output.out.splitlines()) == 1 and "empty.pto" in output.err
+
+
+# As a process
+
+
+def test_module_runs_as_a_program_and_keeps_stdout_clean(folder: Path) -> None:
+    child = process("-v", "--prefix", "tiny", "-o", folder / "out.tif", folder / "tiny.pto")
+    out, messages = child.communicate(timeout=120)
+    assert child.returncode == 0, messages
+    assert out == f"{folder / 'out.tif'}\n"
+    assert "Blend" in messages
+
+
+@pytest.mark.skipif(os.name == "nt", reason="Windows has no such signals")
+@pytest.mark.parametrize(("number", "line"), [(signal.SIGINT, 1), (signal.SIGTERM, 8)])
+def test_interruption_leaves_nothing(folder: Path, number: signal.Signals, line: int) -> None:
+    before = names(folder)
+    again = [folder / "tiny.pto"] * 200  # so that there is always something to interrupt
+    child = process("-v", "--prefix", "tiny", *again)
+    assert child.stderr is not None
+    for _ in range(line):
+        child.stderr.readline()
+    child.send_signal(number)
+    _, messages = child.communicate(timeout=60)
+    assert child.returncode == ExitCode.INTERRUPTED, messages
+    assert messages.splitlines()[-1] == "hugin-abflow: interrupted" and "Traceback" not in messages
+    for name in names(folder) - before:  # whole, if a project was done before the signal
+        assert read(folder / name).shape == (HEIGHT, WIDTH, 4)
+    assert len(names(folder) - before) <= 1
+
+
+@pytest.mark.skipif(os.name == "nt", reason="Windows has no such signals")
+def test_interruption_ends_nona_and_removes_its_files(folder: Path, tmp_path: Path) -> None:
+    for name in ("left.png", "right.png"):
+        (folder / name).write_bytes(b"nobody looks at this")
+    programs = tmp_path / "bin"
+    programs.mkdir()
+    started = tmp_path / "pid"
+    (programs / "nona").write_text(
+        f'#!/bin/sh\ncase "$*" in *tiny*) ;; *) echo "nona version 2022.0.0"; exit 0;; esac\n'
+        f'echo $$ > "{started}.part"; mv "{started}.part" "{started}"; exec sleep 60\n'
+    )
+    (programs / "nona").chmod(0o755)
+    before = names(folder)
+    environment = os.environ | {"PATH": f"{programs}{os.pathsep}{os.environ['PATH']}"}
+    child = subprocess.Popen(
+        [sys.executable, "-m", "hugin_abflow", "--remap", "always", str(folder / "tiny.pto")],
+        stderr=subprocess.PIPE,
+        text=True,
+        env=environment,
+    )
+    deadline = time.monotonic() + 60
+    while not started.exists() and child.poll() is None and time.monotonic() < deadline:
+        time.sleep(0.02)
+    child.terminate()
+    _, messages = child.communicate(timeout=30)
+    assert child.returncode == ExitCode.INTERRUPTED, messages
+    assert names(folder) == before
+    with pytest.raises(ProcessLookupError):
+        os.kill(int(started.read_text()), 0)
+
+
+def test_sample_merges(tmp_path: Path) -> None:
+    output = tmp_path / "room.tif"
+    child = process("--prefix", "room", "-o", output, ROOM / "room.pto")
+    out, messages = child.communicate(timeout=300)
+    assert (child.returncode, out, messages) == (0, f"{output}\n", "")
+    pixels = read(output)
+    assert pixels.shape == (1024, 2048, 4)
+    covered = np.zeros((1024, 2048), bool)
+    for path in sorted(ROOM.glob("room[0-9][0-9][0-9][0-9].tif")):
+        with tifffile.TiffFile(path) as layer:
+            tags = layer.pages[0].tags
+            left, top = (
+                round(tags[p].value[0] / tags[p].value[1] * tags[r].value[0] / tags[r].value[1])
+                for p, r in (("XPosition", "XResolution"), ("YPosition", "YResolution"))
+            )
+            alpha = layer.asarray()[..., 3] > 127
+        covered[top : top + alpha.shape[0], left : left + alpha.shape[1]] |= alpha
+    np.testing.assert_array_equal(pixels[..., 3] == 255, covered)  # no hole, and nothing outside

@@ -1,0 +1,70 @@
+"""What ships: the wheel has everything that the program needs at run time, and nothing else."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import tomllib
+import zipfile
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parent.parent
+PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]
+
+BUILD = "import sys; from hatchling.build import build_wheel; build_wheel(sys.argv[1])"
+
+
+@pytest.fixture(scope="module")
+def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The wheel of this checkout, built with what is installed."""
+    pytest.importorskip("hatchling")
+    folder = tmp_path_factory.mktemp("wheel")
+    subprocess.run([sys.executable, "-c", BUILD, folder], cwd=ROOT, check=True, capture_output=True)
+    (path,) = folder.glob("*.whl")
+    return path
+
+
+def test_wheel_has_all_modules_and_kernels_and_nothing_else(wheel: Path) -> None:
+    modules = {p.relative_to(ROOT).as_posix() for p in (ROOT / "hugin_abflow").rglob("*.py")}
+    kernels = {f"hugin_abflow/kernels/{p.name}" for p in (ROOT / "kernels").glob("*.cl")}
+    assert len(modules) > 10 and len(kernels) > 5
+    names = set(zipfile.ZipFile(wheel).namelist())
+    information = {name for name in names if name.split("/")[0].endswith(".dist-info")}
+    notes = {name for name in names if name.startswith("hugin_abflow/kernels/") and name.endswith(".md")}
+    assert names - information - notes == modules | kernels | {"hugin_abflow/py.typed"}
+    assert any(name.endswith("licenses/LICENSE") for name in information)
+
+
+def test_wheel_has_the_command(wheel: Path) -> None:
+    archive = zipfile.ZipFile(wheel)
+    (points,) = (name for name in archive.namelist() if name.endswith("entry_points.txt"))
+    assert "hugin-abflow = hugin_abflow.cli:main" in archive.read(points).decode()
+
+
+def test_unpacked_wheel_runs_outside_the_checkout(wheel: Path, tmp_path: Path) -> None:
+    zipfile.ZipFile(wheel).extractall(tmp_path / "site")
+    environment = os.environ | {"PYTHONPATH": str(tmp_path / "site")}
+    for arguments, expected in (
+        (["-m", "hugin_abflow", "--version"], f"hugin-abflow {PROJECT['version']}"),
+        (["-c", "import hugin_abflow; print(hugin_abflow.__file__)"], str(tmp_path / "site")),
+    ):
+        done = subprocess.run(
+            [sys.executable, *arguments], cwd=tmp_path, env=environment, capture_output=True, text=True
+        )
+        assert done.returncode == 0, done.stderr
+        assert done.stdout.startswith(expected)
+
+
+def test_changelog_has_the_version() -> None:
+    assert f"## [{PROJECT['version']}]" in (ROOT / "CHANGELOG.md").read_text("utf-8")
+
+
+@pytest.mark.skipif(os.name == "nt", reason="make and bash")
+def test_makefile_and_ci_are_runnable() -> None:
+    assert os.access(ROOT / ".ci" / "run", os.X_OK)
+    subprocess.run(["bash", "-n", ".ci/run"], cwd=ROOT, check=True)
+    for target in ("sample", "test", "lint", "clean"):
+        subprocess.run(["make", "--dry-run", target], cwd=ROOT, check=True, capture_output=True)
