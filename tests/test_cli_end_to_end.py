@@ -23,6 +23,7 @@ from hugin_abflow.errors import ExitCode
 ROOM = Path(__file__).resolve().parent.parent / "sample_projects" / "room"
 WIDTH, HEIGHT = 250, 125  # pixels of the tiny canvas
 
+LENS = "Eev0 Er1 Eb1 r0 p0 TrX0 TrY0 TrZ0 Tpy0 Tpp0 j0"
 PROJECT = f"""# hugin project file
 #hugin_ptoversion 2
 p f2 w{WIDTH} h{HEIGHT} v360  k0 E0 R0 n"TIFF_m c:LZW r:CROP"
@@ -30,11 +31,9 @@ m i0
 
 # image lines
 #-hugin  cropFactor=1
-i w120 h120 f3 v240 Ra0 Rb0 Rc0 Rd0 Re0 Eev0 Er1 Eb1 r0 p0 y-90 TrX0 TrY0 TrZ0 Tpy0 Tpp0 j0 a0 b0 c0 d0 e0 g0 t0 \
-Va1 Vb0 Vc0 Vd0 Vx0 Vy0  Vm5 n"left.png"
+i w120 h120 f3 v240 a0 b0 c0 d0 e0 g0 t0 Ra0 Rb0 Rc0 Rd0 Re0 Va1 Vb0 Vc0 Vd0 Vx0 Vy0 {LENS} y-90 n"left.png"
 #-hugin  cropFactor=1
-i w120 h120 f3 v=0 Ra=0 Rb=0 Rc=0 Rd=0 Re=0 Eev0 Er1 Eb1 r0 p0 y90 TrX0 TrY0 TrZ0 Tpy0 Tpp0 j0 a=0 b=0 c=0 d=0 \
-e=0 g=0 t=0 Va=0 Vb=0 Vc=0 Vd=0 Vx=0 Vy=0  Vm5 n"right.png"
+i w120 h120 f3 v=0 a=0 b=0 c=0 d=0 e=0 g=0 t=0 Va=0 Vb=0 Vc=0 Vd=0 {LENS} y90 n"right.png"
 
 #hugin_outputImageType tif
 #hugin_outputImageTypeCompression LZW
