@@ -23,6 +23,7 @@ class Settings:
     working_pixels      upper bound of the pixels of the working canvas (flow, coefficients, colour).
     border_feather      width of the ramp that brings a layer's weight to 0 at its own border, in working
                         pixels; 0: none, as published.
+    fixed_point_steps   times that x_k <- p - sum_j w_j F_kj(x_k) is iterated; 0: flow read at p, as published.
     band_rows           rows of a full-resolution band; 0: chosen from the canvas width.
     device              index in ``--list-devices`` or part of a device's name; None: the fastest GPU, else CPU.
     """
@@ -34,6 +35,7 @@ class Settings:
     interpolation: Interpolation = "bicubic"
     working_pixels: int = 2_100_000
     border_feather: float = 6.0
+    fixed_point_steps: int = 0
     band_rows: int = 0
     device: str | None = None
 
@@ -43,6 +45,7 @@ class Settings:
             ("flow_magnitude", 0, 10_000),
             ("working_pixels", 1024, 1 << 28),
             ("border_feather", 0, 1000),
+            ("fixed_point_steps", 0, 20),
             ("band_rows", 0, 1 << 20),
         ):
             value = getattr(self, name)

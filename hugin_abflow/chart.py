@@ -1,0 +1,138 @@
+"""Charts: the flat grid on which one pair's flow lives (kernels/chart.cl, formulas in common.cl).
+
+On a sphere the overlap of two layers is a band or a patch anywhere, over a pole as well. Its chart is an
+equirectangular projection about an axis of its own, turned so that the overlap lies along the chart's
+equator: there is no pole in it and hardly any stretch. On a plane it is the canvas's own grid.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from hugin_abflow.opencl import Device
+from hugin_abflow.pyramid import Level
+from hugin_abflow.working import Grid, WorkingLayer
+
+# Chart pixels around the overlap, so that flow is smooth across its border.
+_MARGIN = 16
+# Widths of charts that wrap are multiples of this, so that they halve exactly on every pyramid level.
+_WRAP_MULTIPLE = 128
+# Brightness that is added before the logarithm: about the dark noise of a photo, full scale is 1.
+_FLOOR = 0.05
+
+
+@dataclass(frozen=True)
+class Chart:
+    """transform: the 16 numbers of common.cl; width, height px; wraps: columns are periodic."""
+
+    transform: npt.NDArray[np.float32]
+    width: int
+    height: int
+    wraps: bool
+
+
+def _gap(columns: npt.NDArray[np.bool_]) -> tuple[int, int]:
+    """The longest periodic run of False: (first column after it, its length)."""
+    used = np.flatnonzero(columns)
+    gaps = np.diff(np.append(used, used[0] + columns.size)) - 1
+    widest = int(np.argmax(gaps))
+    return int(used[(widest + 1) % used.size]), int(gaps[widest])
+
+
+def _plane(overlap: npt.NDArray[np.bool_], grid: Grid) -> Chart:
+    rows = np.flatnonzero(overlap.any(1))
+    top, bottom = max(0, rows[0] - _MARGIN), min(grid.height, rows[-1] + 1 + _MARGIN)
+    transform = np.zeros(16, np.float32)
+    transform[9:11] = 1
+    columns = overlap.any(0)
+    if not grid.wraps:
+        used = np.flatnonzero(columns)
+        left, right = max(0, used[0] - _MARGIN), min(grid.width, used[-1] + 1 + _MARGIN)
+        transform[11:13] = -left, -top
+        return Chart(transform, int(right - left), int(bottom - top), False)
+    transform[14] = grid.width
+    first, gap = _gap(columns)
+    if gap > 2 * _MARGIN:
+        transform[11:13] = _MARGIN - first, -top
+        return Chart(transform, grid.width - gap + 2 * _MARGIN, int(bottom - top), False)
+    width = max(1, round(grid.width / _WRAP_MULTIPLE)) * _WRAP_MULTIPLE
+    transform[9], transform[12] = width / grid.width, -top
+    return Chart(transform, width, int(bottom - top), True)
+
+
+def _axes(points: npt.NDArray[np.float64], weights: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+    """Rows x, y, z of the chart's axes: z where the overlap reaches least, y at its centre."""
+    scatter = (points * weights[:, None]).T @ points
+    values, vectors = np.linalg.eigh(scatter)
+    z = vectors[:, 0]
+    if values[1] - values[0] < 0.02 * values[2]:  # as wide as long: the canvas's own axis will do
+        z = np.array([0.0, 0.0, 1.0])
+    z = z * (1.0 if z[np.argmax(np.abs(z))] > 0 else -1.0)
+    mean = points.T @ weights
+    y = mean - z * (z @ mean)
+    if np.linalg.norm(y) < 0.02 * weights.sum():  # a ring has no centre
+        y = vectors[:, 2] - z * (z @ vectors[:, 2])
+    if np.linalg.norm(y) < 1e-6:
+        y = np.array([0.0, 1.0, 0.0]) if abs(z[1]) < 0.9 else np.array([1.0, 0.0, 0.0])
+        y = y - z * (z @ y)
+    y /= np.linalg.norm(y)
+    return np.stack([np.cross(y, z), y, z])
+
+
+def _sphere(overlap: npt.NDArray[np.bool_], mask_grid: Grid, scale: float) -> Chart:
+    lon0, dlon, lat0, dlat = mask_grid.lens
+    rows, columns = np.nonzero(overlap)
+    lon, lat = lon0 + (columns + 0.5) * dlon, lat0 - (rows + 0.5) * dlat
+    points = np.stack([np.cos(lat) * np.sin(lon), np.cos(lat) * np.cos(lon), np.sin(lat)], 1)
+    axes = _axes(points, np.cos(lat))
+    x, y, z = axes @ points.T
+    chart_lon, chart_lat = np.arctan2(x, y), np.arcsin(np.clip(z, -1, 1))
+    steps = 720
+    margin = _MARGIN / scale + 2 * math.pi / steps
+    used = np.zeros(steps, bool)
+    used[((chart_lon / (2 * math.pi) + 0.5) * steps).astype(int) % steps] = True
+    south = max(chart_lat.min() - margin, -math.pi / 2)
+    north = min(chart_lat.max() + margin, math.pi / 2)
+    first, gap = _gap(used)
+    wraps = gap * 2 * math.pi / steps < 2 * margin + 4 * math.pi / steps
+    if wraps:
+        width = max(1, round(2 * math.pi * scale / _WRAP_MULTIPLE)) * _WRAP_MULTIPLE
+        across, middle = width / (2 * math.pi), 0.0
+    else:
+        span = (steps - gap) * 2 * math.pi / steps + 2 * margin
+        width, across = math.ceil(span * scale), scale
+        middle = (first / steps - 0.5) * 2 * math.pi + span / 2 - margin
+    turn = np.array(
+        [[math.cos(middle), -math.sin(middle), 0], [math.sin(middle), math.cos(middle), 0], [0, 0, 1]]
+    )
+    transform = np.zeros(16, np.float32)
+    transform[:9] = (turn @ axes).ravel()
+    transform[9:14] = across, scale, width / 2, north * scale, 1
+    return Chart(transform, width, math.ceil((north - south) * scale), wraps)
+
+
+def pair_chart(overlap: npt.NDArray[np.bool_], mask_grid: Grid, grid: Grid) -> Chart:
+    """The chart for an overlap given as a mask on `mask_grid` (a grid over the same region as `grid`).
+
+    It is as fine as the working grid; the mask is not empty.
+    """
+    if grid.lens[1]:
+        return _sphere(overlap, mask_grid, 1 / grid.lens[1])
+    rows = np.arange(grid.height) * mask_grid.height // grid.height
+    columns = np.arange(grid.width) * mask_grid.width // grid.width
+    return _plane(overlap[rows][:, columns], grid)
+
+
+def sample(device: Device, layer: WorkingLayer, grid: Grid, chart: Chart) -> Level:
+    """Log brightness of a layer on the chart, with its mask."""
+    size = (chart.width, chart.height)
+    level = Level(device.empty(size[::-1]), device.empty(size[::-1]), chart.wraps)
+    device.run(
+        "chart", "chart_sample", size, layer.pixels, layer.box, grid.border, grid.lens, chart.transform, size,
+        _FLOOR, level.image, level.mask,
+    )  # fmt: skip
+    return level

@@ -1,0 +1,113 @@
+"""Distances and blend coefficients (kernels/coefficient.cl).
+
+D_k(p) is the distance from p to the nearest union pixel that layer k does not cover, on the sphere as an
+angle; w_k = D_k / sum_j D_j. For two layers this is Eq. 1 of Meng & Liu 2020.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from hugin_abflow.opencl import Buffer, Device
+from hugin_abflow.settings import Settings
+from hugin_abflow.working import Grid, WorkingLayer
+
+# Distances are smooth: a mask grid of this many pixels is fine enough, and four times faster.
+_FINE_PIXELS = 600_000
+
+
+@dataclass(frozen=True)
+class Coefficients:
+    """Of one layer, float32 on the layer's box of the working grid.
+
+    blend   w_k, the blend coefficient; 0 outside the layer, 1 where it is alone.
+    rim     m_k = min(1, D_k / feather), which takes the layer's colour weight to 0 at its border.
+    """
+
+    blend: Buffer
+    rim: Buffer
+
+
+@dataclass(frozen=True)
+class Masks:
+    """Which layer covers what, on the mask grid: uint8 (height, width), on the device and the host."""
+
+    grid: Grid
+    buffers: tuple[Buffer, ...]
+    host: npt.NDArray[np.bool_]  # (layers, height, width)
+
+
+def masks(device: Device, layers: Sequence[WorkingLayer], grid: Grid) -> Masks:
+    """The layers' masks; a mask pixel is covered if every working pixel under it is."""
+    factor = 1 if grid.width * grid.height <= _FINE_PIXELS else 2
+    width = -(-grid.width // factor)
+    if grid.poles:
+        width += width % 2  # crossing a pole goes half the width further
+    mask_grid = grid.resized(width, -(-grid.height // factor))
+    buffers = []
+    for layer in layers:
+        mask = device.empty(mask_grid.shape, np.uint8)
+        device.run(
+            "coefficient", "coefficient_mask", mask_grid.border[:2], layer.pixels, layer.box, grid.border,
+            mask_grid.border, mask,
+        )  # fmt: skip
+        buffers.append(mask)
+    return Masks(mask_grid, tuple(buffers), np.stack([b.get() for b in buffers]).astype(bool))
+
+
+def distance(device: Device, masks_: Masks, index: int, cover: Buffer, working: Grid) -> Buffer:
+    """D_k of layer `index` in working pixels, float32 on the mask grid; `cover` is the union's mask."""
+    grid = masks_.grid
+    size = grid.border[:2]
+    seed, flooded = (device.empty(grid.shape, np.int32) for _ in range(2))
+    mask = masks_.buffers[index]
+    device.run("coefficient", "coefficient_seed", size, mask, cover, grid.border, seed)
+    step = 1 << max(0, math.ceil(math.log2(max(size))) - 1)
+    steps = [1]  # one fine pass first and two last mend nearly all that jump flooding misses
+    while step:
+        steps.append(step)
+        step //= 2
+    for jump in [*steps, 2, 1]:
+        device.run(
+            "coefficient", "coefficient_flood", size, seed, grid.border, grid.lens, jump, flooded
+        )
+        seed, flooded = flooded, seed
+    unit = working.width / grid.width
+    furthest = math.pi / working.lens[1] if working.lens[1] else math.hypot(*working.shape)
+    result = device.empty(grid.shape)
+    device.run(
+        "coefficient", "coefficient_distance", size, seed, mask, grid.border, grid.lens, unit, furthest, result
+    )
+    return result
+
+
+def coefficients(
+    device: Device, layers: Sequence[WorkingLayer], masks_: Masks, grid: Grid, settings: Settings
+) -> list[Coefficients]:
+    """The blend coefficients of all layers."""
+    cover = device.upload(masks_.host.any(0), np.uint8)
+    total = device.zeros(grid.shape)
+    ratio = (masks_.grid.width / grid.width, masks_.grid.height / grid.height)
+    expanded = []
+    for index, layer in enumerate(layers):
+        blend = device.empty(layer.pixels.shape[:2])
+        on_masks = distance(device, masks_, index, cover, grid)
+        device.run(
+            "coefficient", "coefficient_expand", layer.box[2:], on_masks, masks_.grid.border, ratio,
+            layer.pixels, layer.box, grid.border, blend, total,
+        )  # fmt: skip
+        expanded.append(blend)
+    result = []
+    for layer, blend in zip(layers, expanded, strict=True):
+        rim = device.empty(blend.shape)
+        device.run(
+            "coefficient", "coefficient_ratio", layer.box[2:], blend, layer.box, grid.border, total,
+            settings.border_feather, rim,
+        )  # fmt: skip
+        result.append(Coefficients(blend, rim))
+    return result

@@ -1,0 +1,182 @@
+"""Smooth exposure and colour correction of each layer (kernels/colour.cl).
+
+One gain field per layer and channel, in the log domain on a coarse grid: where layers overlap, the corrected
+layers agree; from there the correction spreads through each layer, smoothly, and fades out. It is the
+minimum of
+
+    sum_pairs c (g_a - g_b + d_ab)^2  +  sum_k |grad g_k|^2  +  g_k^2 / fade^2
+
+with d_ab the measured difference of the aligned layers, found by conjugate gradients. Where there is
+no difference it is exactly zero.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from hugin_abflow.geometry import PairFlow
+from hugin_abflow.opencl import Buffer, Device
+from hugin_abflow.working import Grid, WorkingLayer
+
+# Working pixels per cell of the colour grid.
+_CELL = 16
+# Brightness added before logarithms, as in kernels/blend.cl: gains of near-black pixels mean nothing.
+_FLOOR = 0.02
+_CLIPPED = 0.98
+_SPREAD = 0.15
+# Weight of the measured differences against smoothness.
+_DATA = 30.0
+# The correction fades out over this share of the canvas's width.
+_FADE = 0.12
+# Gains below this (a quarter of an 8-bit level at full scale) are taken to exactly 0.
+_NEGLIGIBLE = 1e-3
+_TOLERANCE, _ITERATIONS = 1e-3, 400
+
+
+@dataclass(frozen=True)
+class Correction:
+    """Log gains: grid is the colour grid; gains one per layer, float32 (height, width, 4); None: none."""
+
+    grid: Grid
+    gains: tuple[Buffer | None, ...]
+
+
+def colour_grid(grid: Grid) -> Grid:
+    """The coarse grid over the working grid's region."""
+    return grid.resized(max(1, round(grid.width / _CELL)), max(1, round(grid.height / _CELL)))
+
+
+def correction(
+    device: Device,
+    layers: Sequence[WorkingLayer],
+    fields: Sequence[Buffer],
+    pairs: Sequence[PairFlow],
+    grid: Grid,
+    covered: npt.NDArray[np.bool_],
+) -> Correction:
+    """Measure the overlaps of the aligned layers and solve for the gains.
+
+    fields: of geometry.py. covered: (layers, height, width) on any grid over the same region.
+    """
+    cells = colour_grid(grid)
+    floating = layers[0].layer.dtype.kind == "f"
+    measured = []
+    for pair in pairs:
+        difference = device.empty((*cells.shape, 4))
+        a, b = layers[pair.a], layers[pair.b]
+        device.run(
+            "colour", "colour_difference", cells.border[:2],
+            a.pixels, fields[pair.a], a.box, b.pixels, fields[pair.b], b.box,
+            grid.border, grid.lens, cells.border, _FLOOR, 1e30 if floating else _CLIPPED, _SPREAD, difference,
+        )  # fmt: skip
+        measured.append((pair.a, pair.b, difference.get().astype(np.float64)))
+    if not any(np.any(d[..., :3] * d[..., 3:]) for _, _, d in measured):
+        return Correction(cells, (None,) * len(layers))
+    inside = _cells_covered(covered, cells)
+    gains = solve(measured, inside, cells)
+    gains = np.sign(gains) * np.maximum(np.abs(gains) - _NEGLIGIBLE, 0)
+    result = []
+    for gain, mask in zip(gains, inside, strict=True):
+        if not gain.any():
+            result.append(None)
+            continue
+        packed = np.zeros((*cells.shape, 4), np.float32)
+        packed[..., :3] = _extend(gain, mask, cells.wraps)
+        result.append(device.upload(packed))
+    return Correction(cells, tuple(result))
+
+
+def _cells_covered(covered: npt.NDArray[np.bool_], cells: Grid) -> npt.NDArray[np.bool_]:
+    """Which cells a layer reaches into."""
+    for axis, count in ((1, cells.height), (2, cells.width)):
+        starts = np.arange(count) * covered.shape[axis] // count
+        covered = np.logical_or.reduceat(covered, starts, axis)
+    return covered
+
+
+def solve(
+    measured: Sequence[tuple[int, int, npt.NDArray[np.float64]]], inside: npt.NDArray[np.bool_], cells: Grid
+) -> npt.NDArray[np.float64]:
+    """Gains (layers, height, width, 3) for differences (a, b, array of r, g, b, weight per cell)."""
+    latitude = cells.lens[2] - (np.arange(cells.height) + 0.5) * cells.lens[3]
+    area = np.maximum(np.cos(latitude), 0.02)[:, None] if cells.lens[1] else np.ones((cells.height, 1))
+    # a cell's sides: steps along a row are shorter near a pole, so neighbours there are bound closer
+    east = (inside & np.roll(inside, -1, 2)) / area
+    if not cells.wraps:
+        east[:, :, -1] = 0
+    south = np.zeros(inside.shape)
+    south[:, :-1] = (inside[:, :-1] & inside[:, 1:]) * np.sqrt(area[:-1] * area[1:])
+    fade = max(1.0, _FADE * (cells.width if not cells.lens[1] else 2 * np.pi / cells.lens[1]))
+    hold = inside * area / fade**2
+    links = [(a, b, _DATA * d[..., 3] * area, d[..., :3]) for a, b, d in measured]
+
+    def apply(g: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+        out = hold[..., None] * g
+        step = east[..., None] * (g - np.roll(g, -1, 2))
+        out += step - np.roll(step, 1, 2)
+        step = south[..., None] * (g - np.roll(g, -1, 1))
+        out += step - np.roll(step, 1, 1)
+        for a, b, weight, _ in links:
+            step = weight[..., None] * (g[a] - g[b])
+            out[a] += step
+            out[b] -= step
+        return out
+
+    right = np.zeros((*inside.shape, 3))
+    diagonal = hold + east + np.roll(east, 1, 2) + south + np.roll(south, 1, 1)
+    for a, b, weight, difference in links:
+        right[a] -= weight[..., None] * difference
+        right[b] += weight[..., None] * difference
+        diagonal[a] += weight
+        diagonal[b] += weight
+    scale = np.where(diagonal > 0, 1 / np.maximum(diagonal, 1e-12), 0)[..., None]
+    return _conjugate_gradients(apply, right, scale)
+
+
+def _conjugate_gradients(apply, right, scale):  # type: ignore[no-untyped-def]
+    """Solve apply(x) = right, preconditioned with the inverse diagonal `scale`."""
+    x = np.zeros_like(right)
+    residual = right.copy()
+    z = scale * residual
+    direction = z.copy()
+    rho = start = float(np.vdot(residual, z))
+    for _ in range(_ITERATIONS):
+        if rho <= start * _TOLERANCE**2 or rho == 0:
+            break
+        image = apply(direction)
+        step = rho / float(np.vdot(direction, image))
+        x += step * direction
+        residual -= step * image
+        z = scale * residual
+        rho, last = float(np.vdot(residual, z)), rho
+        direction = z + (rho / last) * direction
+    return x
+
+
+def _extend(
+    gain: npt.NDArray[np.float64], mask: npt.NDArray[np.bool_], wraps: bool
+) -> npt.NDArray[np.float64]:
+    """Carry gains two cells beyond the layer, so that interpolation at its border finds no zeros."""
+    known = mask.astype(np.float64)
+    value = gain * known[..., None]
+    for _ in range(2):
+        sums, weights = np.zeros_like(value), np.zeros_like(known)
+        for dy in (-1, 0, 1):
+            for dx in (-1, 0, 1):
+                pad = [(1, 1), (1, 1)]
+                shifted_w = np.pad(known, pad, mode="constant")
+                shifted_v = np.pad(value, [*pad, (0, 0)], mode="constant")
+                if wraps:
+                    shifted_w[1:-1, 0], shifted_w[1:-1, -1] = known[:, -1], known[:, 0]
+                    shifted_v[1:-1, 0], shifted_v[1:-1, -1] = value[:, -1], value[:, 0]
+                rows, columns = known.shape
+                sums += shifted_v[1 + dy : 1 + dy + rows, 1 + dx : 1 + dx + columns]
+                weights += shifted_w[1 + dy : 1 + dy + rows, 1 + dx : 1 + dx + columns]
+        new = (known == 0) & (weights > 0)
+        value[new] = sums[new] / weights[new][:, None]
+        known[new] = 1
+    return value

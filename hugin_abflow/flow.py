@@ -1,0 +1,108 @@
+"""Flow between two images of one grid, in both directions (kernels/flow.cl).
+
+Combined local-global optical flow: the data term is Lucas and Kanade's windowed least squares, on
+brightness and gradient, and a smoothness term spreads it over untextured pixels and beyond the masks
+(Bruhn, Weickert, Schnoerr, "Lucas/Kanade meets Horn/Schunck", 2005). Coarse to fine with warping.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from hugin_abflow import pyramid
+from hugin_abflow.opencl import Buffer, Device
+from hugin_abflow.pyramid import Level
+
+
+@dataclass(frozen=True)
+class FlowParameters:
+    """What the solver weighs; units of h are log brightness."""
+
+    coarsest: int = 12  # px: the shorter side of the coarsest level
+    warps: int = 5  # linearisations per level
+    sweeps: int = 12  # red-black sweeps per linearisation
+    relaxation: float = 1.85  # of successive over-relaxation
+    brightness: float = 5.0  # weight of brightness constancy
+    gradient: float = 10.0  # weight of gradient constancy
+    smoothness: float = 12.0
+    contrast: float = 0.3  # step of h across which smoothness falls to 1/e
+    noise: float = 0.01  # amplitude of h that is no texture
+    mean_sigma: float = 6.0  # px: h is log brightness less its mean over this neighbourhood
+
+
+@dataclass(frozen=True)
+class _Features:
+    feature: Buffer
+    grid: tuple[int, int, int, int]
+
+
+def _features(device: Device, level: Level, parameters: FlowParameters) -> _Features:
+    mean = pyramid.smooth(device, level, parameters.mean_sigma)
+    feature = device.empty((*level.image.shape, 4))
+    device.run("flow", "flow_feature", level.grid[:2], level.image, mean, level.mask, level.grid, feature)
+    return _Features(feature, level.grid)
+
+
+def _refine(device: Device, a: _Features, b: _Features, flow: Buffer, parameters: FlowParameters) -> Buffer:
+    """Improve `flow` from a to b on one level."""
+    grid, size = a.grid, a.grid[:2]
+    shape = size[::-1]
+    warped, tensor, left = (device.empty((*shape, 4)) for _ in range(3))
+    right, base = (device.empty((*shape, 2)) for _ in range(2))
+    system_left, system_right = (device.empty((*shape, 4)) for _ in range(2))
+    window_right = device.empty((*shape, 2))
+    for _ in range(parameters.warps):
+        device.run("flow", "flow_warp", size, b.feature, flow, grid, warped)
+        device.run(
+            "flow", "flow_tensor", size, a.feature, warped, grid,
+            parameters.brightness, parameters.gradient, parameters.noise, tensor, right,
+        )  # fmt: skip
+        device.run("flow", "flow_window", size, tensor, right, grid, left, window_right)
+        device.run(
+            "flow", "flow_system", size, left, window_right, flow, flow, a.feature, grid,
+            parameters.smoothness, parameters.contrast, system_left, system_right,
+        )  # fmt: skip
+        half = ((size[0] + 1) // 2, size[1])
+        for _ in range(parameters.sweeps):
+            for colour in (0, 1):
+                device.run(
+                    "flow", "flow_relax", half, system_left, system_right, grid, colour,
+                    parameters.relaxation, flow,
+                )  # fmt: skip
+        device.run("flow", "flow_median", size, flow, grid, base)
+        flow, base = base, flow
+    return flow
+
+
+def pair_flow(
+    device: Device, a: Level, b: Level, parameters: FlowParameters | None = None
+) -> tuple[Buffer, Buffer]:
+    """Flow from a to b and from b to a: two float32 (height, width, 2) in px of the grid.
+
+    a, b: log brightness with masks, 0 outside them.
+    """
+    parameters = parameters or FlowParameters()
+    shorter, levels = min(a.grid[:2]), 1
+    while shorter >= 2 * parameters.coarsest:
+        shorter, levels = shorter // 2, levels + 1
+    pyramids = [pyramid.build(device, image, levels) for image in (a, b)]
+    flows: list[Buffer] | None = None
+    for level in reversed(range(levels)):
+        features = [_features(device, p[level], parameters) for p in pyramids]
+        grid = features[0].grid
+        if flows is None:
+            flows = [device.zeros((grid[1], grid[0], 2)) for _ in range(2)]
+        else:
+            flows = [_expand(device, flow, grid) for flow in flows]
+        flows = [
+            _refine(device, features[i], features[1 - i], flow, parameters) for i, flow in enumerate(flows)
+        ]
+    assert flows is not None
+    return flows[0], flows[1]
+
+
+def _expand(device: Device, flow: Buffer, grid: tuple[int, int, int, int]) -> Buffer:
+    coarse = (flow.shape[1], flow.shape[0], grid[2], 0)
+    fine = device.empty((grid[1], grid[0], 2))
+    device.run("flow", "flow_expand", grid[:2], flow, coarse, fine, grid[:2])
+    return fine

@@ -1,0 +1,107 @@
+"""Where each layer is sampled and how much its colour counts (kernels/geometry.cl).
+
+x_k(p) = p + sum_j w_j(p) F_jk(p), and the softmax of Code 1 of Meng & Liu 2020, for any number of layers.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from hugin_abflow.chart import Chart
+from hugin_abflow.coefficient import Coefficients
+from hugin_abflow.opencl import Buffer, Device
+from hugin_abflow.settings import Settings
+from hugin_abflow.working import Grid, WorkingLayer
+
+# Flow longer than this share of the canvas's width is implausible; it does not sharpen the softmax further.
+_PLAUSIBLE = 0.1
+
+
+@dataclass(frozen=True)
+class PairFlow:
+    """Flow between layers a and b (indices) on their chart: float32 (height, width, 2), chart px.
+
+    `forward` is F_ab: what a shows at q, b shows at q + F_ab(q); `backward` is F_ba.
+    """
+
+    a: int
+    b: int
+    chart: Chart
+    forward: Buffer
+    backward: Buffer
+
+    def between(self, source: int) -> Buffer:
+        """Flow that starts on layer `source` of the pair."""
+        return self.forward if source == self.a else self.backward
+
+
+def fields(
+    device: Device,
+    layers: Sequence[WorkingLayer],
+    coefficients: Sequence[Coefficients],
+    flows: Sequence[PairFlow],
+    grid: Grid,
+    settings: Settings,
+) -> list[Buffer]:
+    """Per layer, on its box: float32 (height, width, 4), the displacement of x_k as a difference of points
+    (sphere: of unit vectors; plane: working px) and the colour weight s_k, not yet normalised.
+    """
+    result = []
+    for index, layer in enumerate(layers):
+        field = _displacement(device, index, layers, coefficients, flows, grid, None)
+        for _ in range(settings.fixed_point_steps):
+            field = _displacement(device, index, layers, coefficients, flows, grid, field)
+        result.append(field)
+    highest = device.zeros(grid.shape)
+    furthest = _PLAUSIBLE * grid.circumference
+    for layer, field, coefficient in zip(layers, result, coefficients, strict=True):
+        device.run(
+            "geometry", "geometry_activation", layer.box[2:], field, coefficient.blend, layer.box, grid.border,
+            float(settings.softmax_sharpness), float(settings.flow_magnitude), float(grid.circumference),
+            furthest, highest,
+        )  # fmt: skip
+    for layer, field, coefficient in zip(layers, result, coefficients, strict=True):
+        device.run(
+            "geometry", "geometry_softmax", layer.box[2:], field, coefficient.blend, coefficient.rim,
+            layer.box, grid.border, highest,
+        )  # fmt: skip
+    return result
+
+
+def _displacement(
+    device: Device,
+    index: int,
+    layers: Sequence[WorkingLayer],
+    coefficients: Sequence[Coefficients],
+    flows: Sequence[PairFlow],
+    grid: Grid,
+    guess: Buffer | None,
+) -> Buffer:
+    layer = layers[index]
+    field = device.zeros(layer.pixels.shape)
+    for pair in flows:
+        if index not in (pair.a, pair.b):
+            continue
+        other = pair.b if index == pair.a else pair.a
+        flow = pair.between(other if guess is None else index)
+        chart_grid = (pair.chart.width, pair.chart.height, int(pair.chart.wraps), 0)
+        device.run(
+            "geometry", "geometry_add", layer.box[2:], coefficients[other].blend, layers[other].box,
+            layer.pixels, layer.box, grid.border, grid.lens, flow, chart_grid, pair.chart.transform,
+            int(guess is not None), guess or field, field,
+        )  # fmt: skip
+    return field
+
+
+def reach(device: Device, layer: WorkingLayer, field: Buffer, grid: Grid) -> list[float]:
+    """Per row of the layer's box, the largest vertical displacement in working pixels."""
+    rows = device.empty((layer.box[3],))
+    device.run(
+        "geometry", "geometry_reach", (layer.box[3], 1), field, layer.box, int(grid.lens[1] == 0), rows
+    )
+    lengths = rows.get()
+    if grid.lens[1]:  # a chord is a little shorter than its angle
+        return [2 * math.asin(min(1.0, value / 2)) / grid.lens[3] for value in lengths.tolist()]
+    return [float(value) for value in lengths]

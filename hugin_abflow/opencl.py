@@ -1,0 +1,216 @@
+"""The OpenCL device: choose, build, run. The only module that uses pyopencl."""
+
+from __future__ import annotations
+
+import logging
+import os
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import pyopencl as cl
+
+from hugin_abflow.errors import DeviceError
+
+_log = logging.getLogger(__name__)
+
+# Work-group: rows of 64 suit both a GPU's wavefronts and the CPU's vector units.
+_GROUP = (64, 1)
+
+_INSTALL = {
+    "linux": "install a CPU runtime with `pip install 'pyopencl[pocl]'` (or Debian's pocl-opencl-icd), "
+    "or your graphics card's OpenCL driver",
+    "win32": "install your graphics card's driver, or Intel's CPU runtime for OpenCL",
+    "darwin": "use a macOS with Apple's OpenCL, or install pocl from conda-forge",
+}
+
+
+@dataclass(frozen=True)
+class DeviceInfo:
+    """One line of ``--list-devices``. memory: bytes; kind: "GPU", "CPU" or "other"."""
+
+    index: int
+    name: str
+    platform: str
+    kind: str
+    memory: int
+    default: bool
+
+
+def _kernel_folder() -> Path:
+    """Kernels lie in the package (wheel) or beside it (checkout, editable install)."""
+    package = Path(__file__).resolve().parent
+    return next(f for f in (package / "kernels", package.parent / "kernels") if f.is_dir())
+
+
+@cache
+def kernel_source(module: str) -> str:
+    """Source of ``kernels/<module>.cl`` with common.cl in front; #line keeps messages true."""
+    folder = _kernel_folder()
+    parts = [f'#line 1 "{name}.cl"\n{(folder / f"{name}.cl").read_text()}\n' for name in ("common", module)]
+    return "".join(parts)
+
+
+def _kind(device: cl.Device) -> str:
+    if device.type & cl.device_type.GPU:
+        return "GPU"
+    return "CPU" if device.type & cl.device_type.CPU else "other"
+
+
+def _devices() -> list[cl.Device]:
+    try:
+        platforms = cl.get_platforms()
+    except cl.Error:
+        platforms = []
+    found = []
+    for platform in platforms:
+        try:
+            found += platform.get_devices()
+        except cl.Error as error:  # a platform without devices must not hide the others
+            _log.debug("%s: %s", platform.name, error)
+    return found
+
+
+def _speed(device: cl.Device) -> tuple[bool, int]:
+    """Sort key: GPUs first, then by units x clock. Vendors count units differently; it is a guess."""
+    return _kind(device) == "GPU", device.max_compute_units * max(device.max_clock_frequency, 1)
+
+
+def list_devices() -> list[DeviceInfo]:
+    """All OpenCL devices; the one that is used by default is marked."""
+    found = _devices()
+    best = max(found, key=_speed, default=None)
+    return [
+        DeviceInfo(i, d.name.strip(), d.platform.name.strip(), _kind(d), d.global_mem_size, d == best)
+        for i, d in enumerate(found)
+    ]
+
+
+def _choose(wanted: str | None) -> cl.Device:
+    found = _devices()
+    if not found:
+        remedy = _INSTALL.get(sys.platform, _INSTALL["linux"])
+        raise DeviceError(f"no OpenCL device found; {remedy}")
+    if wanted is None:
+        return max(found, key=_speed)
+    if wanted.isdecimal():
+        if int(wanted) < len(found):
+            return found[int(wanted)]
+    else:
+        for device in found:
+            if wanted.lower() in f"{device.name} {device.platform.name}".lower():
+                return device
+    names = ", ".join(f"{i}: {d.name.strip()}" for i, d in enumerate(found))
+    raise DeviceError(f"no OpenCL device fits --device {wanted}; there are {names}")
+
+
+class Buffer:
+    """An array on the device: shape and dtype with a `cl.Buffer`. Freed with the object."""
+
+    def __init__(self, device: Device, shape: tuple[int, ...], dtype: npt.DTypeLike) -> None:
+        self.shape, self.dtype = shape, np.dtype(dtype)
+        self.nbytes = int(np.prod(shape, dtype=np.int64)) * self.dtype.itemsize
+        self.data = cl.Buffer(device.context, cl.mem_flags.READ_WRITE, max(self.nbytes, 16))
+        self._queue = device.queue
+
+    def get(self) -> npt.NDArray[Any]:
+        """Copy to the host."""
+        host = np.empty(self.shape, self.dtype)
+        if host.size:
+            cl.enqueue_copy(self._queue, host, self.data)
+        return host
+
+    def set(self, host: npt.NDArray[Any]) -> Buffer:
+        """Copy from the host; `host` has this buffer's shape."""
+        if host.size:
+            cl.enqueue_copy(self._queue, self.data, np.ascontiguousarray(host, self.dtype))
+        return self
+
+    def fill(self, value: float) -> Buffer:
+        """Set every element."""
+        if self.nbytes:
+            pattern = np.array(value, self.dtype)
+            cl.enqueue_fill_buffer(self._queue, self.data, pattern, 0, self.nbytes)
+        return self
+
+
+class Device:
+    """A device with its queue and built kernels.
+
+    Raises `DeviceError` if there is none, none fits `wanted`, or a kernel does not build.
+    """
+
+    def __init__(self, wanted: str | None = None) -> None:
+        self.device = _choose(wanted)
+        self.context = cl.Context([self.device])
+        self.queue = cl.CommandQueue(self.context)
+        self._kernels: dict[tuple[str, str, str], cl.Kernel] = {}
+        _log.info("device: %s (%s)", self.device.name.strip(), self.device.platform.name.strip())
+
+    def empty(self, shape: Sequence[int], dtype: npt.DTypeLike = np.float32) -> Buffer:
+        """An uninitialised array."""
+        return Buffer(self, tuple(shape), dtype)
+
+    def zeros(self, shape: Sequence[int], dtype: npt.DTypeLike = np.float32) -> Buffer:
+        """An array of zeros."""
+        return self.empty(shape, dtype).fill(0)
+
+    def upload(self, host: npt.NDArray[Any], dtype: npt.DTypeLike | None = None) -> Buffer:
+        """A copy of a host array."""
+        return self.empty(host.shape, dtype or host.dtype).set(host)
+
+    def kernel(self, module: str, name: str, options: str = "") -> cl.Kernel:
+        """Kernel `name` of ``kernels/<module>.cl``, built once per set of options."""
+        key = (module, name, options)
+        if key not in self._kernels:
+            try:
+                program = cl.Program(self.context, kernel_source(module))
+                program.build(["-cl-std=CL1.2", *options.split()])
+            except cl.Error as error:
+                raise DeviceError(
+                    f"kernels/{module}.cl does not build on {self.device.name.strip()}: {error}; "
+                    "update the OpenCL driver or choose another --device"
+                ) from error
+            for found in program.all_kernels():
+                self._kernels[(module, found.function_name, options)] = found
+        return self._kernels[key]
+
+    def run(self, module: str, name: str, size: Sequence[int], *args: object, options: str = "") -> None:
+        """Run a kernel over `size` (columns, rows) work items.
+
+        Arguments: `Buffer`, int (int32), float (float32), or a tuple / array of 2, 4 or 16 numbers,
+        which becomes an int or float vector. The run size is rounded up to whole work-groups; every
+        kernel checks bounds first.
+        """
+        if min(size) <= 0:
+            return
+        kernel = self.kernel(module, name, options)
+        kernel.set_args(*(_argument(a) for a in args))
+        rounded = tuple(-(-int(n) // g) * g for n, g in zip(size, _GROUP, strict=True))
+        cl.enqueue_nd_range_kernel(self.queue, kernel, rounded, _GROUP)
+
+    def finish(self) -> None:
+        """Wait for all that was started; raises `DeviceError` if the device failed."""
+        self.queue.finish()
+
+
+def _argument(value: Any) -> Any:
+    if isinstance(value, Buffer):
+        return value.data
+    if isinstance(value, bool | int | np.integer):
+        return np.int32(value)
+    if isinstance(value, float | np.floating):
+        return np.float32(value)
+    vector = np.asarray(value)
+    kind = "int" if vector.dtype.kind in "iu" else "float"
+    return getattr(cl.cltypes, f"make_{kind}{vector.size}")(*vector.tolist())
+
+
+def quiet_runtime() -> None:
+    """Keep pyopencl's notes about compiler output off the user's terminal."""
+    os.environ.setdefault("PYOPENCL_NO_CACHE", "0")

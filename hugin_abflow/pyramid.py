@@ -1,0 +1,67 @@
+"""Mask-normalised pyramids and smoothing on the device (kernels/pyramid.cl).
+
+Images are float32 (height, width); masks float32 of the same shape, 0 or 1. What lies outside a mask
+never enters a sum. Coarse position = fine position / 2 for any size, odd ones too.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from hugin_abflow.opencl import Buffer, Device
+
+
+@dataclass(frozen=True)
+class Level:
+    """One level: image, mask and whether columns wrap."""
+
+    image: Buffer
+    mask: Buffer
+    wraps: bool
+
+    @property
+    def grid(self) -> tuple[int, int, int, int]:
+        """(width, height, wraps, 0), as the kernels take it."""
+        return self.image.shape[1], self.image.shape[0], int(self.wraps), 0
+
+
+def reduce(device: Device, level: Level) -> Level:
+    """The next coarser level; a pixel is valid where at least half of its weight is."""
+    width, height = level.grid[:2]
+    small = Level(
+        device.empty(((height + 1) // 2, (width + 1) // 2)),
+        device.empty(((height + 1) // 2, (width + 1) // 2)),
+        level.wraps,
+    )
+    size = small.grid[:2]
+    device.run(
+        "pyramid", "pyramid_reduce", size, level.image, level.mask, level.grid, small.image, small.mask, size
+    )
+    return small
+
+
+def build(device: Device, finest: Level, levels: int) -> list[Level]:
+    """`levels` levels, finest first."""
+    pyramid = [finest]
+    while len(pyramid) < levels:
+        pyramid.append(reduce(device, pyramid[-1]))
+    return pyramid
+
+
+def smooth(device: Device, level: Level, sigma: float) -> Buffer:
+    """Gaussian mean of the valid pixels around each pixel, sigma in px; 0 where there are none.
+
+    Expects an image that is 0 where its mask is.
+    """
+    grid, radius = level.grid, max(1, round(2.5 * sigma))
+    shape = level.image.shape
+    image, weight, mean, total = (device.empty(shape) for _ in range(4))
+    device.run(
+        "pyramid", "pyramid_smooth", grid[:2],
+        level.image, level.mask, grid, (1, 0), float(sigma), radius, 0, image, weight,
+    )  # fmt: skip
+    device.run(
+        "pyramid", "pyramid_smooth", grid[:2],
+        image, weight, grid, (0, 1), float(sigma), radius, 1, mean, total,
+    )  # fmt: skip
+    return mean

@@ -1,0 +1,157 @@
+"""The working canvas: a reduced grid with a bounded number of pixels on which everything that sees far
+is calculated (kernels/working.cl).
+
+The grid covers the layers' common bounding box ("region"; the canvas's whole width where it wraps), with
+separate ratios in x and y, so that edges coincide for any size. A working pixel is valid only if every
+full-resolution pixel under it is, so that layers cut from one picture agree exactly.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from hugin_abflow.layer import Box, Canvas, Layer
+from hugin_abflow.opencl import Buffer, Device
+from hugin_abflow.progress import Advance
+from hugin_abflow.settings import Settings
+
+# Rows of a layer that are decoded and uploaded at a time.
+_ROWS = 256
+
+# OpenCL type and full-scale value of each depth; half is widened on the host.
+PIXEL = {"uint8": ("uchar", 255.0), "uint16": ("ushort", 65535.0), "float32": ("float", 1.0)}
+
+
+@dataclass(frozen=True)
+class Grid:
+    """A pixel grid over the region.
+
+    region      full-resolution canvas pixels that it covers.
+    width, height    of the grid.
+    wraps, poles     border rules (kernels/common.cl); poles: bit 0 at the top, bit 1 at the bottom.
+    lens        (lon of x = 0, radians per column, lat of y = 0, radians per row); zeros on a plane.
+    """
+
+    region: Box
+    width: int
+    height: int
+    wraps: bool
+    poles: int
+    lens: tuple[float, float, float, float]
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """(height, width), as arrays have it."""
+        return self.height, self.width
+
+    @property
+    def border(self) -> tuple[int, int, int, int]:
+        """Grid as the kernels take it: (width, height, wraps, poles)."""
+        return self.width, self.height, int(self.wraps), self.poles
+
+    @property
+    def circumference(self) -> float:
+        """The canvas's width as the flow-magnitude term takes it: 2 pi on the sphere, else grid px."""
+        return 2 * math.pi if self.lens[1] else float(self.width)
+
+    def resized(self, width: int, height: int) -> Grid:
+        """The same region on another number of pixels."""
+        lon, dlon, lat, dlat = self.lens
+        lens = (lon, dlon * self.width / width, lat, dlat * self.height / height)
+        return Grid(self.region, width, height, self.wraps, self.poles, lens)
+
+
+@dataclass(frozen=True)
+class WorkingLayer:
+    """A layer on the working grid: pixels float32 (height, width, 4), r, g, b in 0..1 and valid.
+
+    box: (left, top, width, height) on the grid.
+    """
+
+    layer: Layer
+    box: tuple[int, int, int, int]
+    pixels: Buffer
+
+
+def full_grid(canvas: Canvas, layers: Sequence[Layer]) -> Grid:
+    """The region's own pixels: the layers' common bounding box at full resolution."""
+    top = min(layer.box.top for layer in layers)
+    bottom = max(layer.box.bottom for layer in layers)
+    left = 0 if canvas.wraps else min(layer.box.left for layer in layers)
+    right = canvas.width if canvas.wraps else max(layer.box.right for layer in layers)
+    lens, poles = (0.0, 0.0, 0.0, 0.0), 0
+    if canvas.spherical:
+        step = math.radians(canvas.hfov) / canvas.width
+        lens = ((left - canvas.width / 2) * step, step, (canvas.height / 2 - top) * step, step)
+        if canvas.wraps and canvas.width % 2 == 0:
+            poles += abs(lens[2] - math.pi / 2) < step / 2
+            poles += 2 * (abs(lens[2] - (bottom - top) * step + math.pi / 2) < step / 2)
+    return Grid(Box(left, top, right, bottom), right - left, bottom - top, canvas.wraps, poles, lens)
+
+
+def working_grid(full: Grid, settings: Settings) -> Grid:
+    """The grid on which flow, coefficients and colour are calculated."""
+    ratio = max(1.0, math.sqrt(full.width * full.height / settings.working_pixels))
+    width, height = max(2, round(full.width / ratio)), max(1, round(full.height / ratio))
+    if ratio > 1 and full.wraps:
+        width += width % 2  # crossing a pole goes half the width further
+    return full.resized(min(width, full.width), min(height, full.height))
+
+
+def pixel_options(layer: Layer) -> tuple[str, float]:
+    """Build options and full-scale value for a layer's rows on the device."""
+    name, white = PIXEL["float32" if layer.dtype == np.float16 else layer.dtype.name]
+    return f"-DPIXEL={name} -DSAMPLES={layer.channels + 1}", white
+
+
+def device_rows(layer: Layer, top: int, bottom: int) -> np.ndarray:
+    """Rows of a layer in a type that kernels read (half as float32)."""
+    rows = layer.read(top, bottom)
+    return rows.astype(np.float32) if rows.dtype == np.float16 else rows
+
+
+def _span(low: int, high: int, start: int, ratio: tuple[int, int]) -> tuple[int, int]:
+    """Grid pixels (first, end) that lie wholly within full-resolution pixels [low, high)."""
+    full, small = ratio
+    return -(-(low - start) * small // full), (high - start) * small // full
+
+
+def reduce_layer(device: Device, layer: Layer, grid: Grid, advance: Advance) -> WorkingLayer:
+    """Decode a layer once, band by band, onto the working grid; `advance` counts its rows."""
+    region = grid.region
+    left, right = _span(layer.box.left, layer.box.right, region.left, (region.width, grid.width))
+    top, bottom = _span(layer.box.top, layer.box.bottom, region.top, (region.height, grid.height))
+    width, height = max(1, right - left), max(1, bottom - top)
+    box = (left, top, width, height)
+    pixels = device.zeros((height, width, 4))
+    options, white = pixel_options(layer)
+    ratio = (region.width, grid.width, region.height, grid.height)
+    step = max(1, _ROWS * grid.height // region.height)
+    place_x, place_y = layer.box.left - region.left, layer.box.top - region.top
+    for first in range(0, bottom - top, step):
+        rows = min(step, bottom - top - first)
+        start = (top + first) * region.height // grid.height - place_y
+        end = -(-(top + first + rows) * region.height // grid.height) - place_y
+        stored = device.upload(device_rows(layer, start, end))
+        place = (place_x, start + place_y, layer.box.width, end - start)
+        device.run(
+            "working", "working_reduce", (width, rows), stored, place, ratio, box, first, (width, rows),
+            white, pixels, options=options,
+        )  # fmt: skip
+        advance(end - start)
+    return WorkingLayer(layer, box, pixels)
+
+
+def same_where_both(device: Device, a: WorkingLayer, b: WorkingLayer) -> bool:
+    """Whether two layers show the same colours wherever both cover the grid: then there is no parallax."""
+    differs = device.zeros((1,), np.int32)
+    options, _ = pixel_options(a.layer)
+    size = a.box[2:]
+    device.run(
+        "working", "working_compare", size, a.pixels, a.box, b.pixels, b.box, differs, options=options
+    )
+    return not differs.get()[0]

@@ -1,0 +1,158 @@
+/* The full-resolution pass over one band of rows. Built with PIXEL (stored sample type), SAMPLES (2 or 4, alpha
+   last), WHITE (full scale) and INTEGER (1: round and saturate). Band pixels are canvas pixels; `band` is the
+   band's place in the region: left, top, width, height. */
+
+/* Count the layers that cover each pixel. */
+__kernel void blend_count(__global const PIXEL *rows, /* (box.w, box.z, SAMPLES) */
+                          int4 box, int4 band,        /* place of `rows`; band, run size */
+                          __global uchar *count)      /* (band.w, band.z) */
+{
+    const int x = get_global_id(0), y = get_global_id(1);
+    if (x >= band.z || y >= band.w)
+        return;
+    const int at = box_index((int2)(x + band.x, y + band.y), box);
+    if (at >= 0 && (float)rows[(size_t)at * SAMPLES + SAMPLES - 1] >= 0.5f * WHITE)
+        count[y * band.z + x] += 1;
+}
+
+inline float4 blend_pixel(__global const PIXEL *rows, int at) {
+    __global const PIXEL *p = rows + (size_t)at * SAMPLES;
+    const float valid = (float)p[SAMPLES - 1] >= 0.5f * WHITE ? 1.0f : 0.0f;
+    return valid != 0.0f ? (float4)(p[0], p[SAMPLES > 2 ? 1 : 0], p[SAMPLES > 2 ? 2 : 0], 1.0f) : (float4)(0.0f);
+}
+
+inline float4 blend_tap(__global const PIXEL *rows, int4 box, int2 p, int4 border) {
+    if (!grid_border(&p, border))
+        return (float4)(0.0f);
+    const int at = box_index(p, box);
+    return at < 0 ? (float4)(0.0f) : blend_pixel(rows, at);
+}
+
+/* Bicubic sample at position q; next to the mask's rim bilinear over the valid taps, whose share is w. */
+inline float4 blend_sample(__global const PIXEL *rows, int4 box, float2 q, int4 border, int nearest) {
+    if (nearest)
+        return blend_tap(rows, box, convert_int2(floor(q)), border);
+    const float2 p = q - 0.5f, base = floor(p), t = p - base;
+    const int2 corner = convert_int2(base);
+    const float4 wx = catmull_rom(t.x), wy = catmull_rom(t.y);
+    const float ax[4] = {wx.x, wx.y, wx.z, wx.w}, ay[4] = {wy.x, wy.y, wy.z, wy.w};
+    float4 cubic = (float4)(0.0f), linear = (float4)(0.0f);
+    int missing = 0;
+    for (int j = 0; j < 4; ++j) {
+        float4 row = (float4)(0.0f);
+        for (int i = 0; i < 4; ++i) {
+            const float4 c = blend_tap(rows, box, corner + (int2)(i - 1, j - 1), border);
+            row += ax[i] * c;
+            missing += c.w == 0.0f;
+            if (i > 0 && i < 3 && j > 0 && j < 3)
+                linear += (i == 1 ? 1.0f - t.x : t.x) * (j == 1 ? 1.0f - t.y : t.y) * c;
+        }
+        cubic += ay[j] * row;
+    }
+    if (missing == 0)
+        return (float4)(cubic.xyz, 1.0f);
+    return linear.w > 0.0f ? (float4)(linear.xyz / linear.w, linear.w) : (float4)(0.0f);
+}
+
+/* Bilinear reading of a float4 grid that covers `box` of a canvas grid; beyond the box, the box's rim. */
+inline float4 blend_field(__global const float4 *field, int4 box, float2 q, int4 border) {
+    const float2 p = q - 0.5f, base = floor(p), t = p - base;
+    float4 sum = (float4)(0.0f);
+    for (int j = 0; j < 2; ++j)
+        for (int i = 0; i < 2; ++i) {
+            int2 c = convert_int2(base) + (int2)(i, j);
+            if (border.z && box.z == border.x) {
+                c.y = clamp(c.y, 0, border.y - 1);
+                grid_border(&c, border);
+            }
+            const int x = clamp(c.x - box.x, 0, box.z - 1), y = clamp(c.y - box.y, 0, box.w - 1);
+            sum += (i ? t.x : 1.0f - t.x) * (j ? t.y : 1.0f - t.y) * field[y * box.z + x];
+        }
+    return sum;
+}
+
+/* Where layer k is sampled for the pixel at p: the field's displacement carried to full resolution. */
+inline float2 blend_position(float2 p, float3 d, float2 ratio, float4 lens) {
+    if (d.x == 0.0f && d.y == 0.0f && d.z == 0.0f)
+        return p;
+    if (lens.y == 0.0f)
+        return p + d.xy * ratio;
+    /* in the frame of p (east, north, up) the change of longitude is small, hence exact in float32 */
+    const float lon = lens.x + p.x * lens.y, lat = lens.z - p.y * lens.w;
+    const float sl = sin(lon), cl = cos(lon), sp = sin(lat), cp = cos(lat);
+    const float horizontal = sl * d.x + cl * d.y;
+    const float east = cl * d.x - sl * d.y, out = cp + horizontal;
+    const float north = sp + d.z;
+    return (float2)(p.x + atan2(east, out) / lens.y,
+                    p.y + (lat - atan2(north, hypot(east, out))) / lens.w);
+}
+
+/* Smooth exposure correction, log gain, on a floor that keeps dark noise calm; exactly none where it is 0. */
+inline float3 blend_correct(float3 c, float3 gain) {
+    const float floor_value = 0.02f * WHITE;
+    const float3 corrected = (c + floor_value) * exp(gain) - floor_value;
+    return select(corrected, c, gain == 0.0f);
+}
+
+/* Add one layer. The sum is of differences from a reference, so that equal colours stay equal to the bit. */
+__kernel void blend_add(__global const PIXEL *rows, /* (box.w, box.z, SAMPLES) */
+                        int4 box, int4 band,        /* place of `rows`; band, run size */
+                        int4 border, float4 lens,   /* full-resolution grid of the region */
+                        __global const float4 *field, int4 field_box, int4 field_border, /* working grid */
+                        __global const float4 *gain, int4 gain_border, /* colour grid, log gain r, g, b */
+                        int corrected,                                 /* 0: gain is not read */
+                        int nearest,                                   /* 1: nearest-neighbour sampling */
+                        __global const uchar *count,                   /* (band.w, band.z) */
+                        __global float4 *reference,                    /* (band.w, band.z) colour, 1 if set */
+                        __global float4 *sum)                          /* (band.w, band.z) weighted, weight */
+{
+    const int x = get_global_id(0), y = get_global_id(1);
+    if (x >= band.z || y >= band.w)
+        return;
+    const int2 place = (int2)(x + band.x, y + band.y);
+    const int inside = box_index(place, box);
+    if (inside < 0)
+        return;
+    const float4 own = blend_pixel(rows, inside);
+    if (own.w == 0.0f)
+        return;
+    const int at = y * band.z + x;
+    const float2 p = (float2)(place.x + 0.5f, place.y + 0.5f);
+    const float2 scale = (float2)((float)border.x / field_border.x, (float)border.y / field_border.y);
+    float3 g = (float3)(0.0f);
+    if (corrected) {
+        const float2 q = p * (float2)((float)gain_border.x / border.x, (float)gain_border.y / border.y);
+        g = blend_field(gain, (int4)(0, 0, gain_border.x, gain_border.y), q, gain_border).xyz;
+    }
+    float4 first = reference[at];
+    if (first.w == 0.0f) {
+        first = (float4)(blend_correct(own.xyz, g), 1.0f);
+        reference[at] = first;
+    }
+    if (count[at] < 2)
+        return;
+    const float4 f = blend_field(field, field_box, p / scale, field_border);
+    if (f.w <= 0.0f)
+        return;
+    const float4 c = blend_sample(rows, box, blend_position(p, f.xyz, scale, lens), border, nearest);
+    /* a sample that falls outside its layer counts smoothly less */
+    const float w = f.w * c.w * c.w;
+    if (w > 0.0f)
+        sum[at] += (float4)((blend_correct(c.xyz, g) - first.xyz) * w, w);
+}
+
+__kernel void blend_finish(__global const float4 *reference, /* (band.w, band.z) */
+                           __global const float4 *sum,       /* (band.w, band.z) */
+                           int4 band,                        /* run size */
+                           __global PIXEL *out)              /* (band.w, band.z, SAMPLES) */
+{
+    const int x = get_global_id(0), y = get_global_id(1);
+    if (x >= band.z || y >= band.w)
+        return;
+    const int at = y * band.z + x;
+    const float4 s = sum[at], r = reference[at];
+    const float3 c = r.xyz + (s.w > 1e-12f ? s.xyz / s.w : (float3)(0.0f));
+    const float v[4] = {c.x, SAMPLES > 2 ? c.y : r.w * WHITE, c.z, r.w * WHITE};
+    for (int k = 0; k < SAMPLES; ++k)
+        out[(size_t)at * SAMPLES + k] = INTEGER ? (PIXEL)clamp(rint(v[k]), 0.0f, (float)WHITE) : (PIXEL)v[k];
+}

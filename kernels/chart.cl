@@ -1,0 +1,48 @@
+/* Layers seen on a pair's chart. */
+
+inline float4 chart_tap(__global const float4 *layer, int4 box, int2 p, int4 border) {
+    if (!grid_border(&p, border))
+        return (float4)(0.0f);
+    const int at = box_index(p, box);
+    return at < 0 ? (float4)(0.0f) : layer[at];
+}
+
+/* Log brightness of a layer on a chart: bicubic where all taps are valid, bilinear at the rim of the mask. */
+__kernel void chart_sample(__global const float4 *layer, /* (box.w, box.z) r, g, b, valid */
+                           int4 box,                     /* place of `layer` on the canvas grid */
+                           int4 border, float4 lens,     /* canvas grid */
+                           float16 chart, int2 size,     /* run size */
+                           float floor_value,            /* added before the logarithm: dark noise */
+                           __global float *image,        /* (size.y, size.x) */
+                           __global float *mask)         /* (size.y, size.x), 0 or 1 */
+{
+    const int i = get_global_id(0), j = get_global_id(1);
+    if (i >= size.x || j >= size.y)
+        return;
+    const float2 p = canvas_position(chart_point((float2)(i + 0.5f, j + 0.5f), chart), lens) - 0.5f;
+    float2 base = floor(p), t = p - base;
+    /* positions come out of trigonometry or scaling: what is a whole pixel but for rounding is a copy */
+    if (t.x > 0.9995f) { base.x += 1.0f; t.x = 0.0f; }
+    if (t.y > 0.9995f) { base.y += 1.0f; t.y = 0.0f; }
+    t = select(t, (float2)(0.0f), t < 0.0005f);
+    const int2 corner = convert_int2(base);
+    const float4 wx = catmull_rom(t.x), wy = catmull_rom(t.y);
+    const float ax[4] = {wx.x, wx.y, wx.z, wx.w}, ay[4] = {wy.x, wy.y, wy.z, wy.w};
+    float4 cubic = (float4)(0.0f), linear = (float4)(0.0f);
+    bool inner = true, outer = true;
+    for (int y = 0; y < 4; ++y)
+        for (int x = 0; x < 4; ++x) {
+            const float w = ax[x] * ay[y];
+            const float4 c = chart_tap(layer, box, corner + (int2)(x - 1, y - 1), border);
+            cubic += w * c;
+            const bool centre = x > 0 && x < 3 && y > 0 && y < 3;
+            const float l = centre ? (x == 1 ? 1.0f - t.x : t.x) * (y == 1 ? 1.0f - t.y : t.y) : 0.0f;
+            linear += l * c;
+            outer = outer && (w == 0.0f || c.w != 0.0f);
+            inner = inner && (l == 0.0f || c.w != 0.0f);
+        }
+    const float3 c = fmax(outer ? cubic.xyz : linear.xyz, 0.0f);
+    const float brightness = 0.299f * c.x + 0.587f * c.y + 0.114f * c.z;
+    image[j * size.x + i] = inner ? log(brightness + floor_value) : 0.0f;
+    mask[j * size.x + i] = inner ? 1.0f : 0.0f;
+}

@@ -1,0 +1,142 @@
+/* Distances and blend coefficients. Distances are found on a mask grid by jump flooding (Rong and Tan 2006):
+   every pixel learns the nearest seed from neighbours at halving steps. */
+
+/* 1 where every working pixel that a mask pixel touches is valid. */
+__kernel void coefficient_mask(__global const float4 *layer, /* (box.w, box.z) r, g, b, valid */
+                               int4 box,                     /* place of `layer` on the working grid */
+                               int4 working,                 /* working grid */
+                               int4 grid,                    /* mask grid, over the same region; run size */
+                               __global uchar *mask)         /* (grid.y, grid.x) */
+{
+    const int x = get_global_id(0), y = get_global_id(1);
+    if (x >= grid.x || y >= grid.y)
+        return;
+    bool valid = true;
+    for (int j = y * working.y / grid.y; j * grid.y < (y + 1) * working.y; ++j)
+        for (int i = x * working.x / grid.x; i * grid.x < (x + 1) * working.x; ++i) {
+            const int at = box_index((int2)(i, j), box);
+            valid = valid && at >= 0 && layer[at].w != 0.0f;
+        }
+    mask[y * grid.x + x] = valid;
+}
+
+/* Seeds of D_k: the union's pixels that layer k does not cover, as packed index; -1 elsewhere. */
+__kernel void coefficient_seed(__global const uchar *mask,  /* (grid.y, grid.x) of layer k */
+                               __global const uchar *cover, /* (grid.y, grid.x) union */
+                               int4 grid,                   /* run size */
+                               __global int *seed)          /* (grid.y, grid.x) */
+{
+    const int x = get_global_id(0), y = get_global_id(1);
+    if (x >= grid.x || y >= grid.y)
+        return;
+    const int at = y * grid.x + x;
+    seed[at] = cover[at] && !mask[at] ? at : -1;
+}
+
+/* Distance in mask pixels; on the sphere the chord's angle over the angle of a column. */
+inline float coefficient_between(int2 p, int2 q, int4 grid, float4 lens) {
+    float dx = fabs((float)(p.x - q.x));
+    if (grid.z)
+        dx = fmin(dx, grid.x - dx);
+    if (lens.y == 0.0f)
+        return hypot(dx, (float)(p.y - q.y));
+    const float a = lens.z - (p.y + 0.5f) * lens.w, b = lens.z - (q.y + 0.5f) * lens.w;
+    const float u = sin(0.5f * (a - b)), v = sin(0.5f * dx * lens.y); /* haversine: exact for small angles */
+    return 2.0f * asin(fmin(1.0f, sqrt(u * u + cos(a) * cos(b) * v * v))) / lens.y;
+}
+
+__kernel void coefficient_flood(__global const int *seed, /* (grid.y, grid.x) */
+                                int4 grid, float4 lens,   /* mask grid, run size */
+                                int step,
+                                __global int *flooded) /* (grid.y, grid.x) */
+{
+    const int x = get_global_id(0), y = get_global_id(1);
+    if (x >= grid.x || y >= grid.y)
+        return;
+    int best = -1;
+    float nearest = INFINITY;
+    for (int j = -step; j <= step; j += step)
+        for (int i = -step; i <= step; i += step) {
+            int2 p = (int2)(x + i, y + j);
+            if (!grid_border(&p, grid))
+                continue;
+            const int s = seed[p.y * grid.x + p.x];
+            if (s < 0)
+                continue;
+            const float d = coefficient_between((int2)(x, y), (int2)(s % grid.x, s / grid.x), grid, lens);
+            if (d < nearest || (d == nearest && s < best)) {
+                nearest = d;
+                best = s;
+            }
+        }
+    flooded[y * grid.x + x] = best;
+}
+
+/* D_k in working pixels: 0 outside the layer, `furthest` where the union has nothing outside it. */
+__kernel void coefficient_distance(__global const int *seed,   /* (grid.y, grid.x) */
+                                   __global const uchar *mask, /* (grid.y, grid.x) */
+                                   int4 grid, float4 lens,     /* mask grid, run size */
+                                   float unit,                 /* working px per mask px */
+                                   float furthest,             /* working px */
+                                   __global float *distance)   /* (grid.y, grid.x) */
+{
+    const int x = get_global_id(0), y = get_global_id(1);
+    if (x >= grid.x || y >= grid.y)
+        return;
+    const int at = y * grid.x + x, s = seed[at];
+    if (!mask[at])
+        distance[at] = 0.0f;
+    else
+        distance[at] = s < 0 ? furthest
+                             : unit * coefficient_between((int2)(x, y), (int2)(s % grid.x, s / grid.x), grid, lens);
+}
+
+/* D_k on the working grid, bilinear; never 0 on a valid pixel, so that a lone layer has coefficient 1. */
+__kernel void coefficient_expand(__global const float *distance, /* (grid.y, grid.x) */
+                                 int4 grid, float2 ratio,        /* mask grid; mask px per working px */
+                                 __global const float4 *layer,   /* (box.w, box.z) */
+                                 int4 box,                       /* place on the working grid; run size */
+                                 int4 working,                   /* working grid */
+                                 __global float *expanded,       /* (box.w, box.z) */
+                                 __global float *total)          /* (working.y, working.x) sum over layers */
+{
+    const int x = get_global_id(0), y = get_global_id(1);
+    if (x >= box.z || y >= box.w)
+        return;
+    const int at = y * box.z + x;
+    float d = 0.0f;
+    if (layer[at].w != 0.0f) {
+        const float2 q = ((float2)(x + box.x, y + box.y) + 0.5f) * ratio - 0.5f;
+        const float2 base = floor(q), t = q - base;
+        float weight = 0.0f;
+        for (int j = 0; j < 2; ++j)
+            for (int i = 0; i < 2; ++i) {
+                int2 p = convert_int2(base) + (int2)(i, j);
+                if (!grid_border(&p, grid))
+                    continue;
+                const float w = (i ? t.x : 1.0f - t.x) * (j ? t.y : 1.0f - t.y);
+                d += w * distance[p.y * grid.x + p.x];
+                weight += w;
+            }
+        d = fmax(d / weight, 1e-3f);
+    }
+    expanded[at] = d;
+    total[(y + box.y) * working.x + x + box.x] += d;
+}
+
+/* w_k = D_k / sum_j D_j, in place. */
+__kernel void coefficient_ratio(__global float *distance,     /* (box.w, box.z) D_k, becomes w_k */
+                                int4 box,                     /* place on the working grid; run size */
+                                int4 working,                 /* working grid */
+                                __global const float *total,  /* (working.y, working.x) */
+                                float feather,                /* working px, 0: none */
+                                __global float *rim)          /* (box.w, box.z) m_k = min(1, D_k / feather) */
+{
+    const int x = get_global_id(0), y = get_global_id(1);
+    if (x >= box.z || y >= box.w)
+        return;
+    const int at = y * box.z + x;
+    const float d = distance[at];
+    rim[at] = feather > 0.0f ? fmin(1.0f, d / feather) : (d > 0.0f ? 1.0f : 0.0f);
+    distance[at] = d > 0.0f ? d / total[(y + box.y) * working.x + x + box.x] : 0.0f;
+}

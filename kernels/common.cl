@@ -1,0 +1,83 @@
+/* Rules every kernel shares; put in front of each source by hugin_abflow/opencl.py.
+
+   Frames. A grid is an array of pixels; positions on it are continuous, x right, y down, and pixel (i, j)
+   covers [i, i+1) x [j, j+1), so its centre is at (i + 0.5, j + 0.5). "Point" is a place in the scene's
+   frame: on a spherical canvas a unit vector (x right, y forward, z up), on a plane (x, y, 0) in canvas
+   grid pixels. */
+
+/* Borders of a grid, given as (width, height, wraps, poles): columns are taken modulo the width where the
+   grid wraps; a row beyond a pole is the mirrored row half a turn further. Returns false outside. */
+inline bool grid_border(int2 *p, int4 grid) {
+    if (p->y < 0 || p->y >= grid.y) {
+        if (!(grid.w & (p->y < 0 ? 1 : 2)))
+            return false;
+        p->y = p->y < 0 ? -1 - p->y : 2 * grid.y - 1 - p->y;
+        p->x += grid.x / 2;
+        if (p->y < 0 || p->y >= grid.y)
+            return false;
+    }
+    if (p->x < 0 || p->x >= grid.x) {
+        if (!grid.z)
+            return false;
+        p->x %= grid.x;
+        p->x += p->x < 0 ? grid.x : 0;
+    }
+    return true;
+}
+
+/* Index of canvas pixel p in an array that covers box (left, top, width, height); -1 outside. */
+inline int box_index(int2 p, int4 box) {
+    const int x = p.x - box.x, y = p.y - box.y;
+    return x >= 0 && y >= 0 && x < box.z && y < box.w ? y * box.z + x : -1;
+}
+
+/* The lens of a canvas grid: lens = (lon of x = 0, radians per column, lat of y = 0, radians per row);
+   radians per column 0 means a plane. */
+inline float3 canvas_point(float2 p, float4 lens) {
+    if (lens.y == 0.0f)
+        return (float3)(p.x, p.y, 0.0f);
+    const float lon = lens.x + p.x * lens.y, lat = lens.z - p.y * lens.w;
+    const float c = cos(lat);
+    return (float3)(c * sin(lon), c * cos(lon), sin(lat));
+}
+
+inline float2 canvas_position(float3 q, float4 lens) {
+    if (lens.y == 0.0f)
+        return q.xy;
+    const float lon = atan2(q.x, q.y), lat = atan2(q.z, hypot(q.x, q.y));
+    return (float2)((lon - lens.x) / lens.y, (lens.z - lat) / lens.w);
+}
+
+/* A chart is the flat grid on which one pair's flow lives. Sphere: an equirectangular projection about an
+   axis of its own; s0-2, s3-5, s6-8 are the rows of the rotation from the scene to the chart's axes.
+   s9, sa: pixels per radian (sphere) or per canvas pixel (plane) in x, y; sb, sc: chart position of
+   longitude 0, latitude 0 (sphere) or of the canvas's origin (plane); sd: 1 on the sphere;
+   se: period of a wrapped plane in canvas pixels, else 0. */
+inline float3 chart_point(float2 u, float16 chart) {
+    if (chart.sd == 0.0f)
+        return (float3)((u.x - chart.sb) / chart.s9, (u.y - chart.sc) / chart.sa, 0.0f);
+    const float lon = (u.x - chart.sb) / chart.s9, lat = (chart.sc - u.y) / chart.sa;
+    const float c = cos(lat), x = c * sin(lon), y = c * cos(lon), z = sin(lat);
+    return (float3)(chart.s0 * x + chart.s3 * y + chart.s6 * z, chart.s1 * x + chart.s4 * y + chart.s7 * z,
+                    chart.s2 * x + chart.s5 * y + chart.s8 * z);
+}
+
+inline float2 chart_position(float3 q, float16 chart) {
+    if (chart.sd == 0.0f) {
+        float2 u = (float2)(q.x * chart.s9 + chart.sb, q.y * chart.sa + chart.sc);
+        if (chart.se > 0.0f) /* the copy that lies on the chart, which may reach across the canvas's border */
+            u.x -= floor(u.x / (chart.se * chart.s9)) * chart.se * chart.s9;
+        return u;
+    }
+    const float x = chart.s0 * q.x + chart.s1 * q.y + chart.s2 * q.z;
+    const float y = chart.s3 * q.x + chart.s4 * q.y + chart.s5 * q.z;
+    const float z = chart.s6 * q.x + chart.s7 * q.y + chart.s8 * q.z;
+    return (float2)(atan2(x, y) * chart.s9 + chart.sb, chart.sc - atan2(z, hypot(x, y)) * chart.sa);
+}
+
+/* Catmull-Rom weights of the four taps around fraction t: exactly (0, 1, 0, 0) at t = 0. */
+inline float4 catmull_rom(float t) {
+    const float t2 = t * t, t3 = t2 * t;
+    return (float4)(-0.5f * t + t2 - 0.5f * t3, 1.0f - 2.5f * t2 + 1.5f * t3, 0.5f * t + 2.0f * t2 - 1.5f * t3,
+                    -0.5f * t2 + 0.5f * t3);
+}

@@ -1,0 +1,271 @@
+/* Dense flow of one pair: combined local-global optical flow. The data term is Lucas and Kanade's windowed
+   least squares on brightness and gradient, the smoothness term spreads it over untextured pixels and beyond
+   the mask; coarse to fine, with warping (Bruhn, Weickert, Schnoerr 2005; normalised as Zimmer et al. 2011).
+
+   A feature is (h, dh/dx, dh/dy, valid): h is log brightness less its local mean, blind to gain. Flow is in
+   pixels of the level's grid; grid = (width, height, wraps, 0). */
+
+__kernel void flow_feature(__global const float *image, /* (grid.y, grid.x) log brightness */
+                           __global const float *mean,  /* (grid.y, grid.x) its local mean */
+                           __global const float *mask,  /* (grid.y, grid.x), 0 or 1 */
+                           int4 grid,                   /* run size */
+                           __global float4 *feature)    /* (grid.y, grid.x) */
+{
+    const int x = get_global_id(0), y = get_global_id(1);
+    if (x >= grid.x || y >= grid.y)
+        return;
+    const int at = y * grid.x + x;
+    if (mask[at] == 0.0f) {
+        feature[at] = (float4)(0.0f);
+        return;
+    }
+    float d[2];
+    for (int axis = 0; axis < 2; ++axis) {
+        float difference = 0.0f, span = 0.0f;
+        for (int side = -1; side <= 1; side += 2) {
+            int2 p = (int2)(x + (axis ? 0 : side), y + (axis ? side : 0));
+            if (grid_border(&p, grid) && mask[p.y * grid.x + p.x] != 0.0f) {
+                difference += side * (image[p.y * grid.x + p.x] - image[at]);
+                span += 1.0f;
+            }
+        }
+        d[axis] = span > 0.0f ? difference / span : 0.0f;
+    }
+    feature[at] = (float4)(image[at] - mean[at], d[0], d[1], 1.0f);
+}
+
+/* Sample feature at q + flow(q), bilinear; w is the share of valid taps. */
+__kernel void flow_warp(__global const float4 *feature, /* (grid.y, grid.x) of the other image */
+                        __global const float2 *flow,    /* (grid.y, grid.x) px */
+                        int4 grid,                      /* run size */
+                        __global float4 *warped)        /* (grid.y, grid.x) */
+{
+    const int x = get_global_id(0), y = get_global_id(1);
+    if (x >= grid.x || y >= grid.y)
+        return;
+    const float2 f = flow[y * grid.x + x];
+    const float2 base = floor(f), t = f - base;
+    const int2 corner = (int2)(x, y) + convert_int2(base);
+    float4 sum = (float4)(0.0f);
+    for (int j = 0; j < 2; ++j)
+        for (int i = 0; i < 2; ++i) {
+            int2 p = corner + (int2)(i, j);
+            if (grid_border(&p, grid))
+                sum += (i ? t.x : 1.0f - t.x) * (j ? t.y : 1.0f - t.y) * feature[p.y * grid.x + p.x];
+        }
+    warped[y * grid.x + x] = sum.w > 0.999f ? sum / sum.w : (float4)(0.0f);
+}
+
+inline float4 flow_mean_feature(__global const float4 *a, __global const float4 *b, int2 p, int4 grid) {
+    if (!grid_border(&p, grid))
+        return (float4)(0.0f);
+    const float4 fa = a[p.y * grid.x + p.x], fb = b[p.y * grid.x + p.x];
+    return fa.w * fb.w > 0.0f ? 0.5f * (fa + fb) : (float4)(0.0f);
+}
+
+/* The linearised constraints of one warp, J (du, dv) = -(J13, J23), weighted robustly. */
+__kernel void flow_tensor(__global const float4 *feature, /* (grid.y, grid.x) */
+                          __global const float4 *warped,  /* (grid.y, grid.x) the other, warped */
+                          int4 grid,                      /* run size */
+                          float brightness,               /* weight of brightness constancy */
+                          float gradient,                 /* weight of gradient constancy */
+                          float noise,                    /* amplitude of h below which texture is noise */
+                          __global float4 *tensor,        /* (grid.y, grid.x) J11, J12, J22, valid */
+                          __global float2 *right)         /* (grid.y, grid.x) J13, J23 */
+{
+    const int x = get_global_id(0), y = get_global_id(1);
+    if (x >= grid.x || y >= grid.y)
+        return;
+    const int at = y * grid.x + x;
+    const float4 a = feature[at], b = warped[at];
+    float4 j = (float4)(0.0f);
+    float2 r = (float2)(0.0f);
+    if (a.w * b.w > 0.0f) {
+        const float robust = 1e-3f, zeta = noise * noise;
+        const float2 d = 0.5f * (a.yz + b.yz);
+        const float4 t = b - a;
+        const float n = 1.0f / (dot(d, d) + zeta);
+        const float w = brightness * n / sqrt(t.x * t.x * n + robust * robust);
+        j = (float4)(w * d.x * d.x, w * d.x * d.y, w * d.y * d.y, 1.0f);
+        r = w * t.x * d;
+        const float4 west = flow_mean_feature(feature, warped, (int2)(x - 1, y), grid);
+        const float4 east = flow_mean_feature(feature, warped, (int2)(x + 1, y), grid);
+        const float4 north = flow_mean_feature(feature, warped, (int2)(x, y - 1), grid);
+        const float4 south = flow_mean_feature(feature, warped, (int2)(x, y + 1), grid);
+        if (west.w * east.w * north.w * south.w > 0.0f) {
+            const float2 dx = 0.5f * (east.yz - west.yz);   /* d(hx)/dx, d(hy)/dx */
+            const float2 dy = 0.5f * (south.yz - north.yz); /* d(hx)/dy, d(hy)/dy */
+            const float nx = 1.0f / (dx.x * dx.x + dy.x * dy.x + zeta);
+            const float ny = 1.0f / (dx.y * dx.y + dy.y * dy.y + zeta);
+            const float g = gradient / sqrt(t.y * t.y * nx + t.z * t.z * ny + robust * robust);
+            j.x += g * (nx * dx.x * dx.x + ny * dx.y * dx.y);
+            j.y += g * (nx * dx.x * dy.x + ny * dx.y * dy.y);
+            j.z += g * (nx * dy.x * dy.x + ny * dy.y * dy.y);
+            r.x += g * (nx * dx.x * t.y + ny * dx.y * t.z);
+            r.y += g * (nx * dy.x * t.y + ny * dy.y * t.z);
+        }
+    }
+    tensor[at] = j;
+    right[at] = r;
+}
+
+/* Sum the constraints over the Lucas-Kanade window (binomial, 3 x 3). */
+__kernel void flow_window(__global const float4 *tensor, /* (grid.y, grid.x) */
+                          __global const float2 *right,  /* (grid.y, grid.x) */
+                          int4 grid,                     /* run size */
+                          __global float4 *tensor_out,   /* (grid.y, grid.x) */
+                          __global float2 *right_out)    /* (grid.y, grid.x) */
+{
+    const int x = get_global_id(0), y = get_global_id(1);
+    if (x >= grid.x || y >= grid.y)
+        return;
+    float4 j = (float4)(0.0f);
+    float2 r = (float2)(0.0f);
+    for (int dy = -1; dy <= 1; ++dy)
+        for (int dx = -1; dx <= 1; ++dx) {
+            int2 p = (int2)(x + dx, y + dy);
+            if (!grid_border(&p, grid))
+                continue;
+            const float w = (dx ? 0.25f : 0.5f) * (dy ? 0.25f : 0.5f);
+            j += w * tensor[p.y * grid.x + p.x];
+            r += w * right[p.y * grid.x + p.x];
+        }
+    tensor_out[y * grid.x + x] = j;
+    right_out[y * grid.x + x] = r;
+}
+
+inline float flow_edge(__global const float2 *flow, __global const float4 *feature, int at, int2 p, int4 grid,
+                       float smoothness, float contrast) {
+    if (!grid_border(&p, grid))
+        return 0.0f;
+    const int to = p.y * grid.x + p.x;
+    const float2 d = flow[to] - flow[at];
+    const float4 fa = feature[at], fb = feature[to];
+    /* an edge of the image is where the flow may jump */
+    const float step = fa.w * fb.w > 0.0f ? (fa.x - fb.x) / contrast : 0.0f;
+    return smoothness * exp(-fabs(step)) / sqrt(dot(d, d) + 1e-4f);
+}
+
+/* The linear system of one warp: diag/off-diagonals of the data term, right-hand side for the whole flow (not
+   the increment), and the smoothness weights towards the east and south neighbours. */
+__kernel void flow_system(__global const float4 *tensor,  /* (grid.y, grid.x) */
+                          __global const float2 *right,   /* (grid.y, grid.x) */
+                          __global const float2 *base,    /* (grid.y, grid.x) flow of this linearisation */
+                          __global const float2 *flow,    /* (grid.y, grid.x) flow that sets the smoothness */
+                          __global const float4 *feature, /* (grid.y, grid.x) */
+                          int4 grid,                      /* run size */
+                          float smoothness, float contrast,
+                          __global float4 *left_side, /* (grid.y, grid.x) J11, J12, J22, weight to the east */
+                          __global float4 *right_side) /* (grid.y, grid.x) b1, b2, weight to the south, 0 */
+{
+    const int x = get_global_id(0), y = get_global_id(1);
+    if (x >= grid.x || y >= grid.y)
+        return;
+    const int at = y * grid.x + x;
+    const float4 j = tensor[at];
+    const float2 f = base[at], r = right[at];
+    left_side[at] = (float4)(j.xyz, flow_edge(flow, feature, at, (int2)(x + 1, y), grid, smoothness, contrast));
+    right_side[at] = (float4)(j.x * f.x + j.y * f.y - r.x, j.y * f.x + j.z * f.y - r.y,
+                              flow_edge(flow, feature, at, (int2)(x, y + 1), grid, smoothness, contrast), 0.0f);
+}
+
+/* One half-sweep of red-black successive over-relaxation, in place. */
+__kernel void flow_relax(__global const float4 *left_side,  /* (grid.y, grid.x) */
+                         __global const float4 *right_side, /* (grid.y, grid.x) */
+                         int4 grid, int colour,             /* run size: ((grid.x + 1) / 2, grid.y) */
+                         float relaxation,
+                         __global float2 *flow) /* (grid.y, grid.x) */
+{
+    const int y = get_global_id(1), x = 2 * get_global_id(0) + ((y + colour) & 1);
+    if (x >= grid.x || y >= grid.y)
+        return;
+    const int at = y * grid.x + x;
+    const float4 j = left_side[at], b = right_side[at];
+    const float2 old = flow[at];
+    float2 sum = (float2)(0.0f);
+    float weight = 0.0f;
+    int2 p = (int2)(x + 1, y);
+    if (grid_border(&p, grid)) {
+        sum += j.w * flow[p.y * grid.x + p.x];
+        weight += j.w;
+    }
+    p = (int2)(x, y + 1);
+    if (grid_border(&p, grid)) {
+        sum += b.z * flow[p.y * grid.x + p.x];
+        weight += b.z;
+    }
+    p = (int2)(x - 1, y);
+    if (grid_border(&p, grid)) {
+        const float w = left_side[p.y * grid.x + p.x].w;
+        sum += w * flow[p.y * grid.x + p.x];
+        weight += w;
+    }
+    p = (int2)(x, y - 1);
+    if (grid_border(&p, grid)) {
+        const float w = right_side[p.y * grid.x + p.x].z;
+        sum += w * flow[p.y * grid.x + p.x];
+        weight += w;
+    }
+    float2 f = old;
+    const float dx = j.x + weight, dy = j.z + weight;
+    if (dx > 0.0f)
+        f.x += relaxation * ((sum.x + b.x - j.y * f.y) / dx - f.x);
+    if (dy > 0.0f)
+        f.y += relaxation * ((sum.y + b.y - j.y * f.x) / dy - f.y);
+    flow[at] = f;
+}
+
+inline void flow_sort(float2 *a, float2 *b) {
+    const float2 low = fmin(*a, *b);
+    *b = fmax(*a, *b);
+    *a = low;
+}
+
+/* 3 x 3 median of each component: removes outliers, keeps edges of motion. */
+__kernel void flow_median(__global const float2 *flow, /* (grid.y, grid.x) */
+                          int4 grid,                   /* run size */
+                          __global float2 *median)     /* (grid.y, grid.x) */
+{
+    const int x = get_global_id(0), y = get_global_id(1);
+    if (x >= grid.x || y >= grid.y)
+        return;
+    float2 v[9];
+    for (int k = 0; k < 9; ++k) {
+        int2 p = (int2)(x + k % 3 - 1, y + k / 3 - 1);
+        v[k] = grid_border(&p, grid) ? flow[p.y * grid.x + p.x] : flow[y * grid.x + x];
+    }
+    /* the median of nine by 19 exchanges */
+    flow_sort(v + 1, v + 2); flow_sort(v + 4, v + 5); flow_sort(v + 7, v + 8);
+    flow_sort(v + 0, v + 1); flow_sort(v + 3, v + 4); flow_sort(v + 6, v + 7);
+    flow_sort(v + 1, v + 2); flow_sort(v + 4, v + 5); flow_sort(v + 7, v + 8);
+    flow_sort(v + 0, v + 3); flow_sort(v + 5, v + 8); flow_sort(v + 4, v + 7);
+    flow_sort(v + 3, v + 6); flow_sort(v + 1, v + 4); flow_sort(v + 2, v + 5);
+    flow_sort(v + 4, v + 7); flow_sort(v + 4, v + 2); flow_sort(v + 6, v + 4);
+    flow_sort(v + 4, v + 2);
+    median[y * grid.x + x] = v[4];
+}
+
+/* Carry the flow of the coarser level to the next finer one: bilinear, doubled. */
+__kernel void flow_expand(__global const float2 *coarse, /* (grid.y, grid.x) px of the coarse level */
+                          int4 grid,                     /* of the coarse level */
+                          __global float2 *fine,         /* (size.y, size.x) px of the fine level */
+                          int2 size)                     /* run size */
+{
+    const int x = get_global_id(0), y = get_global_id(1);
+    if (x >= size.x || y >= size.y)
+        return;
+    const float2 q = (float2)(x + 0.5f, y + 0.5f) * 0.5f - 0.5f;
+    const float2 base = floor(q), t = q - base;
+    float2 sum = (float2)(0.0f);
+    float weight = 0.0f;
+    for (int j = 0; j < 2; ++j)
+        for (int i = 0; i < 2; ++i) {
+            int2 p = convert_int2(base) + (int2)(i, j);
+            if (!grid_border(&p, grid))
+                continue;
+            const float w = (i ? t.x : 1.0f - t.x) * (j ? t.y : 1.0f - t.y);
+            sum += w * coarse[p.y * grid.x + p.x];
+            weight += w;
+        }
+    fine[y * size.x + x] = 2.0f * sum / weight;
+}

@@ -1,0 +1,114 @@
+/* Where each layer is sampled: x_k(p) = p + sum over j of w_j(p) F_jk(p). A field holds, on the box of one layer
+   of the working grid, (displacement, colour weight); the displacement is a difference of points, so that it
+   is continuous over the poles. */
+
+inline float2 geometry_flow(__global const float2 *flow, float2 u, int4 grid) {
+    const float2 q = u - 0.5f, base = floor(q), t = q - base;
+    float2 sum = (float2)(0.0f);
+    float weight = 0.0f;
+    for (int j = 0; j < 2; ++j)
+        for (int i = 0; i < 2; ++i) {
+            int2 p = convert_int2(base) + (int2)(i, j);
+            if (!grid_border(&p, grid))
+                continue;
+            const float w = (i ? t.x : 1.0f - t.x) * (j ? t.y : 1.0f - t.y);
+            sum += w * flow[p.y * grid.x + p.x];
+            weight += w;
+        }
+    return weight > 1e-6f ? sum / weight : (float2)(0.0f);
+}
+
+/* Add one other layer's part. guess = 0: read F_jk at p (first order, as published). Otherwise F_kj is read at
+   the place that `guess` says layer k is sampled, whose way to p it is: x_k = p - sum_j w_j F_kj(x_k). */
+__kernel void geometry_add(__global const float *blend_j,   /* (box_j.w, box_j.z) */
+                           int4 box_j,                      /* place on the working grid */
+                           __global const float4 *layer_k,  /* (box_k.w, box_k.z) r, g, b, valid */
+                           int4 box_k,                      /* place on the working grid; run size */
+                           int4 border, float4 lens,        /* working grid */
+                           __global const float2 *flow,     /* chart grid, px */
+                           int4 grid, float16 chart,        /* chart */
+                           int use_guess,
+                           __global const float4 *guess,    /* (box_k.w, box_k.z) displacement */
+                           __global float4 *field)          /* (box_k.w, box_k.z) displacement is added */
+{
+    const int x = get_global_id(0), y = get_global_id(1);
+    if (x >= box_k.z || y >= box_k.w)
+        return;
+    const int at = y * box_k.z + x;
+    const int2 p = (int2)(x + box_k.x, y + box_k.y);
+    const int at_j = box_index(p, box_j);
+    if (at_j < 0 || layer_k[at].w == 0.0f)
+        return;
+    const float w = blend_j[at_j];
+    if (w == 0.0f)
+        return;
+    float3 q = canvas_point((float2)(p.x + 0.5f, p.y + 0.5f), lens);
+    if (use_guess) {
+        q += guess[at].xyz;
+        if (lens.y != 0.0f)
+            q = normalize(q);
+    }
+    const float2 u = chart_position(q, chart);
+    const float2 f = geometry_flow(flow, u, grid);
+    if (f.x == 0.0f && f.y == 0.0f)
+        return;
+    const float3 d = chart_point(u + f, chart) - chart_point(u, chart);
+    field[at].xyz += (use_guess ? -w : w) * d;
+}
+
+/* a_k = sharpness * w_k * (1 + magnitude * f_k / width), with f_k = |displacement| / (1 - w_k); and the maximum
+   over the layers, without which exp overflows. */
+__kernel void geometry_activation(__global float4 *field,        /* (box.w, box.z); a_k goes to w */
+                                  __global const float *blend,   /* (box.w, box.z) w_k */
+                                  int4 box, int4 border,         /* place on the working grid, run size */
+                                  float sharpness, float magnitude, float width,
+                                  float furthest,          /* plausible length of flow, in width's unit */
+                                  __global float *highest) /* (border.y, border.x) */
+{
+    const int x = get_global_id(0), y = get_global_id(1);
+    if (x >= box.z || y >= box.w)
+        return;
+    const int at = y * box.z + x;
+    const float w = blend[at];
+    if (w == 0.0f)
+        return;
+    const float d = length(field[at].xyz);
+    const float f = w < 1.0f ? fmin(d / (1.0f - w), furthest) : 0.0f;
+    const float a = sharpness * w * (1.0f + magnitude * f / width);
+    field[at].w = a;
+    const int top = (y + box.y) * border.x + x + box.x;
+    highest[top] = fmax(highest[top], a);
+}
+
+/* s_k (not yet normalised) = m_k * exp(a_k - max a). */
+__kernel void geometry_softmax(__global float4 *field,       /* (box.w, box.z); s_k replaces a_k */
+                               __global const float *blend,  /* (box.w, box.z) w_k */
+                               __global const float *rim,    /* (box.w, box.z) m_k */
+                               int4 box, int4 border,        /* place on the working grid, run size */
+                               __global const float *highest) /* (border.y, border.x) */
+{
+    const int x = get_global_id(0), y = get_global_id(1);
+    if (x >= box.z || y >= box.w)
+        return;
+    const int at = y * box.z + x;
+    field[at].w = blend[at] > 0.0f
+                      ? rim[at] * exp(field[at].w - highest[(y + box.y) * border.x + x + box.x])
+                      : 0.0f;
+}
+
+/* The longest displacement of each row: how many rows a band needs beyond its own. */
+__kernel void geometry_reach(__global const float4 *field, /* (box.w, box.z) */
+                             int4 box,                     /* run size: (box.w, 1) */
+                             int plane,                    /* 1: only the y component counts */
+                             __global float *reach)        /* (box.w) in units of the field */
+{
+    const int y = get_global_id(0);
+    if (y >= box.w || get_global_id(1) > 0)
+        return;
+    float longest = 0.0f;
+    for (int x = 0; x < box.z; ++x) {
+        const float3 d = field[y * box.z + x].xyz;
+        longest = fmax(longest, plane ? fabs(d.y) : length(d));
+    }
+    reach[y] = longest;
+}

@@ -1,0 +1,54 @@
+/* Layers at working resolution. Built with PIXEL (stored sample type) and SAMPLES (2 or 4, alpha last). */
+
+/* Area mean of the full-resolution pixels under each working pixel; exact integer weights, because working
+   edges lie at fractions of a pixel. Valid only if every pixel under it is. */
+__kernel void working_reduce(__global const PIXEL *rows, /* (box.w, box.z, SAMPLES) */
+                             int4 box,      /* place of `rows` in the region: left, top, width, height, px */
+                             int4 ratio,    /* region width, working width, region height, working height */
+                             int4 out_box,  /* place of `layer` on the working grid */
+                             int first,     /* first row of `layer` to calculate */
+                             int2 size,     /* run size: out_box.z columns, rows to calculate */
+                             float white,   /* value of full scale */
+                             __global float4 *layer) /* (out_box.w, out_box.z): r, g, b in 0..1, valid */
+{
+    const int i = get_global_id(0), j = get_global_id(1) + first;
+    if (i >= size.x || j >= first + size.y)
+        return;
+    const int x0 = (i + out_box.x) * ratio.x, x1 = x0 + ratio.x; /* edges, times working width */
+    const int y0 = (j + out_box.y) * ratio.z, y1 = y0 + ratio.z;
+    float3 sum = (float3)(0.0f);
+    float total = 0.0f;
+    bool valid = true;
+    for (int y = y0 / ratio.w; y * ratio.w < y1; ++y)
+        for (int x = x0 / ratio.y; x * ratio.y < x1; ++x) {
+            const int at = box_index((int2)(x, y), box);
+            if (at < 0) {
+                valid = false;
+                continue;
+            }
+            __global const PIXEL *p = rows + (size_t)at * SAMPLES;
+            if ((float)p[SAMPLES - 1] < 0.5f * white)
+                valid = false;
+            const float w = (float)(min(y1, (y + 1) * ratio.w) - max(y0, y * ratio.w)) *
+                            (float)(min(x1, (x + 1) * ratio.y) - max(x0, x * ratio.y));
+            sum += w * (float3)(p[0], p[SAMPLES > 2 ? 1 : 0], p[SAMPLES > 2 ? 2 : 0]);
+            total += w;
+        }
+    const float scale = 1.0f / (white * total);
+    layer[j * out_box.z + i] = valid ? (float4)(sum * scale, 1.0f) : (float4)(0.0f);
+}
+
+/* Raise `differs` if two layers show different colours on a working pixel that both cover. */
+__kernel void working_compare(__global const float4 *a, int4 a_box, /* run size: a_box.zw */
+                              __global const float4 *b, int4 b_box, __global int *differs)
+{
+    const int x = get_global_id(0), y = get_global_id(1);
+    if (x >= a_box.z || y >= a_box.w)
+        return;
+    const int at = box_index((int2)(x + a_box.x, y + a_box.y), b_box);
+    if (at < 0)
+        return;
+    const float4 p = a[y * a_box.z + x], q = b[at];
+    if (p.w != 0.0f && q.w != 0.0f && any(p.xyz != q.xyz))
+        *differs = 1;
+}
