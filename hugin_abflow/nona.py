@@ -1,0 +1,429 @@
+"""Layers of a project: find them, or have Hugin's nona make them."""
+
+from __future__ import annotations
+
+import logging
+import os
+import re
+import shutil
+import subprocess
+import tempfile
+from collections import deque
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal, get_args
+
+from hugin_abflow import pto, tifftags
+from hugin_abflow.errors import (
+    ImageReadError,
+    LayersMismatchError,
+    LayersMissingError,
+    NonaFailedError,
+    NonaMissingError,
+    OutputError,
+    PhotoMissingError,
+    SettingsError,
+)
+from hugin_abflow.images import read_layers
+from hugin_abflow.layer import Canvas, Layer
+from hugin_abflow.progress import Progress, silent
+from hugin_abflow.project import Plan, PlannedImage
+
+log = logging.getLogger("hugin_abflow.nona")
+
+Remap = Literal["auto", "always", "never"]
+
+_STALE_SECONDS = 2.0  # file times closer than this say nothing (FAT counts in steps of 2 s)
+_LAST_LINES = 8  # of nona's output, in the message of a failure
+_STEPS = ("remapping ", "saving ")  # what nona -v says at the end of a photo's loading and remapping
+_KILL_SECONDS = 5.0
+_INSTALL = (
+    "nona is not in PATH; install Hugin (Debian, Ubuntu: apt install hugin-tools; Fedora: dnf install hugin; "
+    "macOS, Windows: put the folder of Hugin's programs into PATH)"
+)
+
+
+# ------------------------------------------------------------------------------------- the whole
+
+
+@contextmanager
+def open_layers(
+    plan: Plan,
+    *,
+    prefix: str | Path | None = None,
+    layers: Sequence[str | Path] | None = None,
+    remap: Remap = "auto",
+    keep_layers: bool = False,
+    progress: Progress = silent,
+) -> Iterator[list[Layer]]:
+    """The project's layers in the order of its images, readable inside the ``with`` block.
+
+    layers          files that are the layers, whatever their names; taken as they are.
+    prefix          layers named PREFIX0000.tif ..., as given or relative to the project's folder; taken
+                    as they are. Without both, the project's stem and Hugin's default prefix are tried.
+    remap           "never": only what is there. "always": nona makes all layers. "auto": nona makes all
+                    that are missing, and all if one is more than 2 s older than the project or its
+                    photo and they can be made again (else they are used, with a warning).
+    keep_layers     layers that nona made are moved beside the project, under its stem.
+
+    Layers are made in a folder under TMPDIR that is removed in the end. Raises `LayersMissingError`,
+    `PhotoMissingError`, `NonaMissingError`, `NonaFailedError`, `LayersMismatchError`,
+    `ImageReadError`, `OutputError` (layers cannot be kept), `SettingsError` (`remap` unknown, or
+    "always" together with named layers).
+    """
+    _check_request(remap, named=bool(prefix or layers))
+    with _work_folder() as folder:
+        if layers:
+            files = _named_files(layers)
+        elif prefix:
+            files = _layers_by_prefix(plan, prefix).in_order()
+        else:
+            files = _find_or_make(plan, folder, remap, keep_layers, progress).in_order()
+        opened = _open_all(files)
+        check_layers(plan.canvas, opened)
+        yield opened
+
+
+def check_layers(canvas: Canvas, layers: Sequence[Layer]) -> None:
+    """Raise `LayersMismatchError` unless the layers fit the canvas and each other.
+
+    Canvas size (where a layer's file tells it), place inside the canvas, depth, number of channels.
+    """
+    size = f"{canvas.width}x{canvas.height}"
+    again = "make the layers again (--remap always) or leave the file out"
+    for layer in layers:
+        name, box, first = layer.file or layer.name, layer.box, layers[0]
+        if layer.canvas_size not in (None, (canvas.width, canvas.height)):
+            made_for = "{}x{}".format(*layer.canvas_size or ())
+            raise LayersMismatchError(
+                f"{name} was made for a canvas of {made_for}, the project's is {size}; {again}"
+            )
+        if min(box.left, box.top) < 0 or box.right > canvas.width or box.bottom > canvas.height:
+            raise LayersMismatchError(
+                f"{name} covers columns {box.left} to {box.right} and rows {box.top} to {box.bottom}, "
+                f"outside the canvas of {size}; {again}"
+            )
+        if layer.dtype != first.dtype:
+            raise LayersMismatchError(
+                f"{name} has {layer.dtype} samples, {first.name} has {first.dtype}; {again}"
+            )
+        if layer.channels != first.channels:
+            kinds = {1: "grey", 3: "RGB"}
+            raise LayersMismatchError(
+                f"{name} is {kinds[layer.channels]}, {first.name} is {kinds[first.channels]}; {again}"
+            )
+        if layer.icc != first.icc:
+            log.warning("%s and %s differ in ICC profile; the first layer's is used", name, first.name)
+
+
+def _check_request(remap: str, named: bool) -> None:
+    if remap not in get_args(Remap):
+        raise SettingsError(f"remap is {remap!r}; choose 'auto', 'always' or 'never'")
+    if named and remap == "always":
+        raise SettingsError(
+            "layers are named and shall be made; leave out --prefix and --layers, or --remap always"
+        )
+
+
+@contextmanager
+def _work_folder() -> Iterator[Path]:
+    """A folder for nona's layers; nothing is left of it."""
+    # asked each time: Python remembers the first TMPDIR that it saw
+    root = os.environ.get("TMPDIR", "")
+    with tempfile.TemporaryDirectory(
+        prefix="hugin-abflow-", dir=root if Path(root).is_dir() and root else None, ignore_cleanup_errors=True
+    ) as folder:
+        yield Path(folder)
+
+
+def _open_all(files: Sequence[Path]) -> list[Layer]:
+    return [layer for file in files for layer in read_layers(file)]
+
+
+# ------------------------------------------------------------------------------------- finding
+
+
+@dataclass(frozen=True)
+class _Found:
+    """Layers on disk: one file per image index, or one file of many pages (then `files` is empty)."""
+
+    prefix: Path
+    files: dict[int, Path]
+    pages: Path | None = None
+
+    def missing(self, plan: Plan) -> list[PlannedImage]:
+        """Active images without a layer; of a file of pages nobody can tell."""
+        return [] if self.pages else [image for image in plan.images if image.index not in self.files]
+
+    def stale(self, plan: Plan) -> list[Path]:
+        """Layers older than the project or their photo."""
+        project = _time(plan.file)
+        photos = {image.index: _time(image.photo) for image in plan.images}
+        newest = {file: max(project, photos[index]) for index, file in self.files.items()}
+        if self.pages:
+            newest[self.pages] = max(project, *photos.values())
+        return [file for file, time in newest.items() if _time(file) < time - _STALE_SECONDS]
+
+    def in_order(self) -> list[Path]:
+        """The files by image index."""
+        return [self.pages] if self.pages else [self.files[index] for index in sorted(self.files)]
+
+
+def layer_name(prefix: str, index: int, ending: str) -> str:
+    """What nona calls the layer of image `index`; numbers of unused images are left out."""
+    return f"{prefix}{index:04d}{ending}"
+
+
+def _find_under(plan: Plan, prefix: Path) -> _Found | None:
+    """Layers that begin with `prefix`, if any."""
+    endings = (".exr", ".tif", ".tiff") if plan.hdr else (".tif", ".tiff", ".exr")
+    photos = {image.photo for image in plan.images}  # may be named alike: img0000.tif of img.pto
+    for ending in endings:
+        paths = {i.index: prefix.with_name(layer_name(prefix.name, i.index, ending)) for i in plan.images}
+        files = {index: path for index, path in paths.items() if path.is_file() and path not in photos}
+        if files:
+            return _Found(prefix, files)
+    for ending in (".tif", ".tiff"):
+        pages = prefix.with_name(prefix.name + ending)
+        if _is_multilayer(pages):
+            return _Found(prefix, {}, pages)
+    return None
+
+
+def _is_multilayer(path: Path) -> bool:
+    """Whether a file is nona's TIFF_multilayer: a finished panorama may have the same name."""
+    try:
+        return path.is_file() and any(place.paged for place in tifftags.read_places(path))
+    except ImageReadError:
+        return False
+
+
+def _find(plan: Plan) -> _Found | None:
+    """Layers under the project's stem or Hugin's default prefix; complete and fresh ones first."""
+    names = [plan.stem, plan.hugin_prefix]
+    if plan.hdr:
+        names = [*(f"{name}_hdr_" for name in names), *names]  # what hugin_executor calls them
+    found = [layers for name in names if (layers := _find_under(plan, plan.folder / name))]
+    return min(found, key=lambda f: (bool(f.missing(plan)), bool(f.stale(plan))), default=None)
+
+
+def _layers_by_prefix(plan: Plan, prefix: str | Path) -> _Found:
+    """Layers that the user named by their prefix."""
+    places = [Path(prefix).absolute(), plan.folder / prefix]
+    for place in places:
+        # a prefix may end in a slash: then names are numbers only
+        found = _find_under(plan, place / "" if str(prefix).endswith(("/", os.sep)) else place)
+        if found:
+            for image in found.missing(plan):
+                log.info("no layer of image %d (%s) under %s: not used", image.index, image.name, prefix)
+            return found
+    first = layer_name(str(prefix), plan.images[0].index, ".tif")
+    raise LayersMissingError(
+        f"no layer {first} (nor .exr, nor of another active image) here or in {plan.folder}; "
+        "check --prefix, or leave it out to have nona make the layers"
+    )
+
+
+def _named_files(layers: Sequence[str | Path]) -> list[Path]:
+    for path in map(Path, layers):
+        if not path.is_file():
+            raise LayersMissingError(f"{path}: no such layer; check --layers")
+    return [Path(path) for path in layers]
+
+
+def _find_or_make(plan: Plan, folder: Path, remap: Remap, keep: bool, progress: Progress) -> _Found:
+    """Layers that nobody named: what is there, what nona makes, or both."""
+    found = None if remap == "always" else _find(plan)
+    if remap == "never":
+        if found is None:
+            raise LayersMissingError(
+                f"no layers {plan.stem}0000.tif ... or {plan.hugin_prefix}0000.tif ... beside {plan.file}; "
+                "name them with --prefix or --layers, or let nona make them (--remap auto)"
+            )
+        _report_used(plan, found)
+        return found
+    stale = found.stale(plan) if found else []
+    if found is None or (stale and _can_make(plan)):
+        if stale:
+            log.info("%s is older than the project or its photo: layers are made again", stale[0])
+        return _make_all(plan, folder, keep, progress)
+    if stale:
+        reason = "nona is not installed" if shutil.which("nona") is None else "photos are missing"
+        log.warning("%s is older than the project or its photo; used as it is, since %s", stale[0], reason)
+    made = _make_missing(plan, folder, found, keep, progress)
+    return _Found(found.prefix, found.files | made, found.pages)
+
+
+def _report_used(plan: Plan, found: _Found) -> None:
+    """Warn of what --remap never leaves as it is."""
+    for image in found.missing(plan):
+        log.warning("no layer of image %d (%s): it is left out", image.index, image.name)
+    for file in found.stale(plan)[:1]:
+        log.warning("%s is older than the project or its photo; used as it is (--remap never)", file)
+
+
+def _time(path: Path) -> float:
+    """Time of the last change; 0 for what is not there, which makes nothing stale."""
+    try:
+        return path.stat().st_mtime
+    except OSError:
+        return 0.0
+
+
+# ------------------------------------------------------------------------------------- making
+
+
+def probe() -> str | None:
+    """nona's version ("2022.0.0.a0962865f932"), None where it is not installed."""
+    try:
+        shown = subprocess.run(
+            ["nona", "--help"], capture_output=True, text=True, errors="replace", timeout=30, check=False
+        )
+    except (OSError, subprocess.TimeoutExpired):
+        return None
+    version = re.search(r"nona version (\S+)", shown.stdout + shown.stderr)
+    return version.group(1) if version else "unknown"
+
+
+def _can_make(plan: Plan) -> bool:
+    return shutil.which("nona") is not None and all(image.photo.is_file() for image in plan.images)
+
+
+def _make_all(plan: Plan, folder: Path, keep: bool, progress: Progress) -> _Found:
+    """Have nona make every layer."""
+    for image in plan.images:
+        _require_photo(image)
+    with progress("remap", len(_STEPS) * len(plan.images)) as advance:
+        code, lines = _run(plan, folder, [], advance)
+    made = _made(plan, folder)
+    if code:
+        raise _failure(plan, folder, code, lines)
+    if not made:
+        raise LayersMissingError(f"{plan.file}: no active image reaches into the crop; nona made no layer")
+    return _Found(plan.folder / plan.stem, _keep(plan, plan.folder / plan.stem, made) if keep else made)
+
+
+def _make_missing(plan: Plan, folder: Path, found: _Found, keep: bool, progress: Progress) -> dict[int, Path]:
+    """Have nona make the layers that are not there; images that miss the crop have none."""
+    missing = found.missing(plan)
+    if not missing:
+        return {}
+    with progress("remap", len(_STEPS) * len(missing)) as advance:
+        for image in missing:
+            code, lines = _run(plan, folder, ["-i", str(image.index)], advance)
+            if code and f"image with number {image.index}" in " ".join(lines):
+                # nona does not count an image outside the crop as one of the project's
+                log.info("image %d (%s) misses the crop: it has no layer", image.index, image.name)
+            elif code:
+                _require_photo(image)
+                raise _failure(plan, folder, code, lines)
+    made = _made(plan, folder)
+    return _keep(plan, found.prefix, made) if keep else made
+
+
+def _require_photo(image: PlannedImage) -> None:
+    if not image.photo.is_file():
+        raise PhotoMissingError(
+            f"{image.photo} (image {image.index}) is not there, and its layer must be made from it; "
+            "put it back, or name layers that exist with --prefix or --layers"
+        )
+
+
+def _run(
+    plan: Plan, folder: Path, options: list[str], advance: Callable[[int], None]
+) -> tuple[int, list[str]]:
+    """Run nona as Hugin does; its exit code and last lines. It does not outlive an exception."""
+    output = ["-r", "hdr", "-m", "EXR_m"] if plan.hdr else ["-r", "ldr", "-m", "TIFF_m"]
+    target, project = folder / plan.stem, _project_for_nona(plan, folder)
+    command = ["nona", "-v", "-z", "LZW", *output, *options, "-o", str(target), str(project)]
+    log.info("%s", " ".join(command))
+    try:
+        process = subprocess.Popen(
+            command,
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            text=True,
+            errors="replace",
+            env={**os.environ, "LANGUAGE": "en"},  # progress is read from the messages
+        )
+    except FileNotFoundError:
+        raise NonaMissingError(f"{_INSTALL}; or name layers that exist with --prefix or --layers") from None
+    lines: deque[str] = deque(maxlen=_LAST_LINES)
+    with process:  # closes the pipe and waits
+        try:
+            assert process.stdout is not None
+            for line in process.stdout:
+                if line.strip():
+                    lines.append(line.strip())
+                    log.debug("nona: %s", line.strip())
+                if line.startswith(_STEPS):
+                    advance(1)
+        except BaseException:
+            _stop(process)
+            raise
+    return process.returncode, list(lines)
+
+
+def _stop(process: subprocess.Popen[str]) -> None:
+    process.terminate()
+    try:
+        process.wait(_KILL_SECONDS)
+    except subprocess.TimeoutExpired:
+        process.kill()
+
+
+def _project_for_nona(plan: Plan, folder: Path) -> Path:
+    """The project itself; a copy with absolute names where photos are not where it says.
+
+    That happens to projects that were moved or come from Windows; nona does not look elsewhere.
+    """
+    if all(plan.folder / image.name == image.photo for image in plan.images):
+        return plan.file
+    project = pto.load(plan.file)
+    for image in plan.images:
+        project.images[image.index].filename = str(image.photo)
+    copy = folder / "project.pto"
+    copy.write_bytes(pto.dumps(project))
+    return copy
+
+
+def _made(plan: Plan, folder: Path) -> dict[int, Path]:
+    """The layers that nona left in the folder."""
+    ending = ".exr" if plan.hdr else ".tif"
+    paths = {image.index: folder / layer_name(plan.stem, image.index, ending) for image in plan.images}
+    return {index: path for index, path in paths.items() if path.is_file()}
+
+
+def _failure(plan: Plan, folder: Path, code: int, lines: list[str]) -> NonaFailedError:
+    said = "\n  ".join(lines) or "(nothing)"
+    return NonaFailedError(
+        f"nona failed on {plan.file} (exit code {code}); it wrote into {folder.parent}, TMPDIR chooses "
+        f"another folder. Its last lines:\n  {said}"
+    )
+
+
+def _keep(plan: Plan, prefix: Path, made: dict[int, Path]) -> dict[int, Path]:
+    """Move layers beside the project, each whole or not at all."""
+    photos = {image.photo.resolve() for image in plan.images}
+    kept = {}
+    for index, path in made.items():
+        final = prefix.with_name(layer_name(prefix.name, index, path.suffix))
+        part = final.with_name(f".abflow-{os.getpid()}{path.suffix}")
+        if final.resolve() in photos:
+            raise OutputError(
+                f"{final} is a photo, the layer cannot be kept by that name; rename the project"
+            )
+        try:
+            shutil.move(path, part)
+            part.replace(final)
+        except OSError as error:
+            raise OutputError(
+                f"{final} cannot be written: {error.strerror}; leave out --keep-layers or free the folder"
+            ) from None
+        finally:
+            part.unlink(missing_ok=True)
+        kept[index] = final
+    return kept

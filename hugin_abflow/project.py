@@ -1,0 +1,200 @@
+"""What a Hugin project asks for: canvas, active images, output."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path, PureWindowsPath
+
+from hugin_abflow import pto
+from hugin_abflow.errors import ProjectError
+from hugin_abflow.layer import Box, Canvas
+
+EQUIRECTANGULAR, SINUSOIDAL = 2, 7
+
+# Output projections whose columns are meridians, so that at 360 degrees the right border continues in
+# the left one, row by row: cylindrical, equirectangular, Mercator, Lambert's cylindrical equal-area,
+# Miller, architectural (Miller above the horizon, Lambert below). Found by remapping a smooth sphere
+# with nona at hfov 360 in all 22 projections: in these six the step from the last to the first column
+# is that between neighbours, in every row. Sinusoidal, Albers and Hammer-Aitoff have curved borders,
+# the others none that meet. Hugin passes -w to enblend for all of them.
+WRAPPING = frozenset({1, 2, 5, 8, 11, 13})
+
+_ENDINGS = {"tif": ".tif", "tiff": ".tif", "jpg": ".jpg", "jpeg": ".jpg", "png": ".png", "exr": ".exr"}
+_COMPRESSIONS = ("none", "lzw", "packbits", "deflate")
+_JPEG_QUALITY = 90  # Hugin's default
+
+
+@dataclass(frozen=True)
+class PlannedImage:
+    """One active image.
+
+    index       its number in the project, from 0; nona puts it into the layer's name.
+    name        the photo's name as the project writes it.
+    photo       where the photo is (see `locate_photo`); it need not exist.
+    """
+
+    index: int
+    name: str
+    photo: Path
+
+
+@dataclass(frozen=True)
+class Output:
+    """How the project wants its panorama stored.
+
+    ending          of the file: .tif, .jpg, .png or .exr.
+    compression     of a TIFF: none, lzw, packbits or deflate; None: not said.
+    jpeg_quality    1..100.
+    """
+
+    ending: str
+    compression: str | None
+    jpeg_quality: int
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What a project asks for; see `read_plan`.
+
+    file            the project file, absolute.
+    canvas          the panorama's pixel grid; its crop is what is output.
+    images          active images in the project's order.
+    output          type of the panorama's file.
+    hdr             layers are scene-linear EXR (nona ``-r hdr``) instead of TIFF in the photos' depth.
+    hugin_prefix    what Hugin names layers and panorama by default: "first image - last image".
+    """
+
+    file: Path
+    canvas: Canvas
+    images: tuple[PlannedImage, ...]
+    output: Output
+    hdr: bool
+    hugin_prefix: str
+
+    @property
+    def folder(self) -> Path:
+        """The project's folder: relative names begin here."""
+        return self.file.parent
+
+    @property
+    def stem(self) -> str:
+        """The project's name without .pto; Hugin's temporary projects have no ending to lose."""
+        return self.file.stem if self.file.suffix.lower() == ".pto" else self.file.name
+
+    def default_output(self, taken: Iterable[Path] = ()) -> Path:
+        """Beside the project, named after it: ``pano.pto`` -> ``pano.tif``.
+
+        If that is a photo of the project or one of `taken` (the layers' files), ``pano_abflow.tif``,
+        then ``pano_abflow2.tif`` and so on: inputs are never replaced.
+        """
+        inputs = {_key(path) for path in [*(image.photo for image in self.images), *taken]}
+        path, attempt = self.folder / f"{self.stem}{self.output.ending}", 0
+        while _key(path) in inputs:
+            attempt += 1
+            suffix = "_abflow" if attempt == 1 else f"_abflow{attempt}"
+            path = self.folder / f"{self.stem}{suffix}{self.output.ending}"
+        return path
+
+
+def read_plan(path: Path | str) -> Plan:
+    """Read a project and decide what it asks for.
+
+    Raises `pto.PtoError` for a file that is no project, `ProjectError` for one that makes no panorama:
+    no active image, no canvas, an empty crop.
+    """
+    file = Path(path).absolute()
+    project = pto.load(file)
+    names = [image.filename for image in project.images]
+    images = tuple(
+        PlannedImage(image.index, image.filename, locate_photo(file.parent, image.filename))
+        for image in project.images
+        if not image.disabled
+    )
+    if not images:
+        raise ProjectError(f"{file} has no active image; enable at least one in Hugin's photos list")
+    hdr = _is_hdr(project)
+    return Plan(
+        file=file,
+        canvas=_canvas(file, project.panorama),
+        images=images,
+        output=_output(project, hdr),
+        hdr=hdr,
+        hugin_prefix=f"{_stem(names[0])} - {_stem(names[-1])}",
+    )
+
+
+def locate_photo(folder: Path, name: str) -> Path:
+    """Where a photo is: relative to the project's folder unless absolute, as in Hugin.
+
+    What is not there is also looked for with Windows' separators and, as Hugin's GUI does for moved
+    projects, under its bare name beside the project. If nothing exists: where Hugin expects it.
+    """
+    expected = folder / name
+    windows = PureWindowsPath(name)
+    bare = folder / windows.name if windows.name else expected
+    moved = bare if windows.is_absolute() or windows.drive else folder.joinpath(*windows.parts)
+    for candidate in (expected, moved, bare):
+        if candidate.is_file():
+            return candidate
+    return expected
+
+
+def _canvas(file: Path, panorama: pto.Panorama) -> Canvas:
+    """The p-line's canvas with its crop."""
+    width, height, projection = panorama.width, panorama.height, panorama.projection
+    if width < 1 or height < 1:
+        raise ProjectError(f"{file}: the canvas is {width}x{height}; set its size in Hugin's stitcher tab")
+    # Hugin (PanoramaOptions::setWidth) makes these two even, and so do nona's layers
+    if projection in (EQUIRECTANGULAR, SINUSOIDAL):
+        width += width % 2
+    whole = Box(0, 0, width, height)
+    crop = whole
+    if panorama.crop is not None:
+        crop = whole.intersect(Box(*panorama.crop))
+        if not crop.width or not crop.height:
+            left, top, right, bottom = panorama.crop
+            raise ProjectError(
+                f"{file}: the crop (left {left}, top {top}, right {right}, bottom {bottom}) holds nothing of "
+                f"the {width}x{height} canvas; set it anew in Hugin's stitcher tab"
+            )
+    wrapping = projection in WRAPPING
+    hfov = min(panorama.hfov, 360.0) if wrapping else panorama.hfov  # as Hugin does
+    return Canvas(width, height, crop, wrapping and hfov == 360.0, projection == EQUIRECTANGULAR, hfov)
+
+
+def _is_hdr(project: pto.Project) -> bool:
+    """Whether the HDR panorama is what Hugin would stitch; the ordinary one counts if both are."""
+    blended_hdr, blended_ldr = (
+        project.option(f"output{kind}Blended", "").strip().lower() for kind in ("HDR", "LDR")
+    )
+    if not blended_hdr and not blended_ldr:
+        return bool(project.panorama.hdr)  # a script older than these options: what the p-line says
+    return blended_hdr == "true" and blended_ldr != "true"
+
+
+def _output(project: pto.Project, hdr: bool) -> Output:
+    """From the #hugin_output lines; from the p-line's n where there are none (PanoTools scripts)."""
+    words = (project.panorama.output_format or "").split()
+    from_n = words[0].partition("_")[0].lower() if words else ""
+    letters = {word[:1]: word[1:].removeprefix(":") for word in words[1:]}  # c:LZW r:CROP q95
+    kind = project.option("outputImageTypeHDR" if hdr else "outputImageType", "").strip().lower()
+    default = "exr" if hdr else "tif"
+    compression = project.option(f"outputImageType{'HDR' if hdr else ''}Compression", "").strip()
+    compression = (compression or letters.get("c", "")).lower()
+    quality = project.option("outputJPEGQuality", "").strip() or letters.get("q", "")
+    return Output(
+        ending=_ENDINGS.get(kind) or (not hdr and _ENDINGS.get(from_n)) or _ENDINGS[default],
+        compression=compression if compression in _COMPRESSIONS else None,
+        jpeg_quality=min(100, max(1, int(quality))) if quality.isdecimal() else _JPEG_QUALITY,
+    )
+
+
+def _stem(name: str) -> str:
+    """A photo's name without folder and ending."""
+    return PureWindowsPath(name).stem
+
+
+def _key(path: Path) -> str:
+    """Equal for names of one file, also where the file system ignores case."""
+    return str(path.resolve()).casefold()
