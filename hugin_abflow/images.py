@@ -89,7 +89,7 @@ def _describe(path: Path, name: str, page: int, source: Any, place: tifftags.Pla
     left, top, canvas = spec.x, spec.y, None
     if place is not None:
         left, top, canvas = place.x, place.y, place.canvas
-    elif spec.full_x == 0 and spec.full_y == 0:
+    elif source.format_name() == "openexr" and spec.full_x == 0 and spec.full_y == 0:
         canvas = spec.full_width, spec.full_height
     rows = _Rows(path, page, spec)
     profile = spec.getattribute("ICCProfile")
@@ -172,29 +172,32 @@ class _Rows:
             return np.empty((0, self.width, self.channels + 1), self.dtype)
         with self._lock:
             kept_from = self._end - (0 if self._kept is None else len(self._kept))
-            if self._kept is not None and kept_from <= top < bottom <= self._end:
-                return self._kept[top - kept_from : bottom - kept_from]
-            if self._kept is not None and kept_from <= top <= self._end:
-                first, start = top, self._end
-                above = [self._kept[top - kept_from :]]
+            if self._kept is not None and kept_from <= top and bottom <= self._end:
+                rows, first = self._kept, kept_from
             else:
-                first = start = top - top % self.chunk
-                above = []
-            end = min(self.height, bottom + -bottom % self.chunk)
-            above.append(self._decode(start, end))
-            rows = above[0] if len(above) == 1 else np.concatenate(above)
-            rows.setflags(write=False)  # the next answer is cut from the same memory
-            self._keep(rows, end)
+                rows, first = self._extend(top, bottom, kept_from)
+                rows.setflags(write=False)  # the next answer is cut from the same memory
+                self._keep(rows, first)
+            if bottom == self.height and self.chunk > 1:
+                # the image is done: let go of file and memory, layers can be many
+                self._kept = self._source = None
             return rows[top - first : bottom - first]
 
-    def _keep(self, rows: Pixels, end: int) -> None:
-        """Remember the last rows; once the image is done let go of the file and the memory."""
-        if end == self.height and self.chunk > 1:
-            self._kept = self._source = None
-            return
+    def _extend(self, top: int, bottom: int, kept_from: int) -> tuple[Pixels, int]:
+        """Rows that include `top` to `bottom`, and which is the first: kept ones and newly decoded ones."""
+        end = min(self.height, bottom + -bottom % self.chunk)
+        if self._kept is not None and kept_from <= top <= self._end:
+            return np.concatenate([self._kept[top - kept_from :], self._decode(self._end, end)]), top
+        start = top - top % self.chunk
+        return self._decode(start, end), start
+
+    def _keep(self, rows: Pixels, first: int) -> None:
+        """Remember the last rows for the next answer."""
+        self._end = first + len(rows)
         if rows.nbytes > _MAX_KEPT:
             rows = rows[-max(self.chunk, _MAX_KEPT // rows[0].nbytes) :].copy()
-        self._kept, self._end = rows, end
+            rows.setflags(write=False)
+        self._kept = rows
 
     def _decode(self, first: int, last: int) -> Pixels:
         if self._source is None:

@@ -116,7 +116,9 @@ class ImageWriter:
         if self._option is not None:
             spec["compression"] = self._option
         if icc is not None:
-            spec["ICCProfile"] = np.frombuffer(icc, np.uint8)
+            spec.attribute("ICCProfile", oiio.TypeDesc(f"uint8[{len(icc)}]"), np.frombuffer(icc, np.uint8))
+            if self.format == "png":
+                spec["oiio:ColorSpace"] = "unknown"  # else the file claims sRGB beside its profile
         if self.format == "tiff":
             if min(offset) < 0:
                 raise OutputError(f"{self.path}: TIFF holds no negative position {offset}; choose .exr")

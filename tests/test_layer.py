@@ -1,0 +1,47 @@
+"""Box, canvas and layer."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from hugin_abflow.layer import Box, Canvas, Layer, full_scale
+
+
+def test_box_measures_and_intersects():
+    box = Box(3, 5, 14, 12)
+    assert (box.width, box.height) == (11, 7)
+    assert box.intersect(Box(10, 0, 99, 8)) == Box(10, 5, 14, 8)
+    assert Box(10, 0, 99, 8).intersect(box) == Box(10, 5, 14, 8)
+
+
+@pytest.mark.parametrize("other", [Box(14, 5, 20, 12), Box(3, 12, 14, 20), Box(-9, -9, 3, 5)])
+def test_boxes_that_only_touch_have_nothing_in_common(other):
+    common = Box(3, 5, 14, 12).intersect(other)
+    assert common.width * common.height == 0
+    assert common.width >= 0 and common.height >= 0
+
+
+def test_canvas_kinds():
+    assert not Canvas.plane(31, 17).wraps
+    assert not Canvas.plane(31, 17).spherical
+    assert Canvas.sphere(62, 31).wraps
+    assert not Canvas.sphere(62, 31, hfov=359.0).wraps
+    assert Canvas.sphere(62, 31).crop == Box(0, 0, 62, 31)
+
+
+def test_layer_from_array_serves_the_rows_asked_for():
+    pixels = np.arange(7 * 5 * 4, dtype=np.uint16).reshape(7, 5, 4)
+    layer = Layer.from_array("memory", pixels[:, ::-1], left=3, top=2)  # not contiguous
+    assert layer.box == Box(3, 2, 8, 9)
+    assert (layer.channels, layer.dtype) == (3, np.uint16)
+    assert np.array_equal(layer.read(2, 6), pixels[2:6, ::-1])
+    assert layer.read(2, 6).flags.c_contiguous
+    assert layer.file is None and layer.canvas_size is None
+
+
+@pytest.mark.parametrize(
+    "dtype, full", [(np.uint8, 255), (np.uint16, 65535), (np.float16, 1), (np.float32, 1)]
+)
+def test_full_scale(dtype, full):
+    assert full_scale(dtype) == full
