@@ -147,9 +147,12 @@ def _open_all(files: Sequence[Path]) -> list[Layer]:
 
 @dataclass(frozen=True)
 class _Found:
-    """Layers on disk: one file per image index, or one file of many pages (then `files` is empty)."""
+    """Layers on disk: one file per image index, or one file of many pages (then `files` is empty).
 
-    prefix: Path
+    The prefix is what comes before the numbers, folder included; it may end in a slash.
+    """
+
+    prefix: str
     files: dict[int, Path]
     pages: Path | None = None
 
@@ -176,17 +179,21 @@ def layer_name(prefix: str, index: int, ending: str) -> str:
     return f"{prefix}{index:04d}{ending}"
 
 
-def _find_under(plan: Plan, prefix: Path) -> _Found | None:
+def _layer_path(prefix: str, index: int, ending: str) -> Path:
+    return Path(layer_name(prefix, index, ending)).absolute()
+
+
+def _find_under(plan: Plan, prefix: str) -> _Found | None:
     """Layers that begin with `prefix`, if any."""
     endings = (".exr", ".tif", ".tiff") if plan.hdr else (".tif", ".tiff", ".exr")
     photos = {image.photo for image in plan.images}  # may be named alike: img0000.tif of img.pto
     for ending in endings:
-        paths = {i.index: prefix.with_name(layer_name(prefix.name, i.index, ending)) for i in plan.images}
+        paths = {image.index: _layer_path(prefix, image.index, ending) for image in plan.images}
         files = {index: path for index, path in paths.items() if path.is_file() and path not in photos}
         if files:
             return _Found(prefix, files)
     for ending in (".tif", ".tiff"):
-        pages = prefix.with_name(prefix.name + ending)
+        pages = Path(prefix + ending).absolute()
         if _is_multilayer(pages):
             return _Found(prefix, {}, pages)
     return None
@@ -205,21 +212,21 @@ def _find(plan: Plan) -> _Found | None:
     names = [plan.stem, plan.hugin_prefix]
     if plan.hdr:
         names = [*(f"{name}_hdr_" for name in names), *names]  # what hugin_executor calls them
-    found = [layers for name in names if (layers := _find_under(plan, plan.folder / name))]
+    found = [layers for name in names if (layers := _find_under(plan, str(plan.folder / name)))]
     return min(found, key=lambda f: (bool(f.missing(plan)), bool(f.stale(plan))), default=None)
 
 
 def _layers_by_prefix(plan: Plan, prefix: str | Path) -> _Found:
     """Layers that the user named by their prefix."""
-    places = [Path(prefix).absolute(), plan.folder / prefix]
-    for place in places:
-        # a prefix may end in a slash: then names are numbers only
-        found = _find_under(plan, place / "" if str(prefix).endswith(("/", os.sep)) else place)
+    prefix = os.fspath(prefix)
+    # joined as text: pathlib drops a slash at the end
+    for place in (prefix, os.path.join(plan.folder, prefix)):  # noqa: PTH118
+        found = _find_under(plan, place)
         if found:
             for image in found.missing(plan):
                 log.info("no layer of image %d (%s) under %s: not used", image.index, image.name, prefix)
             return found
-    first = layer_name(str(prefix), plan.images[0].index, ".tif")
+    first = layer_name(prefix, plan.images[0].index, ".tif")
     raise LayersMissingError(
         f"no layer {first} (nor .exr, nor of another active image) here or in {plan.folder}; "
         "check --prefix, or leave it out to have nona make the layers"
@@ -302,7 +309,8 @@ def _make_all(plan: Plan, folder: Path, keep: bool, progress: Progress) -> _Foun
         raise _failure(plan, folder, code, lines)
     if not made:
         raise LayersMissingError(f"{plan.file}: no active image reaches into the crop; nona made no layer")
-    return _Found(plan.folder / plan.stem, _keep(plan, plan.folder / plan.stem, made) if keep else made)
+    prefix = str(plan.folder / plan.stem)
+    return _Found(prefix, _keep(plan, prefix, made) if keep else made)
 
 
 def _make_missing(plan: Plan, folder: Path, found: _Found, keep: bool, progress: Progress) -> dict[int, Path]:
@@ -393,7 +401,7 @@ def _project_for_nona(plan: Plan, folder: Path) -> Path:
 def _made(plan: Plan, folder: Path) -> dict[int, Path]:
     """The layers that nona left in the folder."""
     ending = ".exr" if plan.hdr else ".tif"
-    paths = {image.index: folder / layer_name(plan.stem, image.index, ending) for image in plan.images}
+    paths = {i.index: _layer_path(str(folder / plan.stem), i.index, ending) for i in plan.images}
     return {index: path for index, path in paths.items() if path.is_file()}
 
 
@@ -405,12 +413,12 @@ def _failure(plan: Plan, folder: Path, code: int, lines: list[str]) -> NonaFaile
     )
 
 
-def _keep(plan: Plan, prefix: Path, made: dict[int, Path]) -> dict[int, Path]:
+def _keep(plan: Plan, prefix: str, made: dict[int, Path]) -> dict[int, Path]:
     """Move layers beside the project, each whole or not at all."""
     photos = {image.photo.resolve() for image in plan.images}
     kept = {}
     for index, path in made.items():
-        final = prefix.with_name(layer_name(prefix.name, index, path.suffix))
+        final = _layer_path(prefix, index, path.suffix)
         part = final.with_name(f".abflow-{os.getpid()}{path.suffix}")
         if final.resolve() in photos:
             raise OutputError(

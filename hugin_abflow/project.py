@@ -101,7 +101,7 @@ def read_plan(path: Path | str) -> Plan:
     """Read a project and decide what it asks for.
 
     Raises `pto.PtoError` for a file that is no project, `ProjectError` for one that makes no panorama:
-    no active image, no canvas, an empty crop.
+    no active image, an empty crop.
     """
     file = Path(path).absolute()
     project = pto.load(file)
@@ -143,8 +143,6 @@ def locate_photo(folder: Path, name: str) -> Path:
 def _canvas(file: Path, panorama: pto.Panorama) -> Canvas:
     """The p-line's canvas with its crop."""
     width, height, projection = panorama.width, panorama.height, panorama.projection
-    if width < 1 or height < 1:
-        raise ProjectError(f"{file}: the canvas is {width}x{height}; set its size in Hugin's stitcher tab")
     # Hugin (PanoramaOptions::setWidth) makes these two even, and so do nona's layers
     if projection in (EQUIRECTANGULAR, SINUSOIDAL):
         width += width % 2

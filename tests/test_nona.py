@@ -1,0 +1,694 @@
+"""Finding layers, and having nona make them."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+import pytest
+import tifffile
+
+from hugin_abflow import nona as program
+from hugin_abflow.errors import (
+    ImageReadError,
+    LayersMismatchError,
+    LayersMissingError,
+    NonaFailedError,
+    NonaMissingError,
+    OutputError,
+    PhotoMissingError,
+    SettingsError,
+)
+from hugin_abflow.images import read_layers, write_image
+from hugin_abflow.layer import Box, Canvas, Layer
+from hugin_abflow.nona import check_layers, open_layers
+from hugin_abflow.project import Plan, read_plan
+
+ICC = bytes(range(200))
+
+
+@pytest.fixture(autouse=True)
+def temporary(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+    """TMPDIR of its own, found empty afterwards."""
+    folder = tmp_path / "temporary files"
+    folder.mkdir()
+    monkeypatch.setenv("TMPDIR", str(folder))
+    yield folder
+    assert not list(folder.iterdir())
+
+
+def remap(plan: Plan, prefix: str, *options: str) -> None:
+    """Layers from nona, run by hand in the project's folder."""
+    arguments = ["-z", "LZW", "-r", "ldr", "-m", "TIFF_m", *options, "-o", prefix, str(plan.file)]
+    subprocess.run(["nona", *arguments], cwd=plan.folder, check=True, capture_output=True)
+
+
+def age(path: Path, seconds: float) -> None:
+    """Make a file look older."""
+    changed = path.stat().st_mtime - seconds
+    os.utime(path, (changed, changed))
+
+
+@pytest.fixture
+def no_nona(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """A PATH without nona."""
+    monkeypatch.setenv("PATH", str(tmp_path / "nothing here"))
+
+
+def pixels_of(layers: list[Layer]) -> list[np.ndarray]:
+    return [layer.read(0, layer.box.height) for layer in layers]
+
+
+def same(ones: list[np.ndarray], others: list[np.ndarray]) -> bool:
+    """Equal but for nona's dither, which differs by 1 from run to run."""
+    pairs = list(zip(ones, others, strict=True))
+    return all(one.shape == other.shape for one, other in pairs) and all(
+        np.abs(one.astype(float) - other.astype(float)).max() <= (1 if one.dtype.kind == "u" else 0)
+        for one, other in pairs
+    )
+
+
+def names_of(layers: list[Layer]) -> list[str]:
+    return [layer.name for layer in layers]
+
+
+# ------------------------------------------------------------------------------------ made by nona
+
+
+def uncropped(layer: Layer, canvas: Canvas) -> np.ndarray:
+    """A layer laid out on its canvas."""
+    whole = np.zeros((canvas.height, canvas.width, layer.channels + 1), layer.dtype)
+    box = layer.box
+    whole[box.top : box.bottom, box.left : box.right] = layer.read(0, box.height)
+    return whole
+
+
+KINDS = {
+    "8 bit": {},
+    "16 bit": {"dtype": np.uint16},
+    "float": {"dtype": np.float32},
+    "grey": {"channels": 1},
+    "grey 16 bit": {"channels": 1, "dtype": np.uint16},
+    "ICC": {"icc": ICC},
+    "unicode and spaces": {"folder": "Räume mit Blick", "stem": "mein 'Päno'", "photo": "Föto {} ß.tif"},
+    "odd canvas": {"panorama": 'f2 w801 h403 v360 n"TIFF_m c:LZW r:CROP"'},
+    "crop": {"panorama": 'f2 w802 h401 v360 S31,700,101,333 n"TIFF_m c:LZW r:CROP"'},
+    "no ending": {"stem": "huginpto_A1b2", "ending": ""},
+    "rectilinear": {"panorama": 'f0 w501 h301 v110 n"TIFF_m r:CROP"', "yaws": (-20, 5, 30)},
+    "cylindrical": {"panorama": 'f1 w801 h203 v360 n"TIFF_m r:CROP"'},
+    "fisheye": {"panorama": 'f3 w401 h401 v200 n"TIFF_m r:CROP"', "yaws": (-40, 5, 60)},
+    "stereographic": {"panorama": 'f4 w401 h397 v220 n"TIFF_m r:CROP"', "yaws": (-40, 5, 60)},
+}
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_layers_are_what_nona_makes(make_project, nona, kind):
+    """Depth, channels, position, canvas, colours: as tifffile sees nona's own files, run by hand."""
+    plan = read_plan(make_project(**KINDS[kind]))
+    hand = plan.folder / "by hand"
+    hand.mkdir()
+    remap(plan, str(hand / "cropped "))
+    with open_layers(plan) as layers:
+        assert names_of(layers) == [f"{plan.stem}{index:04d}.tif" for index in range(3)]
+        for index, layer in enumerate(layers):
+            page = tifffile.TiffFile(hand / f"cropped {index:04d}.tif").pages[0]
+            x, y = (round(page.tags[tag].value[0] / page.tags[tag].value[1] * 150) for tag in (286, 287))
+            height, width = page.shape[:2]
+            assert layer.box == Box(x, y, x + width, y + height)
+            assert layer.canvas_size == (plan.canvas.width, plan.canvas.height)
+            assert layer.dtype == KINDS[kind].get("dtype", np.uint8)
+            assert layer.channels == KINDS[kind].get("channels", 3)
+            assert layer.icc == KINDS[kind].get("icc")
+            assert np.array_equal(layer.read(0, height), tifffile.imread(layer.file))
+            assert same([layer.read(0, height)], [page.asarray()])
+
+
+@pytest.mark.parametrize("options", [("TIFF_m", True), ("TIFF_multilayer", False)])
+def test_uncropped_and_multilayer_are_the_same_pixels(make_project, nona, options):
+    """Without r:CROP nona writes the whole canvas; positions of cropped layers must match it."""
+    kind, uncrop = options
+    plan = read_plan(make_project())
+    bare = read_plan(make_project(stem="bare", panorama='f2 w802 h401 v360 n"TIFF_m c:LZW"'))
+    remap(bare if uncrop else plan, "other", "-m", kind)
+    with open_layers(plan) as cropped, open_layers(plan, prefix="other") as others:
+        assert len(cropped) == len(others) == 3
+        for one, other in zip(cropped, others, strict=True):
+            assert other.box == (Box(0, 0, 802, 401) if uncrop else one.box)
+            assert same([uncropped(one, plan.canvas)], [uncropped(other, plan.canvas)])
+
+
+def test_a_layer_across_the_border_is_as_wide_as_the_canvas(make_project, nona):
+    plan = read_plan(make_project(yaws=(0, 175)))
+    with open_layers(plan) as layers:
+        across = layers[1]
+        assert (across.box.left, across.box.right) == (0, 802)
+        alpha = across.read(across.box.height // 2, across.box.height // 2 + 1)[0, :, -1]
+        assert alpha[0] == alpha[-1] == 255 and not alpha[200:600].any()
+
+
+@pytest.mark.parametrize("dtype", [np.uint8, np.float32])
+def test_hdr_layers_are_half_exr(make_project, nona, dtype):
+    hdr = "#hugin_outputLDRBlended false\n#hugin_outputHDRBlended true\n"
+    plan = read_plan(make_project(dtype=dtype, extra=hdr))
+    hand = plan.folder / "by hand"
+    hand.mkdir()
+    subprocess.run(
+        ["nona", "-r", "hdr", "-m", "EXR_m", "-o", hand / "h", plan.file], check=True, capture_output=True
+    )
+    with (
+        open_layers(plan) as layers,
+        open_layers(read_plan(plan.file.with_name("pano.pto")), prefix="by hand/h") as o,
+    ):
+        assert names_of(layers) == ["pano0000.exr", "pano0001.exr", "pano0002.exr"]
+        for layer, other in zip(layers, o, strict=True):
+            assert (layer.dtype, layer.channels, layer.canvas_size) == (np.float16, 3, (802, 401))
+            assert layer.box == other.box
+            rows = layer.read(0, layer.box.height)
+            assert np.array_equal(rows, other.read(0, other.box.height))
+            assert set(np.unique(rows[..., 3])) == {0, 1}
+        # the same photos as TIFF lie at the same place
+        with open_layers(read_plan(make_project(stem="ldr", dtype=dtype))) as ldr:
+            assert [layer.box for layer in ldr] == [layer.box for layer in layers]
+
+
+def test_bigtiff_layers(make_project, nona):
+    plan = read_plan(make_project())
+    remap(plan, "pano")
+    with open_layers(plan, remap="never") as layers:
+        expected = pixels_of(layers)
+    for index in range(3):
+        path = plan.folder / f"pano{index:04d}.tif"
+        page = tifffile.TiffFile(path).pages[0]
+        places = [
+            (tag, page.tags[tag].dtype, 1, page.tags[tag].value, True) for tag in (286, 287, 33300, 33301)
+        ]
+        options = {"photometric": "rgb", "extrasamples": ["unassalpha"], "resolution": (150, 150)}
+        tifffile.imwrite(path, page.asarray(), bigtiff=True, extratags=places, **options)
+        assert path.read_bytes()[2] == 43
+    with open_layers(plan, remap="never") as layers:
+        assert all(layer.canvas_size == (802, 401) for layer in layers)
+        assert same(pixels_of(layers), expected)
+
+
+def test_positions_of_nona_at_every_offset(tmp_path, nona):
+    """Crops put the layer's corner at chosen columns; nona writes them as RATIONALs of floats."""
+    photo = np.full((60, 120, 3), 200, np.uint8)
+    tifffile.imwrite(tmp_path / "p.tif", photo, photometric="rgb")
+    for left in (1, 49, 63, 98, 126, 196, 251, 392):
+        (tmp_path / "a.pto").write_text(
+            f'p f2 w802 h401 v360 S{left},790,{left // 2},390 n"TIFF_m c:LZW r:CROP"\nm i0\n'
+            "i w120 h60 f4 v360 Ra0 Rb0 Rc0 Rd0 Re0 Eev0 Er1 Eb1 r0 p0 y0 TrX0 TrY0 TrZ0 j0 "
+            'a0 b0 c0 d0 e0 g0 t0 Va1 Vb0 Vc0 Vd0 Vx0 Vy0 Vm5 n"p.tif"\n'
+        )
+        plan = read_plan(tmp_path / "a.pto")
+        with open_layers(plan, remap="always") as layers:
+            assert layers[0].box == plan.canvas.crop
+
+
+# ------------------------------------------------------------------------------------ which are used
+
+
+def test_nothing_stays_behind(make_project, nona, temporary):
+    plan = read_plan(make_project())
+    before = sorted(plan.folder.iterdir())
+    with open_layers(plan) as layers:
+        assert all(temporary in layer.file.parents for layer in layers)
+        pixels_of(layers)
+    assert sorted(plan.folder.iterdir()) == before
+
+
+def test_progress_counts_every_step_of_every_image(make_project, nona):
+    phases = []
+
+    @contextmanager
+    def progress(phase, total):
+        phases.append([phase, total, 0])
+
+        def advance(units):
+            phases[-1][2] += units
+
+        yield advance
+
+    with open_layers(read_plan(make_project(disabled=(1,))), progress=progress):
+        pass
+    assert phases == [["remap", 4, 4]]
+
+
+def test_disabled_images_leave_gaps_in_the_names(make_project, nona):
+    plan = read_plan(make_project(disabled=(0,), yaws=(0, 60, 120)))
+    with open_layers(plan) as layers:
+        assert names_of(layers) == ["pano0001.tif", "pano0002.tif"]
+
+
+@pytest.mark.parametrize("prefix", ["pano", "photo 0 - photo 2"])
+def test_layers_beside_the_project_are_found(make_project, nona, prefix, monkeypatch):
+    plan = read_plan(make_project())
+    remap(plan, prefix)
+    monkeypatch.setattr(program, "_run", refuse)
+    with open_layers(plan) as layers:
+        assert names_of(layers) == [f"{prefix}{index:04d}.tif" for index in range(3)]
+        assert layers[0].file.parent == plan.folder
+
+
+def refuse(*arguments):
+    raise AssertionError("nona is not needed here")
+
+
+def test_complete_layers_go_before_incomplete_ones(make_project, nona, monkeypatch):
+    plan = read_plan(make_project())
+    remap(plan, "pano", "-i", "1")
+    remap(plan, "photo 0 - photo 2")
+    monkeypatch.setattr(program, "_run", refuse)
+    with open_layers(plan) as layers:
+        assert layers[0].name == "photo 0 - photo 20000.tif"
+
+
+def test_multilayer_file_is_found_but_a_panorama_of_that_name_is_not(make_project, nona, monkeypatch):
+    plan = read_plan(make_project())
+    write_image(plan.folder / "pano.tif", np.full((401, 802, 4), 255, np.uint8))
+    with pytest.raises(LayersMissingError), open_layers(plan, remap="never"):
+        pass
+    remap(plan, "pano", "-m", "TIFF_multilayer")
+    monkeypatch.setattr(program, "_run", refuse)
+    with open_layers(plan) as layers:
+        assert names_of(layers) == ["pano.tif[0]", "pano.tif[1]", "pano.tif[2]"]
+        assert plan.default_output([layer.file for layer in layers]).name == "pano_abflow.tif"
+
+
+def test_photos_named_like_layers_are_no_layers(make_project, nona, temporary):
+    plan = read_plan(make_project(photo="pano{:04d}.tif"))
+    with open_layers(plan) as layers:
+        assert all(temporary in layer.file.parents for layer in layers)
+    with pytest.raises(OutputError, match=r"pano0000\.tif is a photo"), open_layers(plan, keep_layers=True):
+        pass
+
+
+def test_only_missing_layers_are_made(make_project, nona):
+    plan = read_plan(make_project())
+    remap(plan, "pano")
+    expected = None
+    with open_layers(plan) as layers:
+        expected = pixels_of(layers)
+    (plan.folder / "pano0001.tif").unlink()
+    with open_layers(plan) as layers:
+        assert names_of(layers) == ["pano0000.tif", "pano0001.tif", "pano0002.tif"]
+        assert [layer.file.parent == plan.folder for layer in layers] == [True, False, True]
+        assert same(pixels_of(layers), expected)
+    with open_layers(plan, keep_layers=True) as layers:
+        assert all(layer.file.parent == plan.folder for layer in layers)
+    assert (plan.folder / "pano0001.tif").is_file()
+
+
+@pytest.mark.parametrize("mode", ["auto", "never", "prefix"])
+def test_an_image_that_misses_the_crop_needs_no_layer(make_project, nona, mode):
+    """Image 1 looks away from the crop. Its photo may even be gone."""
+    panorama = 'f2 w802 h401 v360 S300,500,100,300 n"TIFF_m c:LZW r:CROP"'
+    plan = read_plan(make_project(yaws=(-10, 180, 10), panorama=panorama))
+    with open_layers(plan) as layers:  # all are made
+        assert names_of(layers) == ["pano0000.tif", "pano0002.tif"]
+    remap(plan, "pano")
+    plan.images[1].photo.unlink()
+    options = {"prefix": "pano"} if mode == "prefix" else {"remap": mode}
+    with open_layers(plan, **options) as layers:
+        assert names_of(layers) == ["pano0000.tif", "pano0002.tif"]
+        assert layers[0].file.parent == plan.folder
+
+
+def test_no_image_in_the_crop(make_project, nona):
+    plan = read_plan(make_project(yaws=(0,), panorama='f2 w802 h401 v360 S0,50,0,50 n"TIFF_m r:CROP"'))
+    with pytest.raises(LayersMissingError, match="no active image reaches into the crop"), open_layers(plan):
+        pass
+
+
+# ------------------------------------------------------------------------------------ stale layers
+
+
+@pytest.mark.parametrize("older, stale", [(1.0, False), (3.0, True)])
+@pytest.mark.parametrize("than", ["project", "photo"])
+def test_layers_older_than_project_or_photo_are_made_again(make_project, nona, older, stale, than, temporary):
+    plan = read_plan(make_project())
+    remap(plan, "pano")
+    for image in plan.images:
+        age(image.photo, 100)
+    age(plan.file, 100)
+    newer = plan.file if than == "project" else plan.images[1].photo
+    for index in range(3):
+        age(plan.folder / f"pano{index:04d}.tif", 50)
+    moment = (plan.folder / "pano0001.tif").stat().st_mtime + older
+    os.utime(newer, (moment, moment))
+    with open_layers(plan) as layers:
+        assert [temporary in layer.file.parents for layer in layers] == [stale] * 3
+
+
+@pytest.mark.parametrize("reason", ["photos are missing", "nona is not installed"])
+def test_stale_layers_that_cannot_be_made_again_are_used_with_a_warning(
+    make_project, nona, reason, caplog, monkeypatch
+):
+    plan = read_plan(make_project())
+    remap(plan, "pano")
+    age(plan.folder / "pano0000.tif", 60)
+    if "photos" in reason:
+        plan.images[2].photo.unlink()
+    else:
+        monkeypatch.setenv("PATH", "")
+    with open_layers(plan) as layers:
+        assert layers[0].file.parent == plan.folder
+    assert "pano0000.tif is older" in caplog.text and reason in caplog.text
+
+
+def test_never_uses_what_is_there_and_says_what_is_wrong(make_project, nona, caplog):
+    plan = read_plan(make_project())
+    remap(plan, "pano")
+    age(plan.folder / "pano0000.tif", 60)
+    (plan.folder / "pano0002.tif").unlink()
+    with open_layers(plan, remap="never") as layers:
+        assert names_of(layers) == ["pano0000.tif", "pano0001.tif"]
+    assert "no layer of image 2 (photo 2.tif)" in caplog.text
+    assert "pano0000.tif is older" in caplog.text
+
+
+def test_never_without_layers(make_project):
+    with (
+        pytest.raises(LayersMissingError, match=r"pano0000\.tif .* or photo 0 - photo 20000\.tif"),
+        open_layers(read_plan(make_project()), remap="never"),
+    ):
+        pass
+
+
+def test_always_makes_fresh_layers_too(make_project, nona, temporary):
+    plan = read_plan(make_project())
+    remap(plan, "pano")
+    with open_layers(plan, remap="always") as layers:
+        assert all(temporary in layer.file.parents for layer in layers)
+
+
+# ------------------------------------------------------------------------------------ named layers
+
+
+@pytest.mark.parametrize("where", ["here", "project's folder", "absolute", "folder"])
+def test_prefix_is_looked_up_here_and_beside_the_project(make_project, nona, where, monkeypatch, tmp_path):
+    plan = read_plan(make_project())
+    remap(plan, "my layer_")
+    for index in range(3):
+        age(plan.folder / f"my layer_{index:04d}.tif", 1000)  # taken as they are
+    prefix = "my layer_"
+    if where == "here":
+        monkeypatch.chdir(plan.folder)
+    elif where == "absolute":
+        prefix = str(plan.folder / prefix)
+    elif where == "folder":
+        (plan.folder / "sub").mkdir()
+        for index in range(3):
+            (plan.folder / f"my layer_{index:04d}.tif").rename(plan.folder / "sub" / f"{index:04d}.tif")
+        prefix = "sub/"
+    monkeypatch.setattr(program, "_run", refuse)
+    with open_layers(plan, prefix=prefix) as layers:
+        assert len(layers) == 3
+
+
+def test_prefix_without_layers(make_project):
+    with (
+        pytest.raises(LayersMissingError, match=r"no layer nope0000\.tif .*check --prefix"),
+        open_layers(read_plan(make_project()), prefix="nope"),
+    ):
+        pass
+
+
+def test_named_files_are_taken_in_the_order_given(make_project, nona):
+    plan = read_plan(make_project())
+    remap(plan, "x")
+    files = [plan.folder / f"x{index:04d}.tif" for index in (2, 0)]
+    with open_layers(plan, layers=files) as layers:
+        assert names_of(layers) == ["x0002.tif", "x0000.tif"]
+    with (
+        pytest.raises(LayersMissingError, match=r"none\.tif: no such layer; check --layers"),
+        open_layers(plan, layers=[files[0], plan.folder / "none.tif"]),
+    ):
+        pass
+
+
+@pytest.mark.parametrize("request_", [{"remap": "sometimes"}, {"remap": "always", "prefix": "x"}])
+def test_requests_that_make_no_sense(make_project, request_):
+    with pytest.raises(SettingsError), open_layers(read_plan(make_project()), **request_):
+        pass
+
+
+# ------------------------------------------------------------------------------------ kept layers
+
+
+def test_kept_layers_are_found_the_next_time(make_project, nona, monkeypatch):
+    plan = read_plan(make_project(disabled=(1,)))
+    with open_layers(plan, keep_layers=True) as layers:
+        first = pixels_of(layers)
+    assert sorted(path.name for path in plan.folder.glob("pano*.tif")) == ["pano0000.tif", "pano0002.tif"]
+    assert not list(plan.folder.glob(".*"))
+    monkeypatch.setattr(program, "_run", refuse)
+    with open_layers(plan) as layers:
+        assert same(pixels_of(layers), first)
+
+
+# ------------------------------------------------------------------------------------ moved projects
+
+
+def test_projects_from_windows_and_moved_ones_are_remapped(make_project, nona):
+    plan = read_plan(make_project())
+    with open_layers(plan) as layers:
+        expected = pixels_of(layers)
+    (plan.folder / "sub").mkdir()
+    (plan.folder / "photo 0.tif").rename(plan.folder / "sub" / "photo 0.tif")
+    text = plan.file.read_text()
+    text = text.replace('n"photo 0.tif"', 'n"sub\\photo 0.tif"').replace('n"photo 1', 'n"C:\\me\\photo 1')
+    plan.file.write_bytes(text.replace('n"photo 2', 'n"/gone/photo 2').replace("\n", "\r\n").encode())
+    written = plan.file.read_bytes()
+    with open_layers(read_plan(plan.file)) as layers:
+        assert same(pixels_of(layers), expected)
+    assert plan.file.read_bytes() == written
+
+
+# ------------------------------------------------------------------------------------ failures
+
+
+def test_photo_missing(make_project, nona):
+    plan = read_plan(make_project())
+    plan.images[1].photo.unlink()
+    with (
+        pytest.raises(PhotoMissingError, match=r"photo 1\.tif \(image 1\) is not there.*--prefix"),
+        open_layers(plan),
+    ):
+        pass
+
+
+def test_photo_of_a_missing_layer_missing(make_project, nona):
+    plan = read_plan(make_project())
+    remap(plan, "pano")
+    (plan.folder / "pano0001.tif").unlink()
+    plan.images[1].photo.unlink()
+    with pytest.raises(PhotoMissingError, match=r"photo 1\.tif \(image 1\)"), open_layers(plan):
+        pass
+
+
+def test_nona_missing(make_project, no_nona):
+    assert program.probe() is None
+    with (
+        pytest.raises(NonaMissingError, match="apt install hugin-tools"),
+        open_layers(read_plan(make_project())),
+    ):
+        pass
+
+
+def test_nona_is_probed(nona):
+    assert program.probe()[0].isdigit()
+
+
+def test_nona_fails(make_project, nona):
+    plan = read_plan(make_project())
+    plan.images[2].photo.write_bytes(b"no photo")
+    with (
+        pytest.raises(NonaFailedError, match=r"nona failed on .*pano\.pto \(exit code 1\)") as error,
+        open_layers(plan),
+    ):
+        pass
+    assert "did not find a matching file type" in str(error.value)  # nona's own words
+
+
+SLOW_NONA = """#!/bin/sh
+echo $$ > "{folder}/pid"
+while [ "$1" != -o ]; do shift; done
+: > "${{2}}0000.tif"
+echo 'loading photo 0.tif'
+echo 'remapping photo 0.tif'
+exec sleep 60
+"""
+
+
+def test_interruption_ends_nona_and_leaves_nothing(make_project, tmp_path):
+    """A real Ctrl-C, in a process of its own, while nona is at work."""
+    if os.name == "nt":
+        pytest.skip("signals of POSIX")
+    folder = make_slow_nona(tmp_path)
+    project = make_project()
+    code = (
+        "import sys\n"
+        "from hugin_abflow.nona import open_layers\n"
+        "from hugin_abflow.project import read_plan\n"
+        "with open_layers(read_plan(sys.argv[1])):\n"
+        "    pass\n"
+    )
+    environment = {
+        **os.environ,
+        "PATH": f"{folder}{os.pathsep}{os.environ['PATH']}",
+        "PYTHONPATH": str(Path(__file__).parents[1]),
+    }
+    process = subprocess.Popen(
+        [sys.executable, "-c", code, str(project)], env=environment, stderr=subprocess.PIPE, text=True
+    )
+    try:
+        pid = int(wait_for(folder / "pid"))
+        process.send_signal(signal.SIGINT)
+        _, errors = process.communicate(timeout=30)
+    finally:
+        process.kill()
+    assert "KeyboardInterrupt" in errors
+    with pytest.raises(ProcessLookupError):
+        os.kill(pid, 0)
+
+
+def make_slow_nona(tmp_path: Path) -> Path:
+    folder = tmp_path / "bin"
+    folder.mkdir()
+    (folder / "nona").write_text(SLOW_NONA.format(folder=folder))
+    (folder / "nona").chmod(0o755)
+    return folder
+
+
+def wait_for(path: Path) -> str:
+    for _ in range(600):
+        if path.is_file() and path.read_text().endswith("\n"):
+            return path.read_text()
+        time.sleep(0.05)
+    raise AssertionError(f"{path} did not appear")
+
+
+def test_an_exception_of_the_caller_ends_nona_too(make_project, tmp_path, monkeypatch):
+    folder = make_slow_nona(tmp_path)
+    monkeypatch.setenv("PATH", f"{folder}{os.pathsep}{os.environ['PATH']}")
+
+    @contextmanager
+    def progress(phase, total):
+        def advance(units):
+            raise RuntimeError("the progress bar broke")
+
+        yield advance
+
+    with (
+        pytest.raises(RuntimeError, match="progress bar"),
+        open_layers(read_plan(make_project()), progress=progress),
+    ):
+        pass
+    with pytest.raises(ProcessLookupError):
+        os.kill(int((folder / "pid").read_text()), 0)
+
+
+# ------------------------------------------------------------------------------------ what must agree
+
+
+CANVAS = Canvas.sphere(802, 401)
+
+
+def layer(name: str, dtype: type = np.uint8, channels: int = 3, left: int = 10, top: int = 10) -> Layer:
+    return Layer.from_array(name, np.zeros((31, 41, channels + 1), dtype), left, top)
+
+
+@pytest.mark.parametrize(
+    "odd, said",
+    [
+        (layer("b", dtype=np.uint16), ["b has uint16", "a has uint8"]),
+        (layer("b", channels=1), ["b is grey", "a is RGB"]),
+        (layer("b", left=-1), ["b covers columns -1 to 40", "802x401"]),
+        (layer("b", left=780), ["b covers columns 780 to 821", "802x401"]),
+        (layer("b", top=390), ["rows 390 to 421", "802x401"]),
+    ],
+    ids=lambda value: value[0] if isinstance(value, list) else "",
+)
+def test_layers_that_do_not_belong_together(odd, said):
+    check_layers(CANVAS, [layer("a"), layer("c")])
+    with pytest.raises(LayersMismatchError) as error:
+        check_layers(CANVAS, [layer("a"), odd, layer("c")])
+    assert all(part in str(error.value) for part in said)
+
+
+def test_layers_of_another_canvas(make_project, nona):
+    small = read_plan(make_project(stem="small", panorama='f2 w600 h300 v360 n"TIFF_m c:LZW r:CROP"'))
+    remap(small, "pano")
+    plan = read_plan(make_project())
+    with (
+        pytest.raises(
+            LayersMismatchError, match=r"pano0000\.tif was made for a canvas of 600x300, .* 802x401"
+        ),
+        open_layers(plan, prefix="pano"),
+    ):
+        pass
+
+
+def test_layers_of_other_depth_are_named(make_project, nona):
+    plan = read_plan(make_project())
+    remap(plan, "pano")
+    path = plan.folder / "pano0001.tif"
+    (wrong,) = read_layers(path)
+    write_image(
+        path, wrong.read(0, wrong.box.height).astype(np.uint16), offset=(wrong.box.left, wrong.box.top)
+    )
+    with (
+        pytest.raises(
+            LayersMismatchError, match=r"pano0001\.tif has uint16 samples, pano0000\.tif has uint8"
+        ),
+        open_layers(plan),
+    ):
+        pass
+
+
+def test_different_profiles_are_reported(caplog):
+    check_layers(CANVAS, [layer("a"), Layer.from_array("b", np.zeros((3, 5, 4), np.uint8), icc=ICC)])
+    assert "b and a differ in ICC profile" in caplog.text
+
+
+def test_a_layer_that_is_no_image(make_project, nona):
+    plan = read_plan(make_project())
+    remap(plan, "pano")
+    (plan.folder / "pano0002.tif").write_bytes(b"II*\0")
+    with pytest.raises(ImageReadError, match=r"pano0002\.tif"), open_layers(plan):
+        pass
+
+
+# ------------------------------------------------------------------------------------ the real thing
+
+
+def test_the_gopro_ring_has_layers_but_no_photos(caplog):
+    """Layers named by the project's stem, photos gone; times are those of the checkout."""
+    project = Path(__file__).parents[2] / "shared" / "photos" / "gopro_ring" / "layer_.pto"
+    if not project.is_file():
+        pytest.skip("the photographs are not here")
+    with open_layers(read_plan(project)) as layers:
+        assert names_of(layers) == [f"layer_{index:04d}.tif" for index in range(6)]
+        assert all((item.dtype, item.channels) == (np.uint8, 3) for item in layers)
+        assert all(item.read(100, 101).shape == (1, item.box.width, 4) for item in layers)
+
+
+def test_conftest_fails_in_ci_and_skips_elsewhere(monkeypatch):
+    from conftest import require_program
+
+    monkeypatch.setattr(shutil, "which", lambda name: None)
+    monkeypatch.setenv("CI", "true")
+    with pytest.raises(pytest.fail.Exception, match="nona is not installed"):
+        require_program("nona")
+    monkeypatch.delenv("CI")
+    with pytest.raises(pytest.skip.Exception, match="nona is not installed"):
+        require_program("nona")
