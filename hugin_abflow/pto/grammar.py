@@ -166,23 +166,22 @@ class Field(NamedTuple):
     end: int
 
 
-def scan(keys: Keys, text: bytes, start: int, file: str, line: int) -> Iterator[Field]:
-    """The fields of a line from byte `start` on. Raises `PtoError` for a malformed one."""
-    check_quotes(text, file, line)
-    for match in _TOKEN.finditer(text, start):
-        key, length = keys.split(match[0], file, line)
-        yield Field(key, match.start(), match.start() + length, match.end())
+def tokens(text: bytes, start: int, file: str, line: int) -> Iterator[tuple[int, int]]:
+    """Where the tokens of a line begin and end, from byte `start` on.
 
-
-def tokens(text: bytes, start: int) -> Iterator[tuple[int, int]]:
-    """Where the tokens of a line begin and end, whatever they are."""
-    return (match.span() for match in _TOKEN.finditer(text, start))
-
-
-def check_quotes(text: bytes, file: str, line: int) -> None:
-    """Raise `PtoError` where a quote is not closed on its line."""
+    Raises `PtoError` where a quote is not closed on its line.
+    """
     if text.count(b'"') % 2:
         raise PtoError(file, line, show(text[text.rindex(b'"') :].rstrip()), 'a closing quote (")')
+    for match in _TOKEN.finditer(text, start):
+        yield match.span()
+
+
+def scan(keys: Keys, text: bytes, start: int, file: str, line: int) -> Iterator[Field]:
+    """The fields of a line, from byte `start` on. Raises `PtoError` for a malformed one."""
+    for token_start, end in tokens(text, start, file, line):
+        key, length = keys.split(text[token_start:end], file, line)
+        yield Field(key, token_start, token_start + length, end)
 
 
 def is_line(text: bytes, letter: bytes) -> bool:

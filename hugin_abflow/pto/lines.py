@@ -76,10 +76,9 @@ class ImageLine(FieldLine):
     def read(self) -> None:
         """Take in the fields and which of them are links."""
         super().read()
-        values = self._values.items()
-        self.links = {
-            key: int(value[1:]) for key, value in values if value[:1] == b"=" and grammar.is_link(value)
-        }
+        equations = ((key, value) for key, value in self._values.items() if value[:1] == b"=")
+        # An unknown key may hold anything behind its "="; only a variable is tested to be a link.
+        self.links = {key: int(value[1:]) for key, value in equations if key in grammar.VARIABLES}
 
 
 class OutputImageLine(ImageLine):
@@ -165,33 +164,25 @@ class VariableLine(Line):
 
         The number is None where PTGui names a variable of the whole lens.
         """
-        entries: list[tuple[str, int | None]] = []
-        for start, end in grammar.tokens(self.raw, 1):
-            name, number = self._split(self.raw[start:end])
-            entries.append((name, number))
-        return entries
+        return [self._split(self.raw[start:end]) for start, end in self._spans()]
 
     @entries.setter
     def entries(self, value: Iterable[tuple[str, int | None]]) -> None:
-        old = [(self.raw[start:end], start, end) for start, end in grammar.tokens(self.raw, 1)]
-        new = [self.encode(name if image is None else f"{name}{image}") for name, image in value]
-        pieces, position = [], 0
-        for index in range(max(len(old), len(new))):
-            if index < len(old):
-                _, start, end = old[index]
-                # An entry that goes takes the blanks before it along.
-                pieces.append(self.raw[position:start] if index < len(new) else b"")
-                position = end
-            else:
-                pieces.append(b" ")
-            pieces.append(new[index] if index < len(new) else b"")
-        if not old:
-            pieces.insert(0, self.head)
-            position = 1
-        raw = b"".join([*pieces, self.raw[position:]])
-        if [raw[start:end] for start, end in grammar.tokens(raw, 1)] != new:
-            raise self.error(b" ".join(new), "variables, each with an image's number")
+        before, raw, new = self.raw, self.raw, list(value)
+        spans, old = self._spans(), self.entries
+        texts = [self.encode(name if number is None else f"{name}{number}") for name, number in new]
+        end = spans[-1][1] if spans else len(self.head)
+        raw = raw[:end] + b"".join(b" " + text for text in texts[len(old) :]) + raw[end:]
+        for index in reversed(range(len(old))):
+            start, end = spans[index]
+            if index >= len(new):
+                raw = raw[:start].rstrip() + raw[end:]
+            elif old[index] != new[index]:
+                raw = raw[:start] + texts[index] + raw[end:]
         self.replace(raw)
+        if self.entries != new:
+            self.replace(before)
+            raise self.error(b" ".join(texts), "variables, each with an image's number")
 
     def check(self) -> None:
         """Raise `PtoError` where the line names an image that is not there."""
@@ -202,8 +193,11 @@ class VariableLine(Line):
 
     def read(self) -> None:
         """Raise `PtoError` for an entry that is no variable."""
-        for start, end in grammar.tokens(self.raw, 1):
+        for start, end in self._spans():
             self._split(self.raw[start:end])
+
+    def _spans(self) -> list[tuple[int, int]]:
+        return list(grammar.tokens(self.raw, len(self.head), self.owner.file, self.number))
 
     def _split(self, token: bytes) -> tuple[str, int | None]:
         match = grammar.VARIABLE_ENTRY.fullmatch(token)
@@ -235,7 +229,7 @@ class HuginLine(FieldLine):
     def scan(self) -> Iterator[grammar.Field]:
         """The fields and where they lie in `raw`. Raises `PtoError` for a malformed one."""
         raw = self.raw
-        for start, end in grammar.tokens(raw, len(self.head)):
+        for start, end in grammar.tokens(raw, len(self.head), self.owner.file, self.number):
             name, equals, value = raw[start:end].partition(b"=")
             if name == b"cropFactor" and not grammar.is_number(value):
                 raise self.error(raw[start:end], "a number after 'cropFactor='")
@@ -255,8 +249,7 @@ class ImageFileLine(FieldLine):
     def scan(self) -> Iterator[grammar.Field]:
         """The fields and where they lie in `raw`. Raises `PtoError` for a malformed one."""
         raw = self.raw
-        grammar.check_quotes(raw, self.owner.file, self.number)
-        spans = list(grammar.tokens(raw, len(self.head)))
+        spans = list(grammar.tokens(raw, len(self.head), self.owner.file, self.number))
         if len(spans) != len(_IMAGE_FILE_FIELDS):
             raise self.error(raw.rstrip(), 'width, height and "name"')
         for (key, kind), (start, end) in zip(_IMAGE_FILE_FIELDS, spans, strict=True):
