@@ -170,8 +170,8 @@ _information = partial(click.option, cls=_Option, group="Information")
     metavar="FILE...",
     multiple=True,
     type=_file,
-    help="Take these layers, as they are, in the order of the project's images. The list ends at the next "
-    "option or at a name that ends in .pto. Only with one project.",
+    help="Take these layers, as they are, whatever their names. The list ends at the next option or at a "
+    "name that ends in .pto. Only with one project.",
 )
 @_layers(
     "--remap",
@@ -180,7 +180,7 @@ _information = partial(click.option, cls=_Option, group="Information")
     show_default=True,
     help="Make the layers with nona. auto: only if they are missing or older than the project or its photos.",
 )
-@_layers("--keep-layers", is_flag=True, help="Keep the layers that nona made, beside the panorama.")
+@_layers("--keep-layers", is_flag=True, help="Keep the layers that nona made, beside the project.")
 @_blending(
     "--merge",
     type=click.Choice(["joint", "sequential"]),

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import shutil
 import signal
 import subprocess
 import sys
@@ -180,10 +179,15 @@ def test_project_that_is_not_there(folder: Path, capsys: pytest.CaptureFixture[s
 
 
 def test_layers_that_are_not_there(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    (folder / "tiny0001.tif").unlink()
-    arguments = [str(folder / "tiny.pto"), "--prefix", "tiny", "--remap", "never"]
+    for arguments in (["--prefix", "teeny"], ["--layers", "teeny0000.tif"]):
+        code, message = broken(folder, [str(folder / "tiny.pto"), *arguments], capsys)
+        assert code == ExitCode.LAYERS_MISSING and "teeny0000.tif" in message
+
+
+def test_layers_that_are_named_and_to_be_made(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    arguments = [str(folder / "tiny.pto"), "--prefix", "tiny", "--remap", "always"]
     code, message = broken(folder, arguments, capsys)
-    assert code == ExitCode.LAYERS_MISSING and "tiny0001.tif" in message
+    assert code == ExitCode.USAGE and "--prefix" in message
 
 
 def test_photos_that_are_not_there(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -224,10 +228,7 @@ def test_nona_that_is_not_installed(
     assert code == ExitCode.NONA and "nona" in message
 
 
-@pytest.mark.skipif(
-    not os.environ.get("CI") and shutil.which("nona") is None, reason="needs nona (Debian: hugin-tools)"
-)
-def test_nona_that_fails(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_nona_that_fails(folder: Path, nona: str, capsys: pytest.CaptureFixture[str]) -> None:
     for name in ("left.png", "right.png"):
         (folder / name).write_bytes(b"no picture at all")
     code, _ = broken(folder, [str(folder / "tiny.pto"), "--remap", "always"], capsys)
