@@ -4,12 +4,19 @@ from __future__ import annotations
 
 import os
 import shutil
-from collections.abc import Callable, Sequence
+import subprocess
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
 import pytest
 import tifffile
+
+from hugin_abflow.layer import Layer, full_scale
+from hugin_abflow.project import Plan
+
+DTYPES = [np.uint8, np.uint16, np.float16, np.float32]
+ICC = bytes(range(256)) * 3  # carried, never interpreted
 
 
 def require_program(name: str) -> str:
@@ -96,3 +103,64 @@ def make_project(tmp_path: Path) -> ProjectMaker:
         return project
 
     return make
+
+
+def noise(dtype, channels: int = 3, width: int = 131, height: int = 77, seed: int = 0) -> np.ndarray:
+    """Random pixels with binary alpha, colours under alpha 0 too: (height, width, channels + 1)."""
+    values = np.random.default_rng(seed).random((height, width, channels + 1))
+    pixels = values.astype(dtype)
+    if np.dtype(dtype).kind == "u":
+        pixels = np.rint(values * full_scale(dtype)).astype(dtype)
+    pixels[..., -1] = np.where(values[..., -1] > 0.4, full_scale(dtype), 0)
+    return pixels
+
+
+def names_in(folder: Path) -> list[str]:
+    return sorted(path.name for path in folder.iterdir())
+
+
+def whole(layer) -> np.ndarray:
+    return layer.read(0, layer.box.height)
+
+
+@pytest.fixture
+def temporary(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+    """TMPDIR of its own, found empty afterwards."""
+    folder = tmp_path / "temporary files"
+    folder.mkdir()
+    monkeypatch.setenv("TMPDIR", str(folder))
+    yield folder
+    assert not list(folder.iterdir())
+
+
+def remap(plan: Plan, prefix: str, *options: str) -> None:
+    """Layers from nona, run by hand in the project's folder."""
+    arguments = ["-z", "LZW", "-r", "ldr", "-m", "TIFF_m", *options, "-o", prefix, str(plan.file)]
+    subprocess.run(["nona", *arguments], cwd=plan.folder, check=True, capture_output=True)
+
+
+def age(path: Path, seconds: float) -> None:
+    """Make a file look older."""
+    changed = path.stat().st_mtime - seconds
+    os.utime(path, (changed, changed))
+
+
+def pixels_of(layers: list[Layer]) -> list[np.ndarray]:
+    return [layer.read(0, layer.box.height) for layer in layers]
+
+
+def same(ones: list[np.ndarray], others: list[np.ndarray]) -> bool:
+    """Equal but for nona's dither, which differs by 1 from run to run."""
+    pairs = list(zip(ones, others, strict=True))
+    return all(one.shape == other.shape for one, other in pairs) and all(
+        np.abs(one.astype(float) - other.astype(float)).max() <= (1 if one.dtype.kind == "u" else 0)
+        for one, other in pairs
+    )
+
+
+def names_of(layers: list[Layer]) -> list[str]:
+    return [layer.name for layer in layers]
+
+
+def refuse(*arguments):
+    raise AssertionError("nona is not needed here")
