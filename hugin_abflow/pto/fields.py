@@ -148,10 +148,15 @@ class FieldLine(Line):
         return int(self.number_of(key, default))
 
     def box(self, key: str) -> Box | None:
-        """A field ``left,right,top,bottom`` as (left, top, right, bottom); right and bottom exclusive."""
+        """A field ``left,right,top,bottom`` as (left, top, right, bottom); right and bottom exclusive.
+
+        Raises `PtoError` where it holds something else.
+        """
         value = self._values.get(key)
         if value is None:
             return None
+        if not grammar.BOX.accepts(value):
+            raise self.error(value, f"{grammar.BOX.expected} after '{key}'")
         left, right, top, bottom = (int(item) for item in value.split(b","))
         return left, top, right, bottom
 

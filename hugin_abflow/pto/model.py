@@ -259,7 +259,7 @@ class Project:
         self.options = Options(self)
         # Without a p- or m-line in the file these stay without bytes until a field is set.
         self.panorama, self.modes = Panorama(self, 0, b""), Modes(self, 0, b"")
-        self.added: list[Line] = [self.panorama, self.modes]
+        self.added: list[Line] = []
 
     def __repr__(self) -> str:
         return (

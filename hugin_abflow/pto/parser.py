@@ -72,7 +72,7 @@ class _Reader:
         self.file_lines: list[ImageFileLine] = []
         self.dummy_follows = False
         self.file_version: int | None = None
-        self.read_line: dict[bytes, Callable[[int, bytes], Line | None]] = {
+        self.read_line: dict[bytes, Callable[[int, bytes], Line]] = {
             b"p": self.read_panorama,
             b"m": self.read_modes,
             b"i": self.read_input_image,
@@ -82,7 +82,10 @@ class _Reader:
         }
 
     def read(self) -> Project:
-        """Read all lines up to the ``*``, put the images together, check what refers to them."""
+        """Read all lines up to the ``*``, put the images together, check what refers to them.
+
+        There may be hundreds of thousands of control points: one as Hugin writes it is only matched.
+        """
         project = self.project
         lines = project.lines
         plain_control_point = grammar.PLAIN_CONTROL_POINT.fullmatch
@@ -104,7 +107,8 @@ class _Reader:
                 project.end = position
                 break
             elif letter in self.read_line and grammar.is_line(raw, letter):
-                lines[position] = self.read_line[letter](position + 1, raw) or raw
+                lines[position] = self.read_line[letter](position + 1, raw)
+        project.added = [line for line in (project.panorama, project.modes) if not line.number]
         self.join_images()
         self.check()
         self.check_control_points(numbers)
@@ -114,14 +118,12 @@ class _Reader:
         """The p-line."""
         self.refuse_second(self.project.panorama, number, raw)
         self.project.panorama = Panorama(self.project, number, raw)
-        self.project.added = [line for line in self.project.added if not isinstance(line, Panorama)]
         return self.project.panorama
 
     def read_modes(self, number: int, raw: bytes) -> Line:
         """The m-line."""
         self.refuse_second(self.project.modes, number, raw)
         self.project.modes = Modes(self.project, number, raw)
-        self.project.added = [line for line in self.project.added if not isinstance(line, Modes)]
         return self.project.modes
 
     def read_input_image(self, number: int, raw: bytes) -> Line:
@@ -203,7 +205,7 @@ class _Reader:
         """Raise `PtoError` for what refers to nothing, and for a text that is no project."""
         project = self.project
         if not project.panorama.number and not project.images:
-            expected = "a .pto text: a p-line and an i-line for each image"
+            expected = "a .pto text, with a p-line and an i-line for each image"
             first = project.lines[0] if project.lines else b""
             token = first.raw if isinstance(first, Line) else first
             raise PtoError(project.file, 0, grammar.show(token.rstrip()), expected)
