@@ -9,14 +9,15 @@ from contextlib import contextmanager
 from functools import partial
 from importlib import metadata
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import click
 
 from hugin_abflow.errors import AbflowError, DeviceError, ExitCode
 from hugin_abflow.merge import merge_project
+from hugin_abflow.nona import Remap
 from hugin_abflow.opencl import list_devices
-from hugin_abflow.settings import Settings
+from hugin_abflow.settings import MergeMode, Settings
 from hugin_abflow.terminal import (
     PROGRAM,
     complain,
@@ -175,7 +176,7 @@ _information = partial(click.option, cls=_Option, group="Information")
 )
 @_layers(
     "--remap",
-    type=click.Choice(["auto", "always", "never"]),
+    type=click.Choice(get_args(Remap)),
     default="auto",
     show_default=True,
     help="Make the layers with nona. auto: only if they are missing or older than the project or its photos.",
@@ -183,7 +184,7 @@ _information = partial(click.option, cls=_Option, group="Information")
 @_layers("--keep-layers", is_flag=True, help="Keep the layers that nona made, beside the project.")
 @_blending(
     "--merge",
-    type=click.Choice(["joint", "sequential"]),
+    type=click.Choice(get_args(MergeMode)),
     default=_DEFAULTS.merge,
     help="joint: all layers at once. sequential: two at a time, as published; for comparison.",
 )
@@ -237,9 +238,9 @@ def command(
     jpeg_quality: int | None,
     prefix: str | None,
     layers: tuple[Path, ...],
-    remap: str,
+    remap: Remap,
     keep_layers: bool,
-    merge: str,
+    merge: MergeMode,
     exposure: str,
     softmax_sharpness: float,
     flow_magnitude: float,
@@ -263,7 +264,7 @@ def command(
     if quiet and verbose:
         raise click.UsageError("-q and -v contradict each other")
     settings = Settings(
-        merge=merge,  # type: ignore[arg-type]  # click.Choice allows nothing else
+        merge=merge,
         softmax_sharpness=softmax_sharpness,
         flow_magnitude=flow_magnitude,
         exposure=exposure == "auto",
