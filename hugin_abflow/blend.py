@@ -11,13 +11,14 @@ import numpy as np
 import numpy.typing as npt
 
 from hugin_abflow.layer import Box
-from hugin_abflow.opencl import Buffer, Device
+from hugin_abflow.opencl import Buffer, Device, DeviceMemoryError
 from hugin_abflow.progress import Advance
 from hugin_abflow.settings import Settings
 from hugin_abflow.working import Grid, WorkingLayer, device_rows, pixel_options
 
 # Bands of about this many output pixels, where the settings leave the choice.
 _BAND_PIXELS = 1 << 22
+_LEAST_ROWS = 16
 
 
 @dataclass(frozen=True)
@@ -54,7 +55,7 @@ def bands(
     layers: Sequence[BlendLayer],
     full: Grid,
     grid: Grid,
-    gain_grid: Grid | None,
+    gain_grid: Grid,
     crop: Box,
     settings: Settings,
     advance: Advance,
@@ -63,12 +64,20 @@ def bands(
     layers' dtype, alpha last. `crop` is in canvas pixels; `advance` counts rows.
     """
     first = layers[0].working.layer
-    height = settings.band_rows or max(16, _BAND_PIXELS // crop.width)
-    for top in range(crop.top, crop.bottom, height):
-        bottom = min(crop.bottom, top + height)
-        out = _band(device, layers, full, grid, gain_grid, Box(crop.left, top, crop.right, bottom), settings)
+    height = settings.band_rows or max(_LEAST_ROWS, _BAND_PIXELS // crop.width)
+    top = crop.top
+    while top < crop.bottom:
+        part = Box(crop.left, top, crop.right, min(crop.bottom, top + height))
+        try:
+            out = _band(device, layers, full, grid, gain_grid, part, settings)
+        except DeviceMemoryError:
+            if height <= _LEAST_ROWS:
+                raise
+            height = max(_LEAST_ROWS, height // 2)  # the device is smaller than it says
+            continue
         yield out.astype(first.dtype) if first.dtype == np.float16 else out
-        advance(bottom - top)
+        advance(part.height)
+        top = part.bottom
 
 
 def _band(
@@ -76,7 +85,7 @@ def _band(
     layers: Sequence[BlendLayer],
     full: Grid,
     grid: Grid,
-    gain_grid: Grid | None,
+    gain_grid: Grid,
     part: Box,
     settings: Settings,
 ) -> npt.NDArray[Any]:
@@ -104,7 +113,7 @@ def _band(
         device.run(
             "blend", "blend_add", size, rows, place, band, full.border, full.lens,
             layer.field, layer.working.box, grid.border,
-            layer.gain or nothing, (gain_grid or grid).border, int(layer.gain is not None),
+            layer.gain or nothing, gain_grid.border, int(layer.gain is not None),
             int(settings.interpolation == "nearest"), count, reference, total, options=options,
         )  # fmt: skip
     samples = layers[0].working.layer.channels + 1

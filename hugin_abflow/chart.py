@@ -48,7 +48,7 @@ def _plane(overlap: npt.NDArray[np.bool_], grid: Grid) -> Chart:
     top, bottom = max(0, rows[0] - _MARGIN), min(grid.height, rows[-1] + 1 + _MARGIN)
     transform = np.zeros(16, np.float32)
     transform[9:11] = 1
-    columns = overlap.any(0)
+    columns = np.logical_or.reduce(overlap, 0)
     if not grid.wraps:
         used = np.flatnonzero(columns)
         left, right = max(0, used[0] - _MARGIN), min(grid.width, used[-1] + 1 + _MARGIN)

@@ -41,6 +41,10 @@ class Masks:
     buffers: tuple[Buffer, ...]
     host: npt.NDArray[np.bool_]  # (layers, height, width)
 
+    def only(self, indices: Sequence[int]) -> Masks:
+        """The masks of some of the layers."""
+        return Masks(self.grid, tuple(self.buffers[i] for i in indices), self.host[list(indices)])
+
 
 def masks(device: Device, layers: Sequence[WorkingLayer], grid: Grid) -> Masks:
     """The layers' masks; a mask pixel is covered if every working pixel under it is."""
@@ -73,15 +77,22 @@ def distance(device: Device, masks_: Masks, index: int, cover: Buffer, working: 
         steps.append(step)
         step //= 2
     for jump in [*steps, 2, 1]:
-        device.run(
-            "coefficient", "coefficient_flood", size, seed, grid.border, grid.lens, jump, flooded
-        )
+        device.run("coefficient", "coefficient_flood", size, seed, grid.border, grid.lens, jump, flooded)
         seed, flooded = flooded, seed
     unit = working.width / grid.width
     furthest = math.pi / working.lens[1] if working.lens[1] else math.hypot(*working.shape)
     result = device.empty(grid.shape)
     device.run(
-        "coefficient", "coefficient_distance", size, seed, mask, grid.border, grid.lens, unit, furthest, result
+        "coefficient",
+        "coefficient_distance",
+        size,
+        seed,
+        mask,
+        grid.border,
+        grid.lens,
+        unit,
+        furthest,
+        result,
     )
     return result
 
@@ -90,7 +101,7 @@ def coefficients(
     device: Device, layers: Sequence[WorkingLayer], masks_: Masks, grid: Grid, settings: Settings
 ) -> list[Coefficients]:
     """The blend coefficients of all layers."""
-    cover = device.upload(masks_.host.any(0), np.uint8)
+    cover = device.upload(np.logical_or.reduce(masks_.host, 0), np.uint8)
     total = device.zeros(grid.shape)
     ratio = (masks_.grid.width / grid.width, masks_.grid.height / grid.height)
     expanded = []

@@ -20,6 +20,7 @@ import numpy.typing as npt
 
 from hugin_abflow.geometry import PairFlow
 from hugin_abflow.opencl import Buffer, Device
+from hugin_abflow.settings import Settings
 from hugin_abflow.working import Grid, WorkingLayer
 
 # Working pixels per cell of the colour grid.
@@ -28,8 +29,9 @@ _CELL = 16
 _FLOOR = 0.02
 _CLIPPED = 0.98
 _SPREAD = 0.15
-# Weight of the measured differences against smoothness.
-_DATA = 30.0
+# Rounds of (weight of the measured differences against smoothness, residual that halves a cell's trust). The
+# first round fits the trend; what lies far from it is no exposure but something that only one layer shows.
+_ROUNDS = ((0.1, 0.5), (1.0, 0.3), (30.0, 0.3))
 # The correction fades out over this share of the canvas's width.
 _FADE = 0.12
 # Gains below this (a quarter of an 8-bit level at full scale) are taken to exactly 0.
@@ -57,12 +59,16 @@ def correction(
     pairs: Sequence[PairFlow],
     grid: Grid,
     covered: npt.NDArray[np.bool_],
+    settings: Settings,
 ) -> Correction:
     """Measure the overlaps of the aligned layers and solve for the gains.
 
     fields: of geometry.py. covered: (layers, height, width) on any grid over the same region.
+    With `settings.exposure` off there is no correction.
     """
     cells = colour_grid(grid)
+    if not settings.exposure:
+        return Correction(cells, (None,) * len(layers))
     floating = layers[0].layer.dtype.kind == "f"
     measured = []
     for pair in pairs:
@@ -79,7 +85,7 @@ def correction(
     inside = _cells_covered(covered, cells)
     gains = solve(measured, inside, cells)
     gains = np.sign(gains) * np.maximum(np.abs(gains) - _NEGLIGIBLE, 0)
-    result = []
+    result: list[Buffer | None] = []
     for gain, mask in zip(gains, inside, strict=True):
         if not gain.any():
             result.append(None)
@@ -112,7 +118,24 @@ def solve(
     south[:, :-1] = (inside[:, :-1] & inside[:, 1:]) * np.sqrt(area[:-1] * area[1:])
     fade = max(1.0, _FADE * (cells.width if not cells.lens[1] else 2 * np.pi / cells.lens[1]))
     hold = inside * area / fade**2
-    links = [(a, b, _DATA * d[..., 3] * area, d[..., :3]) for a, b, d in measured]
+    solution = np.zeros((*inside.shape, 3))
+    for data, residual in _ROUNDS:
+        links = []
+        for a, b, d in measured:
+            off = np.linalg.norm(solution[a] - solution[b] + d[..., :3], axis=-1) if solution.any() else 0.0
+            links.append((a, b, data * area * d[..., 3] / (1 + (off / residual) ** 2), d[..., :3]))
+        solution = _minimise(links, hold, east, south, solution)
+    return solution
+
+
+def _minimise(
+    links: Sequence[tuple[int, int, npt.NDArray[np.float64], npt.NDArray[np.float64]]],
+    hold: npt.NDArray[np.float64],
+    east: npt.NDArray[np.float64],
+    south: npt.NDArray[np.float64],
+    start: npt.NDArray[np.float64],
+) -> npt.NDArray[np.float64]:
+    """Conjugate gradients, preconditioned by the diagonal, from `start`."""
 
     def apply(g: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
         out = hold[..., None] * g
@@ -126,7 +149,7 @@ def solve(
             out[b] -= step
         return out
 
-    right = np.zeros((*inside.shape, 3))
+    right = np.zeros_like(start)
     diagonal = hold + east + np.roll(east, 1, 2) + south + np.roll(south, 1, 1)
     for a, b, weight, difference in links:
         right[a] -= weight[..., None] * difference
@@ -134,27 +157,23 @@ def solve(
         diagonal[a] += weight
         diagonal[b] += weight
     scale = np.where(diagonal > 0, 1 / np.maximum(diagonal, 1e-12), 0)[..., None]
-    return _conjugate_gradients(apply, right, scale)
-
-
-def _conjugate_gradients(apply, right, scale):  # type: ignore[no-untyped-def]
-    """Solve apply(x) = right, preconditioned with the inverse diagonal `scale`."""
-    x = np.zeros_like(right)
-    residual = right.copy()
+    solution = start.copy()
+    residual = right - apply(solution)
     z = scale * residual
     direction = z.copy()
-    rho = start = float(np.vdot(residual, z))
+    rho = float(np.vdot(residual, z))
+    enough = _TOLERANCE**2 * float(np.vdot(right, scale * right))
     for _ in range(_ITERATIONS):
-        if rho <= start * _TOLERANCE**2 or rho == 0:
+        if rho <= enough:
             break
         image = apply(direction)
         step = rho / float(np.vdot(direction, image))
-        x += step * direction
+        solution += step * direction
         residual -= step * image
         z = scale * residual
         rho, last = float(np.vdot(residual, z)), rho
         direction = z + (rho / last) * direction
-    return x
+    return solution
 
 
 def _extend(

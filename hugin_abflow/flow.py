@@ -19,7 +19,7 @@ class FlowParameters:
     """What the solver weighs; units of h are log brightness."""
 
     coarsest: int = 12  # px: the shorter side of the coarsest level
-    warps: int = 5  # linearisations per level
+    warps: tuple[int, ...] = (2, 5)  # linearisations per level, finest first; the last holds for all coarser
     sweeps: int = 12  # red-black sweeps per linearisation
     relaxation: float = 1.85  # of successive over-relaxation
     brightness: float = 5.0  # weight of brightness constancy
@@ -36,14 +36,20 @@ class _Features:
     grid: tuple[int, int, int, int]
 
 
-def _features(device: Device, level: Level, parameters: FlowParameters) -> _Features:
-    mean = pyramid.smooth(device, level, parameters.mean_sigma)
+def _features(device: Device, level: Level, coarser: Level, parameters: FlowParameters) -> _Features:
+    """Features of a level; the local mean is smooth enough to be taken from the next coarser one."""
+    mean = pyramid.smooth(device, coarser, parameters.mean_sigma / 2)
     feature = device.empty((*level.image.shape, 4))
-    device.run("flow", "flow_feature", level.grid[:2], level.image, mean, level.mask, level.grid, feature)
+    device.run(
+        "flow", "flow_feature", level.grid[:2], level.image, level.mask, level.grid,
+        mean.image, mean.mask, mean.grid, feature,
+    )  # fmt: skip
     return _Features(feature, level.grid)
 
 
-def _refine(device: Device, a: _Features, b: _Features, flow: Buffer, parameters: FlowParameters) -> Buffer:
+def _refine(
+    device: Device, a: _Features, b: _Features, flow: Buffer, warps: int, parameters: FlowParameters
+) -> Buffer:
     """Improve `flow` from a to b on one level."""
     grid, size = a.grid, a.grid[:2]
     shape = size[::-1]
@@ -51,7 +57,7 @@ def _refine(device: Device, a: _Features, b: _Features, flow: Buffer, parameters
     right, base = (device.empty((*shape, 2)) for _ in range(2))
     system_left, system_right = (device.empty((*shape, 4)) for _ in range(2))
     window_right = device.empty((*shape, 2))
-    for _ in range(parameters.warps):
+    for _ in range(warps):
         device.run("flow", "flow_warp", size, b.feature, flow, grid, warped)
         device.run(
             "flow", "flow_tensor", size, a.feature, warped, grid,
@@ -85,17 +91,19 @@ def pair_flow(
     shorter, levels = min(a.grid[:2]), 1
     while shorter >= 2 * parameters.coarsest:
         shorter, levels = shorter // 2, levels + 1
-    pyramids = [pyramid.build(device, image, levels) for image in (a, b)]
+    pyramids = [pyramid.build(device, image, levels + 1) for image in (a, b)]
     flows: list[Buffer] | None = None
     for level in reversed(range(levels)):
-        features = [_features(device, p[level], parameters) for p in pyramids]
+        features = [_features(device, p[level], p[level + 1], parameters) for p in pyramids]
         grid = features[0].grid
+        warps = parameters.warps[min(level, len(parameters.warps) - 1)]
         if flows is None:
             flows = [device.zeros((grid[1], grid[0], 2)) for _ in range(2)]
         else:
             flows = [_expand(device, flow, grid) for flow in flows]
         flows = [
-            _refine(device, features[i], features[1 - i], flow, parameters) for i, flow in enumerate(flows)
+            _refine(device, features[i], features[1 - i], flow, warps, parameters)
+            for i, flow in enumerate(flows)
         ]
     assert flows is not None
     return flows[0], flows[1]

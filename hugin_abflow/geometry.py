@@ -49,7 +49,7 @@ def fields(
     (sphere: of unit vectors; plane: working px) and the colour weight s_k, not yet normalised.
     """
     result = []
-    for index, layer in enumerate(layers):
+    for index in range(len(layers)):
         field = _displacement(device, index, layers, coefficients, flows, grid, None)
         for _ in range(settings.fixed_point_steps):
             field = _displacement(device, index, layers, coefficients, flows, grid, field)
@@ -58,7 +58,8 @@ def fields(
     furthest = _PLAUSIBLE * grid.circumference
     for layer, field, coefficient in zip(layers, result, coefficients, strict=True):
         device.run(
-            "geometry", "geometry_activation", layer.box[2:], field, coefficient.blend, layer.box, grid.border,
+            "geometry", "geometry_activation", layer.box[2:],
+            field, coefficient.blend, layer.box, grid.border,
             float(settings.softmax_sharpness), float(settings.flow_magnitude), float(grid.circumference),
             furthest, highest,
         )  # fmt: skip

@@ -1,71 +1,98 @@
-"""From layers, or a Hugin project, to a panorama."""
+"""From a Hugin project, or from layers, to a panorama."""
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from hugin_abflow import blend, chart, coefficient, colour, flow, geometry, working
-from hugin_abflow.coefficient import Masks
-from hugin_abflow.geometry import PairFlow
-from hugin_abflow.layer import Box, Canvas, Layer
+from hugin_abflow import joint, sequential
+from hugin_abflow.errors import LayersMissingError, OutputError
+from hugin_abflow.images import ImageWriter
+from hugin_abflow.layer import Canvas, Layer
+from hugin_abflow.nona import Remap, check_layers, open_layers
 from hugin_abflow.opencl import Device
 from hugin_abflow.progress import Progress, silent
+from hugin_abflow.project import Plan, read_plan
 from hugin_abflow.settings import Settings
-from hugin_abflow.working import Grid, WorkingLayer
 
-_log = logging.getLogger(__name__)
+
+def merge_project(
+    path: Path | str,
+    settings: Settings | None = None,
+    *,
+    output: Path | str | None = None,
+    prefix: str | Path | None = None,
+    layers: Sequence[str | Path] | None = None,
+    remap: Remap = "auto",
+    keep_layers: bool = False,
+    compression: str | None = None,
+    jpeg_quality: int | None = None,
+    progress: Progress = silent,
+) -> Path:
+    """Turn a Hugin project into a panorama; returns its file.
+
+    output          format by its ending; default: named and typed as the project says, beside it.
+    prefix, layers, remap, keep_layers    where the layers come from, see `nona.open_layers`.
+    compression, jpeg_quality    of the file, see `images.ImageWriter`; default: the project's.
+
+    The file appears when it is complete; inputs are never touched. Raises the `AbflowError` family:
+    what the project, its layers, the device or the output can get wrong.
+    """
+    plan = read_plan(path)
+    settings = settings or Settings()
+    with open_layers(
+        plan, prefix=prefix, layers=layers, remap=remap, keep_layers=keep_layers, progress=progress
+    ) as opened:
+        target = _target(plan, opened, output)
+        crop, first = plan.canvas.crop, opened[0]
+        with ImageWriter(
+            target, crop.width, crop.height, first.channels, first.dtype,
+            offset=(crop.left, crop.top), canvas_size=(plan.canvas.width, plan.canvas.height), icc=first.icc,
+            compression=compression or plan.output.compression,
+            jpeg_quality=jpeg_quality or plan.output.jpeg_quality,
+        ) as writer:  # fmt: skip
+            for rows in _bands(opened, plan.canvas, settings, progress):
+                writer.write_rows(rows)
+    return target
 
 
 def merge_layers(
-    layers: Sequence[Layer], canvas: Canvas, settings: Settings | None = None, *, progress: Progress = silent
+    layers: Sequence[Layer],
+    canvas: Canvas,
+    settings: Settings | None = None,
+    *,
+    progress: Progress = silent,
 ) -> npt.NDArray[Any]:
-    settings = settings or Settings()
+    """Merge layers in memory: the canvas's crop, (height, width, channels + 1) in the layers' dtype.
+
+    Alpha is last and unassociated. Raises `LayersMissingError` without layers, `LayersMismatchError` if
+    they do not fit the canvas or each other, `DeviceError`.
+    """
+    if not layers:
+        raise LayersMissingError("there are no layers to merge; give at least one")
+    check_layers(canvas, layers)
+    return np.concatenate(list(_bands(layers, canvas, settings or Settings(), progress)))
+
+
+def _bands(
+    layers: Sequence[Layer], canvas: Canvas, settings: Settings, progress: Progress
+) -> Iterator[npt.NDArray[Any]]:
+    """The panorama's rows from top to bottom."""
     device = Device(settings.device)
-    return np.concatenate(list(_panorama(device, layers, canvas, settings, progress)))
+    method = {"joint": joint.merge, "sequential": sequential.merge}[settings.merge]
+    yield from method(device, layers, canvas, settings, progress)
 
 
-def _panorama(device, layers, canvas, settings, progress):
-    full = working.full_grid(canvas, layers)
-    grid = working.working_grid(full, settings)
-    reduced = _reduce(device, layers, grid, progress)
-    masks = coefficient.masks(device, reduced, grid)
-    coefficients = coefficient.coefficients(device, reduced, masks, grid, settings)
-    flows = _flows(device, reduced, masks, grid, progress)
-    fields = geometry.fields(device, reduced, coefficients, flows, grid, settings)
-    correction = None
-    if settings.exposure:
-        correction = colour.correction(device, reduced, fields, flows, grid, masks.host)
-    final = [
-        blend.BlendLayer(l, f, geometry.reach(device, l, f, grid), correction.gains[i] if correction else None)
-        for i, (l, f) in enumerate(zip(reduced, fields, strict=True))
-    ]
-    with progress("Blending", canvas.crop.height) as advance:
-        yield from blend.bands(device, final, full, grid, correction.grid if correction else None, canvas.crop, settings, advance)
-
-
-def _reduce(device, layers, grid, progress):
-    with progress("Reading layers", sum(layer.box.height for layer in layers)) as advance:
-        return [working.reduce_layer(device, layer, grid, advance) for layer in layers]
-
-
-def _flows(device, layers, masks, grid, progress):
-    pairs = [(a, b) for a in range(len(layers)) for b in range(a + 1, len(layers)) if (masks.host[a] & masks.host[b]).any()]
-    result = []
-    with progress("Finding flow", len(pairs)) as advance:
-        for a, b in pairs:
-            overlap = masks.host[a] & masks.host[b]
-            c = chart.pair_chart(overlap, masks.grid, grid)
-            if working.same_where_both(device, layers[a], layers[b]):
-                zero = device.zeros((c.height, c.width, 2))
-                result.append(PairFlow(a, b, c, zero, zero))
-            else:
-                levels = [chart.sample(device, layers[i], grid, c) for i in (a, b)]
-                result.append(PairFlow(a, b, c, *flow.pair_flow(device, *levels)))
-            advance(1)
-    return result
+def _target(plan: Plan, layers: Sequence[Layer], output: Path | str | None) -> Path:
+    """The panorama's file, which must be none of the inputs."""
+    inputs = [layer.file for layer in layers if layer.file is not None]
+    if output is None:
+        return plan.default_output(inputs)
+    for file in [plan.file, *(image.photo for image in plan.images), *inputs]:
+        if file.resolve() == Path(output).resolve():
+            raise OutputError(f"{output} is an input of {plan.file}; choose another name with -o")
+    return Path(output)

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import logging
-import os
 import sys
-from collections.abc import Sequence
+import warnings
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -109,33 +110,62 @@ def _choose(wanted: str | None) -> cl.Device:
     raise DeviceError(f"no OpenCL device fits --device {wanted}; there are {names}")
 
 
+class DeviceMemoryError(DeviceError):
+    """The device's memory is too small for what was asked; smaller pieces may fit."""
+
+
+_OUT_OF_MEMORY = frozenset(
+    {
+        cl.status_code.MEM_OBJECT_ALLOCATION_FAILURE,
+        cl.status_code.OUT_OF_RESOURCES,
+        cl.status_code.OUT_OF_HOST_MEMORY,
+        cl.status_code.INVALID_BUFFER_SIZE,
+    }
+)
+
+
+@contextmanager
+def _device_errors(doing: str) -> Iterator[None]:
+    """Turn pyopencl's errors into ours."""
+    try:
+        yield
+    except cl.Error as error:
+        remedy = "close other programs that use it, or choose another --device"
+        kind = DeviceMemoryError if error.code in _OUT_OF_MEMORY else DeviceError
+        raise kind(f"the OpenCL device failed while {doing} ({error}); {remedy}") from error
+
+
 class Buffer:
     """An array on the device: shape and dtype with a `cl.Buffer`. Freed with the object."""
 
     def __init__(self, device: Device, shape: tuple[int, ...], dtype: npt.DTypeLike) -> None:
         self.shape, self.dtype = shape, np.dtype(dtype)
         self.nbytes = int(np.prod(shape, dtype=np.int64)) * self.dtype.itemsize
-        self.data = cl.Buffer(device.context, cl.mem_flags.READ_WRITE, max(self.nbytes, 16))
+        with _device_errors(f"allocating {self.nbytes} bytes"):
+            self.data = cl.Buffer(device.context, cl.mem_flags.READ_WRITE, max(self.nbytes, 16))
         self._queue = device.queue
 
     def get(self) -> npt.NDArray[Any]:
         """Copy to the host."""
         host = np.empty(self.shape, self.dtype)
         if host.size:
-            cl.enqueue_copy(self._queue, host, self.data)
+            with _device_errors("copying to the host"):
+                cl.enqueue_copy(self._queue, host, self.data)
         return host
 
     def set(self, host: npt.NDArray[Any]) -> Buffer:
         """Copy from the host; `host` has this buffer's shape."""
         if host.size:
-            cl.enqueue_copy(self._queue, self.data, np.ascontiguousarray(host, self.dtype))
+            with _device_errors("copying from the host"):
+                cl.enqueue_copy(self._queue, self.data, np.ascontiguousarray(host, self.dtype))
         return self
 
     def fill(self, value: float) -> Buffer:
         """Set every element."""
         if self.nbytes:
             pattern = np.array(value, self.dtype)
-            cl.enqueue_fill_buffer(self._queue, self.data, pattern, 0, self.nbytes)
+            with _device_errors("filling a buffer"):
+                cl.enqueue_fill_buffer(self._queue, self.data, pattern, 0, self.nbytes)
         return self
 
 
@@ -169,8 +199,10 @@ class Device:
         key = (module, name, options)
         if key not in self._kernels:
             try:
-                program = cl.Program(self.context, kernel_source(module))
-                program.build(["-cl-std=CL1.2", *options.split()])
+                with warnings.catch_warnings():  # compilers chat; errors come with the exception
+                    warnings.simplefilter("ignore", cl.CompilerWarning)
+                    program = cl.Program(self.context, kernel_source(module))
+                    program.build(["-cl-std=CL1.2", *options.split()])
             except cl.Error as error:
                 raise DeviceError(
                     f"kernels/{module}.cl does not build on {self.device.name.strip()}: {error}; "
@@ -192,11 +224,13 @@ class Device:
         kernel = self.kernel(module, name, options)
         kernel.set_args(*(_argument(a) for a in args))
         rounded = tuple(-(-int(n) // g) * g for n, g in zip(size, _GROUP, strict=True))
-        cl.enqueue_nd_range_kernel(self.queue, kernel, rounded, _GROUP)
+        with _device_errors(f"running {name}"):
+            cl.enqueue_nd_range_kernel(self.queue, kernel, rounded, _GROUP)
 
     def finish(self) -> None:
         """Wait for all that was started; raises `DeviceError` if the device failed."""
-        self.queue.finish()
+        with _device_errors("finishing"):
+            self.queue.finish()
 
 
 def _argument(value: Any) -> Any:
@@ -209,8 +243,3 @@ def _argument(value: Any) -> Any:
     vector = np.asarray(value)
     kind = "int" if vector.dtype.kind in "iu" else "float"
     return getattr(cl.cltypes, f"make_{kind}{vector.size}")(*vector.tolist())
-
-
-def quiet_runtime() -> None:
-    """Keep pyopencl's notes about compiler output off the user's terminal."""
-    os.environ.setdefault("PYOPENCL_NO_CACHE", "0")

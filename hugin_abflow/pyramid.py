@@ -8,6 +8,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import numpy as np
+
 from hugin_abflow.opencl import Buffer, Device
 
 
@@ -48,20 +50,19 @@ def build(device: Device, finest: Level, levels: int) -> list[Level]:
     return pyramid
 
 
-def smooth(device: Device, level: Level, sigma: float) -> Buffer:
+def smooth(device: Device, level: Level, sigma: float) -> Level:
     """Gaussian mean of the valid pixels around each pixel, sigma in px; 0 where there are none.
 
-    Expects an image that is 0 where its mask is.
+    Expects an image that is 0 where its mask is. The result's mask is the weight of the valid pixels.
     """
     grid, radius = level.grid, max(1, round(2.5 * sigma))
-    shape = level.image.shape
-    image, weight, mean, total = (device.empty(shape) for _ in range(4))
-    device.run(
-        "pyramid", "pyramid_smooth", grid[:2],
-        level.image, level.mask, grid, (1, 0), float(sigma), radius, 0, image, weight,
-    )  # fmt: skip
-    device.run(
-        "pyramid", "pyramid_smooth", grid[:2],
-        image, weight, grid, (0, 1), float(sigma), radius, 1, mean, total,
-    )  # fmt: skip
-    return mean
+    taps = device.upload(np.exp(-0.5 * (np.arange(radius + 1) / sigma) ** 2).astype(np.float32))
+    rows, columns = (
+        Level(device.empty(level.image.shape), device.empty(level.image.shape), level.wraps) for _ in range(2)
+    )
+    for source, step, normalise, target in ((level, (1, 0), 0, rows), (rows, (0, 1), 1, columns)):
+        device.run(
+            "pyramid", "pyramid_smooth", grid[:2], source.image, source.mask, grid, step, taps, radius,
+            normalise, target.image, target.mask,
+        )  # fmt: skip
+    return columns

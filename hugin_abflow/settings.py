@@ -23,9 +23,11 @@ class Settings:
     working_pixels      upper bound of the pixels of the working canvas (flow, coefficients, colour).
     border_feather      width of the ramp that brings a layer's weight to 0 at its own border, in working
                         pixels; 0: none, as published.
-    fixed_point_steps   times that x_k <- p - sum_j w_j F_kj(x_k) is iterated; 0: flow read at p, as published.
+    fixed_point_steps   times that x_k <- p - sum_j w_j F_kj(x_k) is iterated; 0: flow is read at p,
+                        as published.
     band_rows           rows of a full-resolution band; 0: chosen from the canvas width.
-    device              index in ``--list-devices`` or part of a device's name; None: the fastest GPU, else CPU.
+    device              index in ``--list-devices`` or part of a device's name; None: the fastest GPU,
+                        else CPU.
     """
 
     merge: MergeMode = "joint"

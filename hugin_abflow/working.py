@@ -11,6 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from zlib import crc32
 
 import numpy as np
 
@@ -69,12 +70,14 @@ class Grid:
 class WorkingLayer:
     """A layer on the working grid: pixels float32 (height, width, 4), r, g, b in 0..1 and valid.
 
-    box: (left, top, width, height) on the grid.
+    box         (left, top, width, height) on the grid.
+    checksum    of the stored pixels: tells layers of one size and place apart.
     """
 
     layer: Layer
     box: tuple[int, int, int, int]
     pixels: Buffer
+    checksum: int
 
 
 def full_grid(canvas: Canvas, layers: Sequence[Layer]) -> Grid:
@@ -131,19 +134,22 @@ def reduce_layer(device: Device, layer: Layer, grid: Grid, advance: Advance) -> 
     options, white = pixel_options(layer)
     ratio = (region.width, grid.width, region.height, grid.height)
     step = max(1, _ROWS * grid.height // region.height)
+    checksum = 0
     place_x, place_y = layer.box.left - region.left, layer.box.top - region.top
     for first in range(0, bottom - top, step):
         rows = min(step, bottom - top - first)
         start = (top + first) * region.height // grid.height - place_y
         end = -(-(top + first + rows) * region.height // grid.height) - place_y
-        stored = device.upload(device_rows(layer, start, end))
+        rows_read = device_rows(layer, start, end)
+        checksum = crc32(rows_read.data, checksum)
+        stored = device.upload(rows_read)
         place = (place_x, start + place_y, layer.box.width, end - start)
         device.run(
             "working", "working_reduce", (width, rows), stored, place, ratio, box, first, (width, rows),
             white, pixels, options=options,
         )  # fmt: skip
         advance(end - start)
-    return WorkingLayer(layer, box, pixels)
+    return WorkingLayer(layer, box, pixels, checksum)
 
 
 def same_where_both(device: Device, a: WorkingLayer, b: WorkingLayer) -> bool:
@@ -151,7 +157,5 @@ def same_where_both(device: Device, a: WorkingLayer, b: WorkingLayer) -> bool:
     differs = device.zeros((1,), np.int32)
     options, _ = pixel_options(a.layer)
     size = a.box[2:]
-    device.run(
-        "working", "working_compare", size, a.pixels, a.box, b.pixels, b.box, differs, options=options
-    )
+    device.run("working", "working_compare", size, a.pixels, a.box, b.pixels, b.box, differs, options=options)
     return not differs.get()[0]

@@ -5,10 +5,29 @@
    A feature is (h, dh/dx, dh/dy, valid): h is log brightness less its local mean, blind to gain. Flow is in
    pixels of the level's grid; grid = (width, height, wraps, 0). */
 
-__kernel void flow_feature(__global const float *image, /* (grid.y, grid.x) log brightness */
-                           __global const float *mean,  /* (grid.y, grid.x) its local mean */
-                           __global const float *mask,  /* (grid.y, grid.x), 0 or 1 */
-                           int4 grid,                   /* run size */
+/* Bilinear reading of the local mean, which is kept on the next coarser level. */
+inline float flow_local_mean(__global const float *mean, __global const float *weight, int4 coarse, int x, int y) {
+    const float2 q = (float2)(x + 0.5f, y + 0.5f) * 0.5f - 0.5f;
+    const float2 base = floor(q), t = q - base;
+    float sum = 0.0f, total = 0.0f;
+    for (int j = 0; j < 2; ++j)
+        for (int i = 0; i < 2; ++i) {
+            int2 p = convert_int2(base) + (int2)(i, j);
+            if (!grid_border(&p, coarse) || weight[p.y * coarse.x + p.x] <= 1e-6f)
+                continue;
+            const float w = (i ? t.x : 1.0f - t.x) * (j ? t.y : 1.0f - t.y);
+            sum += w * mean[p.y * coarse.x + p.x];
+            total += w;
+        }
+    return total > 0.0f ? sum / total : 0.0f;
+}
+
+__kernel void flow_feature(__global const float *image,  /* (grid.y, grid.x) log brightness */
+                           __global const float *mask,   /* (grid.y, grid.x), 0 or 1 */
+                           int4 grid,                    /* run size */
+                           __global const float *mean,   /* (coarse.y, coarse.x) local mean */
+                           __global const float *weight, /* (coarse.y, coarse.x) of the mean */
+                           int4 coarse,                  /* the next coarser level */
                            __global float4 *feature)    /* (grid.y, grid.x) */
 {
     const int x = get_global_id(0), y = get_global_id(1);
@@ -31,7 +50,7 @@ __kernel void flow_feature(__global const float *image, /* (grid.y, grid.x) log 
         }
         d[axis] = span > 0.0f ? difference / span : 0.0f;
     }
-    feature[at] = (float4)(image[at] - mean[at], d[0], d[1], 1.0f);
+    feature[at] = (float4)(image[at] - flow_local_mean(mean, weight, coarse, x, y), d[0], d[1], 1.0f);
 }
 
 /* Sample feature at q + flow(q), bilinear; w is the share of valid taps. */

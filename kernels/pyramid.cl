@@ -33,7 +33,7 @@ __kernel void pyramid_smooth(__global const float *image,  /* (grid.y, grid.x), 
                              __global const float *weight, /* (grid.y, grid.x) */
                              int4 grid,                    /* width, height, wraps, 0; run size */
                              int2 step,                    /* (1, 0) or (0, 1) */
-                             float sigma,                  /* px */
+                             __global const float *taps,   /* (radius + 1) from the centre outwards */
                              int radius,                   /* px */
                              int normalise,                /* 1: divide image by weight */
                              __global float *image_out,    /* (grid.y, grid.x) */
@@ -42,13 +42,12 @@ __kernel void pyramid_smooth(__global const float *image,  /* (grid.y, grid.x), 
     const int x = get_global_id(0), y = get_global_id(1);
     if (x >= grid.x || y >= grid.y)
         return;
-    const float k = -0.5f / (sigma * sigma);
     float sum = 0.0f, total = 0.0f;
     for (int i = -radius; i <= radius; ++i) {
         int2 p = (int2)(x, y) + i * step;
         if (!grid_border(&p, grid))
             continue;
-        const float g = exp(k * (float)(i * i));
+        const float g = taps[abs(i)];
         sum += g * image[p.y * grid.x + p.x];
         total += g * weight[p.y * grid.x + p.x];
     }

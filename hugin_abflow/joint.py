@@ -1,0 +1,138 @@
+"""Merge all layers at once: the steps in their order."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from hugin_abflow import blend, chart, coefficient, colour, flow, geometry, working
+from hugin_abflow.blend import BlendLayer
+from hugin_abflow.coefficient import Masks
+from hugin_abflow.geometry import PairFlow
+from hugin_abflow.layer import Canvas, Layer
+from hugin_abflow.opencl import Device, DeviceMemoryError
+from hugin_abflow.progress import Progress
+from hugin_abflow.settings import Settings
+from hugin_abflow.working import Grid, WorkingLayer
+
+_log = logging.getLogger(__name__)
+
+# Overlaps of fewer working pixels than this have nothing to match.
+_LEAST_OVERLAP = 64
+# Below this a working canvas is too small to be worth another attempt.
+_LEAST_WORKING_PIXELS = 20_000
+
+
+@dataclass(frozen=True)
+class Prepared:
+    """All that the full-resolution pass needs, on the device."""
+
+    layers: tuple[BlendLayer, ...]
+    full: Grid
+    grid: Grid
+    gain_grid: Grid
+
+
+def merge(
+    device: Device, layers: Sequence[Layer], canvas: Canvas, settings: Settings, progress: Progress
+) -> Iterator[npt.NDArray[Any]]:
+    """Bands of the panorama's crop from top to bottom, as `blend.bands` gives them.
+
+    The result does not depend on the order of `layers`.
+    """
+    prepared = _prepare_in_memory(device, layers, canvas, settings, progress)
+    with progress("blend", canvas.crop.height) as advance:
+        yield from blend.bands(
+            device, prepared.layers, prepared.full, prepared.grid, prepared.gain_grid,
+            canvas.crop, settings, advance,
+        )  # fmt: skip
+
+
+def _prepare_in_memory(
+    device: Device, layers: Sequence[Layer], canvas: Canvas, settings: Settings, progress: Progress
+) -> Prepared:
+    """`prepare`, on a smaller working canvas where the device's memory does not hold the wanted one."""
+    while True:
+        try:
+            return prepare(device, layers, canvas, settings, progress)
+        except DeviceMemoryError:
+            fewer = settings.working_pixels // 2
+            if fewer < _LEAST_WORKING_PIXELS:
+                raise
+            _log.warning("the device's memory is too small; trying again at a lower working resolution")
+            settings = replace(settings, working_pixels=fewer)
+
+
+def prepare(
+    device: Device, layers: Sequence[Layer], canvas: Canvas, settings: Settings, progress: Progress
+) -> Prepared:
+    """Everything that sees far, at working resolution: flow, coefficients, geometry, colour."""
+    full = working.full_grid(canvas, layers)
+    grid = working.working_grid(full, settings)
+    everything = _read(device, layers, grid, progress)
+    masks = coefficient.masks(device, everything, grid)
+    used = [i for i in range(len(everything)) if not _redundant(i, everything, masks)]
+    reduced = [everything[i] for i in used]
+    masks = masks.only(used)
+    coefficients = coefficient.coefficients(device, reduced, masks, grid, settings)
+    flows = _flows(device, reduced, masks, grid, progress)
+    fields = geometry.fields(device, reduced, coefficients, flows, grid, settings)
+    correction = colour.correction(device, reduced, fields, flows, grid, masks.host, settings)
+    final = [
+        BlendLayer(layer, field, geometry.reach(device, layer, field, grid), gain)
+        for layer, field, gain in zip(reduced, fields, correction.gains, strict=True)
+    ]
+    final += [_unblended(device, everything[i]) for i in range(len(everything)) if i not in used]
+    return Prepared(tuple(final), full, grid, correction.grid)
+
+
+def _read(device: Device, layers: Sequence[Layer], grid: Grid, progress: Progress) -> list[WorkingLayer]:
+    """The layers on the working grid, in an order that does not depend on the caller's."""
+    with progress("read", sum(layer.box.height for layer in layers)) as advance:
+        reduced = [working.reduce_layer(device, layer, grid, advance) for layer in layers]
+    return sorted(reduced, key=lambda r: (r.layer.box.top, r.layer.box.left, r.box, r.checksum))
+
+
+def _redundant(index: int, layers: Sequence[WorkingLayer], masks: Masks) -> bool:
+    """A layer wholly inside another has no area of its own; equal ones share."""
+    own = masks.host[index]
+    for other, mask in enumerate(masks.host):
+        if other != index and not (own & ~mask).any() and (mask & ~own).any():
+            _log.info(
+                "%s lies wholly inside %s: not used", layers[index].layer.name, layers[other].layer.name
+            )
+            return True
+    return False
+
+
+def _unblended(device: Device, layer: WorkingLayer) -> BlendLayer:
+    """A layer without weight: it shows only where no other layer is."""
+    left, top = layer.box[:2]
+    place = replace(layer, box=(left, top, 1, 1))
+    return BlendLayer(place, device.zeros((1, 1, 4)), [0.0], None)
+
+
+def _flows(
+    device: Device, layers: Sequence[WorkingLayer], masks: Masks, grid: Grid, progress: Progress
+) -> list[PairFlow]:
+    """Flow of every pair of layers that overlap, on the pair's own chart."""
+    overlaps = [
+        (a, b, masks.host[a] & masks.host[b]) for a in range(len(layers)) for b in range(a + 1, len(layers))
+    ]
+    overlaps = [entry for entry in overlaps if np.count_nonzero(entry[2]) >= _LEAST_OVERLAP]
+    result = []
+    with progress("flow", len(overlaps)) as advance:
+        for a, b, overlap in overlaps:
+            pair = (layers[a], layers[b])
+            # without it, the borders of the masks would differ from the middle by rounding
+            if not working.same_where_both(device, *pair):
+                its_chart = chart.pair_chart(overlap, masks.grid, grid)
+                image_a, image_b = (chart.sample(device, layer, grid, its_chart) for layer in pair)
+                result.append(PairFlow(a, b, its_chart, *flow.pair_flow(device, image_a, image_b)))
+            advance(1)
+    return result
