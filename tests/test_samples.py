@@ -60,7 +60,7 @@ def test_project_is_what_the_generator_writes(sample: Sample) -> None:
         name = re.search(r'n"([^"]+)"', line)
         assert name
         photo = cv2.imread(str(FOLDER / sample.name / name[1]))
-        assert photo.shape == (camera.height, camera.width, 3)
+        assert photo is not None and photo.shape == (camera.height, camera.width, 3)
 
 
 @pytest.mark.parametrize("sample", SAMPLES, ids=NAMES)
@@ -77,7 +77,7 @@ def test_layers_lie_where_the_lenses_say(sample: Sample) -> None:
         covered = pixels[..., 3] > 0
         y, x = np.mgrid[0:bottom, 0 : sample.width] + 0.5
         expected = camera.covers(lens.equirect_directions(x, y, sample.width))
-        # alpha is the lens's frame but for its border; nona's own estimate of the crop box cuts off a few pixels
+        # alpha is the lens's frame but for its border; nona's guess at the box cuts off a few pixels
         outside = expected.copy()
         outside[top : top + height, left : left + width] = False
         assert outside.sum() < 2e-4 * expected.sum()

@@ -1,0 +1,135 @@
+"""How fast? ``python benchmarks/speed.py [--width 9000] [--runs 3]``
+
+Six layers of the paper's rig on a large canvas, 8 bit, LZW, cropped, as nona writes them, are blended by
+enblend and by hugin-abflow in turns. Wall time, CPU time (user + system) and peak memory are medians over
+the runs; the table is Markdown. The layers are rendered once and kept in --cache.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import shutil
+import statistics
+import sys
+import tempfile
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
+
+from benchmarks.rigs import RIGS, render_layer, write_layer
+from sample_projects.project import project_text
+from sample_projects.scene import room
+from sample_projects.tracer import Tracer
+
+ROOT = Path(__file__).resolve().parent.parent
+
+
+@dataclass(frozen=True)
+class Run:
+    """One run of a blender: seconds, seconds, MiB."""
+
+    wall: float
+    cpu: float
+    peak: float
+
+
+def make_layers(folder: Path, width: int) -> None:
+    """Render the layers and the project, unless they are there. One sample a pixel: speed needs no beauty."""
+    if (folder / "project.pto").exists():
+        return
+    folder.mkdir(parents=True, exist_ok=True)
+    cameras = RIGS["ring"](1)
+    tracer = Tracer(room(1), folder.parent, samples=12)
+    for index, camera in enumerate(cameras):
+        start = time.perf_counter()
+        layer, left, top = render_layer(camera, tracer, width, 1 + 0.01 * (index % 3 - 1), grid=1)
+        write_layer(folder / f"layer{index:04d}.tif", layer, left, top, width)
+        print(f"layer {index}: rendered in {time.perf_counter() - start:.0f} s", file=sys.stderr)
+    names = [f"photo{index:04d}.jpg" for index in range(len(cameras))]
+    (folder / "project.pto").write_text(project_text(cameras, names, width), encoding="utf-8")
+
+
+def measure(command: list[str]) -> Run:
+    """Run a command to its end and ask the system what it took, its children included."""
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    with tempfile.TemporaryFile() as log:
+        start = time.perf_counter()
+        streams = [(os.POSIX_SPAWN_DUP2, log.fileno(), 1), (os.POSIX_SPAWN_DUP2, log.fileno(), 2)]
+        child = os.posix_spawnp(command[0], command, environment, file_actions=streams)
+        _, status, usage = os.wait4(child, 0)
+        wall = time.perf_counter() - start
+        if os.waitstatus_to_exitcode(status) != 0:
+            log.seek(0)
+            raise SystemExit(f"{' '.join(command)} failed:\n{log.read().decode(errors='replace')}")
+    # ru_maxrss counts KiB on Linux, bytes on macOS
+    unit = 1 << 20 if sys.platform == "darwin" else 1 << 10
+    return Run(wall, usage.ru_utime + usage.ru_stime, usage.ru_maxrss / unit)
+
+
+def commands(folder: Path, width: int) -> dict[str, list[str]]:
+    """The blenders compared; the first is what the others are measured by."""
+    layers = [str(path) for path in sorted(folder.glob("layer[0-9]*.tif"))]
+    size = f"-f{width}x{width // 2}"
+    out = {name: str(folder / f"result-{name}.tif") for name in ("enblend", "abflow")}
+    project, prefix = str(folder / "project.pto"), str(folder / "layer")
+    return {
+        "enblend -w": ["enblend", "-w", size, "--compression=LZW", "-o", out["enblend"], "--", *layers],
+        "hugin-abflow": [
+            *(sys.executable, "-m", "hugin_abflow", project, "--prefix", prefix, "-o", out["abflow"]),
+        ],
+    }
+
+
+def table(runs: dict[str, list[Run]]) -> str:
+    """Medians, and their ratios to the first blender's."""
+    lines = ["| blender | wall s | CPU s | peak MiB | wall ratio | CPU ratio | memory ratio |"]
+    lines.append("|---|---|---|---|---|---|---|")
+    medians = {
+        name: [statistics.median(getattr(run, key) for run in done) for key in ("wall", "cpu", "peak")]
+        for name, done in runs.items()
+    }
+    reference = next(iter(medians.values()))
+    for name, (wall, cpu, peak) in medians.items():
+        ratios = [value / base for value, base in zip((wall, cpu, peak), reference, strict=True)]
+        shown = " | ".join(f"{ratio:.2f}" for ratio in ratios)
+        lines.append(f"| {name} | {wall:.1f} | {cpu:.1f} | {peak:.0f} | {shown} |")
+    return "\n".join(lines)
+
+
+def main() -> None:
+    """The command line."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--width", type=int, default=9000, help="of the canvas, px")
+    parser.add_argument("--runs", type=int, default=3, help="of each blender")
+    parser.add_argument("--only", choices=["enblend -w", "hugin-abflow"], help="leave the other one out")
+    parser.add_argument(
+        "--cache", type=Path, default=ROOT / "build" / "benchmarks", help="where layers are kept"
+    )
+    options = parser.parse_args()
+    folder = options.cache / f"speed-{options.width}"
+    make_layers(folder, options.width)
+    chosen = {
+        name: command
+        for name, command in commands(folder, options.width).items()
+        if options.only in (None, name)
+    }
+    for name in chosen:
+        if shutil.which(chosen[name][0]) is None:
+            raise SystemExit(f"{chosen[name][0]} is not installed; --only measures the other blender alone")
+    runs: dict[str, list[Run]] = {name: [] for name in chosen}
+    for turn in range(options.runs):
+        for name, command in chosen.items():
+            runs[name].append(measure(command))
+            print(f"run {turn + 1}, {name}: {runs[name][-1].wall:.1f} s", file=sys.stderr)
+    size = f"{options.width}x{options.width // 2}"
+    print(f"Canvas {size}, six layers, {options.runs} runs of each in turns, medians:\n")
+    print(table(runs))
+
+
+if __name__ == "__main__":
+    main()
