@@ -129,12 +129,13 @@ def reduce_layer(device: Device, layer: Layer, grid: Grid, advance: Advance) -> 
     left, right = _span(layer.box.left, layer.box.right, region.left, (region.width, grid.width))
     top, bottom = _span(layer.box.top, layer.box.bottom, region.top, (region.height, grid.height))
     width, height = max(1, right - left), max(1, bottom - top)
-    box = (left, top, width, height)
+    # a layer smaller than a working pixel covers none, but kernels write to the grid under its box
+    box = (min(left, grid.width - width), min(top, grid.height - height), width, height)
     pixels = device.zeros((height, width, 4))
     options, white = pixel_options(layer)
     ratio = (region.width, grid.width, region.height, grid.height)
     step = max(1, _ROWS * grid.height // region.height)
-    checksum = 0
+    checksum = done = 0
     place_x, place_y = layer.box.left - region.left, layer.box.top - region.top
     for first in range(0, bottom - top, step):
         rows = min(step, bottom - top - first)
@@ -148,7 +149,9 @@ def reduce_layer(device: Device, layer: Layer, grid: Grid, advance: Advance) -> 
             "working", "working_reduce", (width, rows), stored, place, ratio, box, first, (width, rows),
             white, pixels, options=options,
         )  # fmt: skip
-        advance(end - start)
+        advance(end - done)  # bands share rows; each counts once
+        done = end
+    advance(layer.box.height - done)
     return WorkingLayer(layer, box, pixels, checksum)
 
 
