@@ -13,6 +13,7 @@ import pytest
 import tifffile
 
 from hugin_abflow.layer import Layer, full_scale
+from hugin_abflow.opencl import Device
 from hugin_abflow.project import Plan
 
 DTYPES = [np.uint8, np.uint16, np.float16, np.float32]
@@ -58,6 +59,12 @@ def photo_pixels(
     if np.dtype(dtype).kind == "f":
         return scaled.astype(dtype)
     return np.rint(scaled * np.iinfo(dtype).max).astype(dtype)
+
+
+@pytest.fixture(scope="session")
+def device() -> Device:
+    """The default device; kernels are built once per session."""
+    return Device()
 
 
 ProjectMaker = Callable[..., Path]

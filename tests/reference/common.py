@@ -1,0 +1,118 @@
+"""Twins of kernels/common.cl: borders of a grid, canvas and chart transforms, bicubic weights.
+
+Everything is float64; positions are arrays (x right, y down), points arrays (..., 3).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+
+Array = np.ndarray
+Numbers = Sequence[float] | Array
+
+
+def grid_border(x: Array, y: Array, grid: Sequence[int]) -> tuple[Array, Array, Array]:
+    """Columns and rows after the border rules of (width, height, wraps, poles), and which lie inside."""
+    width, height, wraps, poles = grid
+    x, y = np.broadcast_arrays(x, y)
+    north, south = (y < 0) & bool(poles & 1), (y >= height) & bool(poles & 2)
+    x = np.where(north | south, x + width // 2, x)
+    y = np.where(north, -1 - y, np.where(south, 2 * height - 1 - y, y))
+    if wraps:
+        x = np.mod(x, width)
+    return x, y, (x >= 0) & (x < width) & (y >= 0) & (y < height)
+
+
+def take(values: Array, box: Sequence[int], x: Array, y: Array, inside: Array | None = None) -> Array:
+    """Values of an array that covers `box` at pixels (x, y); 0 outside, or where `inside` is false."""
+    left, top, width, height = box
+    x, y = np.asarray(x) - left, np.asarray(y) - top
+    good = (x >= 0) & (x < width) & (y >= 0) & (y < height)
+    if inside is not None:
+        good = good & inside
+    found = values[np.clip(y, 0, height - 1), np.clip(x, 0, width - 1)].astype(np.float64)
+    return np.where(good.reshape(good.shape + (1,) * (found.ndim - good.ndim)), found, 0.0)
+
+
+def on_grid(values: Array, grid: Sequence[int], x: Array, y: Array) -> tuple[Array, Array]:
+    """Values of an array that covers the whole grid, 0 outside its borders; and which lie inside."""
+    x, y, inside = grid_border(x, y, grid)
+    return take(values, (0, 0, grid[0], grid[1]), x, y, inside), inside
+
+
+def four_taps(x: Array, y: Array) -> Iterator[tuple[Array, Array, Array]]:
+    """(column, row, bilinear weight) of the pixels around positions whose pixel centres are at n + 0.5."""
+    left, top = np.floor(x - 0.5).astype(int), np.floor(y - 0.5).astype(int)
+    right_share, lower_share = x - 0.5 - left, y - 0.5 - top
+    yield left, top, (1 - right_share) * (1 - lower_share)
+    yield left + 1, top, right_share * (1 - lower_share)
+    yield left, top + 1, (1 - right_share) * lower_share
+    yield left + 1, top + 1, right_share * lower_share
+
+
+def bilinear(values: Array, grid: Sequence[int], x: Array, y: Array) -> tuple[Array, Array]:
+    """Weighted sum over the taps inside the grid, and their share of the weight."""
+    total, share = 0.0, 0.0
+    for column, row, weight in four_taps(x, y):
+        found, inside = on_grid(values, grid, column, row)
+        total = total + found * weight.reshape(weight.shape + (1,) * (found.ndim - weight.ndim))
+        share = share + weight * inside
+    return np.asarray(total), np.asarray(share)
+
+
+def catmull_rom(t: Array) -> Array:
+    """Weights (4, ...) of taps -1, 0, 1, 2: Keys' cubic with a = -1/2, as a function of tap distance."""
+    distance = np.abs(np.asarray(t) - np.arange(-1, 3).reshape(4, *[1] * np.ndim(t)))
+    near = 1.5 * distance**3 - 2.5 * distance**2 + 1
+    far = -0.5 * distance**3 + 2.5 * distance**2 - 4 * distance + 2
+    return np.where(distance <= 1, near, np.where(distance < 2, far, 0.0))
+
+
+def _direction(lon: Array, lat: Array) -> Array:
+    return np.stack([np.cos(lat) * np.sin(lon), np.cos(lat) * np.cos(lon), np.sin(lat)], -1)
+
+
+def canvas_point(x: Array, y: Array, lens: Numbers) -> Array:
+    """Points in the scene of canvas positions."""
+    lon0, across, lat0, down = np.asarray(lens, np.float64)
+    if across == 0:
+        return np.stack([x, y, np.zeros_like(x)], -1).astype(np.float64)
+    return _direction(lon0 + x * across, lat0 - y * down)
+
+
+def canvas_position(point: Array, lens: Numbers) -> tuple[Array, Array]:
+    """Canvas positions of points, not necessarily of unit length."""
+    lon0, across, lat0, down = np.asarray(lens, np.float64)
+    if across == 0:
+        return point[..., 0], point[..., 1]
+    unit = point / np.linalg.norm(point, axis=-1, keepdims=True)
+    lon, lat = np.arctan2(unit[..., 0], unit[..., 1]), np.arcsin(np.clip(unit[..., 2], -1, 1))
+    return (lon - lon0) / across, (lat0 - lat) / down
+
+
+def chart_point(u: Array, v: Array, chart: Numbers) -> Array:
+    """Points in the scene of chart positions."""
+    t = np.asarray(chart, np.float64)
+    if t[13] == 0:
+        return np.stack([(u - t[11]) / t[9], (v - t[12]) / t[10], np.zeros_like(u)], -1)
+    return _direction((u - t[11]) / t[9], (t[12] - v) / t[10]) @ t[:9].reshape(3, 3)
+
+
+def chart_position(point: Array, chart: Numbers) -> tuple[Array, Array]:
+    """Chart positions of points; on a wrapped plane the copy within the first period of the chart."""
+    t = np.asarray(chart, np.float64)
+    if t[13] == 0:
+        u = point[..., 0] * t[9] + t[11]
+        return (np.mod(u, t[14] * t[9]) if t[14] > 0 else u), point[..., 1] * t[10] + t[12]
+    turned = point @ t[:9].reshape(3, 3).T
+    lon = np.arctan2(turned[..., 0], turned[..., 1])
+    lat = np.arctan2(turned[..., 2], np.hypot(turned[..., 0], turned[..., 1]))
+    return lon * t[9] + t[11], t[12] - lat * t[10]
+
+
+def pixels(width: int, height: int, left: int = 0, top: int = 0) -> tuple[Array, Array]:
+    """Columns and rows of all pixels of a box, each (height, width)."""
+    rows, columns = np.mgrid[top : top + height, left : left + width]
+    return columns, rows

@@ -1,0 +1,79 @@
+"""Twins of kernels/geometry.cl."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from reference.common import Array, Numbers, bilinear, canvas_point, chart_point, chart_position, pixels, take
+
+
+def flow_at(flow: Array, u: Array, v: Array, grid: Sequence[int]) -> Array:
+    """Flow at chart positions, from the pixels that exist; 0 beyond the chart."""
+    total, share = bilinear(flow, grid, u, v)
+    known = share > 1e-6
+    return np.where(known[..., None], total / np.where(known, share, 1)[..., None], 0.0)
+
+
+def geometry_add(
+    blend_j: Array,
+    box_j: Sequence[int],
+    layer_k: Array,
+    box_k: Sequence[int],
+    lens: Numbers,
+    flow: Array,
+    grid: Sequence[int],
+    chart: Numbers,
+    use_guess: int,
+    guess: Array,
+    field: Array,
+) -> Array:
+    """Field of layer k, (height, width, 4), with the part of layer j added to its displacement."""
+    x, y = pixels(box_k[2], box_k[3], box_k[0], box_k[1])
+    weight = np.where(layer_k[..., 3] != 0, take(blend_j, box_j, x, y), 0.0)
+    point = canvas_point(x + 0.5, y + 0.5, lens)
+    if use_guess:
+        point = point + guess[..., :3]
+        if lens[1]:
+            point = point / np.linalg.norm(point, axis=-1, keepdims=True)
+    u, v = chart_position(point, chart)
+    moved = flow_at(flow, u, v, grid)
+    way = chart_point(u + moved[..., 0], v + moved[..., 1], chart) - chart_point(u, v, chart)
+    result = field.astype(np.float64)
+    result[..., :3] += (-1 if use_guess else 1) * weight[..., None] * way
+    return result
+
+
+def geometry_activation(
+    field: Array,
+    blend: Array,
+    box: Sequence[int],
+    sharpness: float,
+    magnitude: float,
+    width: float,
+    furthest: float,
+    highest: Array,
+) -> tuple[Array, Array]:
+    """a_k in the field's last channel, and the maximum over layers."""
+    result, highest = field.astype(np.float64), highest.astype(np.float64)
+    shared = np.where(blend < 1, 1 - blend, np.inf)  # nobody else: f_k is 0
+    long = np.minimum(np.linalg.norm(field[..., :3], axis=-1) / shared, furthest)
+    a = sharpness * blend * (1 + magnitude * long / width)
+    result[..., 3] = np.where(blend != 0, a, result[..., 3])
+    part = np.s_[box[1] : box[1] + box[3], box[0] : box[0] + box[2]]
+    highest[part] = np.where(blend != 0, np.maximum(highest[part], a), highest[part])
+    return result, highest
+
+
+def geometry_softmax(field: Array, blend: Array, rim: Array, box: Sequence[int], highest: Array) -> Array:
+    """s_k, not normalised, in the field's last channel."""
+    result = field.astype(np.float64)
+    top = highest[box[1] : box[1] + box[3], box[0] : box[0] + box[2]]
+    result[..., 3] = np.where(blend > 0, rim * np.exp(np.minimum(field[..., 3] - top, 0)), 0.0)
+    return result
+
+
+def geometry_reach(field: Array, plane: int) -> Array:
+    """The longest displacement of each row: (height,)."""
+    return (np.abs(field[..., 1]) if plane else np.linalg.norm(field[..., :3], axis=-1)).max(1)

@@ -1,0 +1,224 @@
+"""Reduction of layers to the working grid: kernels against twins, twins against brute force."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from reference.working import working_compare, working_reduce
+from tolerances import SUM, assert_close
+
+from hugin_abflow import working
+from hugin_abflow.layer import Box, Canvas, Layer, full_scale
+from hugin_abflow.opencl import Device
+from hugin_abflow.settings import Settings
+from hugin_abflow.working import Grid, WorkingLayer
+
+DTYPES = (np.uint8, np.uint16, np.float32)
+PLANE = (0.0, 0.0, 0.0, 0.0)
+
+
+def random_pixels(seed: int, width: int, height: int, dtype: type, channels: int, holes: float) -> np.ndarray:
+    """(height, width, channels + 1) with a share of transparent pixels, which are not black."""
+    random = np.random.default_rng(seed)
+    white = full_scale(dtype)
+    pixels = random.random((height, width, channels + 1)) * white
+    pixels[..., -1] = np.where(random.random((height, width)) < holes, 0, white)
+    return pixels.astype(dtype)
+
+
+def nothing(units: int) -> None:
+    """Progress that nobody watches."""
+
+
+def grid_over(region: Box, width: int, height: int, wraps: bool = False) -> Grid:
+    return Grid(region, width, height, wraps, 0, PLANE)
+
+
+def test_twin_of_reduce_is_the_mean_of_repeated_pixels() -> None:
+    """With every pixel repeated (working size) times, working pixels are blocks of whole copies."""
+    pixels = random_pixels(0, 77, 53, np.uint8, 3, 0.02)
+    small = working_reduce(
+        pixels, (0, 0, 77, 53), (77, 31, 53, 20), (0, 0, 31, 20), 0, (31, 20), 255.0
+    )  # fmt: skip
+    blocks = np.repeat(np.repeat(pixels / 255.0, 31, 1), 20, 0).reshape(20, 53, 31, 77, 4)
+    valid = blocks[..., 3].min((1, 3)) == 1
+    assert 0 < valid.sum() < valid.size
+    assert np.array_equal(small[..., 3] == 1, valid)
+    assert np.allclose(small[valid][:, :3], blocks.mean((1, 3))[valid][:, :3], atol=1e-12)
+    assert not small[~valid].any()
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+@pytest.mark.parametrize("channels", [1, 3])
+def test_reduce_equals_its_twin(device: Device, dtype: type, channels: int) -> None:
+    """A layer whose box is aligned with nothing, on a grid whose size divides nothing, in several bands."""
+    pixels = random_pixels(1, 77, 53, dtype, channels, 0.01)
+    layer = Layer.from_array("a", pixels, left=13, top=7)
+    grid = grid_over(Box(2, 3, 110, 88), 47, 29)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(working, "_ROWS", 20)
+        reduced = working.reduce_layer(device, layer, grid, nothing)
+    kernel = reduced.pixels.get()
+    left, top, width, height = reduced.box
+    assert (left, top) == (math.ceil(11 * 47 / 108), math.ceil(4 * 29 / 85))
+    assert (left + width, top + height) == (88 * 47 // 108, 57 * 29 // 85)
+    twin = working_reduce(
+        pixels, (11, 4, 77, 53), (108, 47, 85, 29), reduced.box, 0, (width, height), full_scale(dtype)
+    )
+    assert 0.5 < twin[..., 3].mean() < 1
+    assert np.array_equal(kernel[..., 3], twin[..., 3])
+    assert_close(kernel, twin, SUM)
+
+
+@pytest.mark.parametrize("rows", [1, 20, 256])
+def test_reduce_does_not_depend_on_how_rows_are_read(device: Device, rows: int) -> None:
+    pixels = random_pixels(2, 77, 53, np.uint16, 3, 0.005)
+    layer = Layer.from_array("a", pixels, left=5, top=9)
+    grid = grid_over(Box(0, 0, 90, 70), 41, 33)
+    whole = working.reduce_layer(device, layer, grid, nothing).pixels.get()
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(working, "_ROWS", rows)
+        assert np.array_equal(working.reduce_layer(device, layer, grid, nothing).pixels.get(), whole)
+
+
+def test_layers_cut_from_one_picture_agree_to_the_bit(device: Device) -> None:
+    picture = random_pixels(3, 101, 67, np.uint8, 3, 0.0)
+    grid = grid_over(Box(0, 0, 101, 67), 43, 31)
+    a = working.reduce_layer(device, Layer.from_array("a", picture[:50, :64]), grid, nothing)
+    b = working.reduce_layer(device, Layer.from_array("b", picture[11:, 23:], 23, 11), grid, nothing)
+    common = [
+        p.pixels.get()[b.box[1] - p.box[1] :, b.box[0] - p.box[0] :][
+            : a.box[3] - b.box[1], : a.box[2] - b.box[0]
+        ]
+        for p in (a, b)
+    ]
+    assert common[0].shape == common[1].shape
+    assert common[0][..., 3].all()
+    assert np.array_equal(*common)
+
+
+def test_full_resolution_is_copied(device: Device) -> None:
+    pixels = random_pixels(4, 77, 53, np.uint8, 3, 0.1)
+    layer = Layer.from_array("a", pixels, left=3, top=2)
+    reduced = working.reduce_layer(device, layer, grid_over(Box(0, 0, 90, 60), 90, 60), nothing)
+    kernel = reduced.pixels.get()
+    valid = pixels[..., 3] > 0
+    assert reduced.box == (3, 2, 77, 53)
+    assert np.array_equal(kernel[..., 3] > 0, valid)
+    assert np.allclose(kernel[valid][:, :3] * 255, pixels[valid][:, :3], atol=1e-4)
+
+
+@pytest.mark.parametrize(("left", "top"), [(119, 40), (60, 79), (119, 79), (41, 41)])
+def test_a_layer_smaller_than_a_working_pixel_stays_on_the_grid(device: Device, left: int, top: int) -> None:
+    """Its box must lie on the grid, or kernels write outside their arrays."""
+    layer = Layer.from_array("dot", np.full((1, 1, 4), 255, np.uint8), left, top)
+    grid = grid_over(Box(0, 0, 120, 80), 30, 20)
+    reduced = working.reduce_layer(device, layer, grid, nothing)
+    x, y, width, height = reduced.box
+    assert 0 <= x <= 30 - width
+    assert 0 <= y <= 20 - height
+    assert not reduced.pixels.get().any()
+
+
+def test_advance_counts_every_row_of_a_layer_once(device: Device) -> None:
+    seen: list[int] = []
+    layer = Layer.from_array("a", random_pixels(5, 77, 53, np.uint8, 1, 0), left=1, top=2)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(working, "_ROWS", 16)
+        working.reduce_layer(device, layer, grid_over(Box(0, 0, 90, 60), 37, 23), seen.append)
+    assert sum(seen) == 53
+
+
+def place(device: Device, pixels: np.ndarray, left: int, top: int) -> WorkingLayer:
+    layer = Layer.from_array("w", np.zeros((1, 1, 4), np.uint8))
+    return WorkingLayer(layer, (left, top, pixels.shape[1], pixels.shape[0]), device.upload(pixels), 0)
+
+
+@pytest.mark.parametrize("change", ["nothing", "colour", "outside", "invisible"])
+def test_compare_equals_its_twin(device: Device, change: str) -> None:
+    picture = random_pixels(6, 77, 53, np.float32, 3, 0.2)
+    picture[..., :3] *= picture[..., 3:]
+    a, b = picture[:40, :50].copy(), picture[20:, 30:].copy()
+    y, x = np.argwhere(a[20:40, 30:50, 3] > 0)[7]
+    if change == "colour":
+        b[y, x, 1] += 1e-6
+    elif change == "outside":
+        b[-1, -1] += 0.5
+    elif change == "invisible":
+        b[y, x] = 0
+    kernel = not working.same_where_both(device, place(device, a, 3, 4), place(device, b, 33, 24))
+    assert kernel == working_compare(a, (3, 4, 50, 40), b, (33, 24, 47, 33)) == (change == "colour")
+
+
+def test_layers_that_do_not_touch_are_the_same(device: Device) -> None:
+    picture = random_pixels(7, 20, 10, np.float32, 3, 0)
+    assert working.same_where_both(device, place(device, picture, 0, 0), place(device, 1 - picture, 40, 0))
+
+
+SPHERE = Canvas.sphere(802, 401)
+
+
+def boxes(*edges: tuple[int, int, int, int]) -> list[Layer]:
+    """Layers that are boxes only: (left, top, right, bottom)."""
+    return [
+        Layer("b", Box(*e), np.dtype(np.uint8), 3, lambda top, bottom: np.zeros((0, 0, 4), np.uint8))
+        for e in edges
+    ]
+
+
+def test_the_region_is_the_layers_bounding_box() -> None:
+    grid = working.full_grid(Canvas.plane(500, 300), boxes((40, 20, 90, 70), (60, 10, 200, 50)))
+    assert grid.region == Box(40, 10, 200, 70)
+    assert (grid.width, grid.height, grid.wraps, grid.poles) == (160, 60, False, 0)
+    assert grid.lens == PLANE
+
+
+@pytest.mark.parametrize(("top", "bottom", "poles"), [(0, 401, 3), (0, 400, 1), (1, 401, 2), (30, 300, 0)])
+def test_poles_are_known_where_layers_reach_them(top: int, bottom: int, poles: int) -> None:
+    grid = working.full_grid(SPHERE, boxes((100, top, 300, bottom), (400, 50, 600, 90)))
+    assert grid.region == Box(0, top, 802, bottom)
+    assert (grid.wraps, grid.poles) == (True, poles)
+    assert grid.lens[0] == pytest.approx(-math.pi)
+    assert grid.lens[2] == pytest.approx(math.pi / 2 - top * math.pi / 401)
+
+
+def test_a_canvas_of_odd_width_has_no_row_beyond_the_pole() -> None:
+    grid = working.full_grid(Canvas.sphere(801, 400), boxes((0, 0, 801, 400)))
+    assert (grid.wraps, grid.poles) == (True, 0)
+
+
+@pytest.mark.parametrize(
+    ("width", "height"), [(802, 401), (1333, 777), (9001, 4501), (64, 32), (3000, 20), (20, 3000)]
+)
+@pytest.mark.parametrize("wraps", [False, True])
+def test_the_working_grid_is_bounded_and_covers_the_region(width: int, height: int, wraps: bool) -> None:
+    full = grid_over(Box(0, 0, width, height), width, height, wraps)
+    grid = working.working_grid(full, Settings(working_pixels=100_000))
+    assert grid.width <= width and grid.height <= height
+    assert grid.width * grid.height <= 100_000 * 1.03 + width + height
+    assert grid.region == full.region
+    if width * height <= 100_000:
+        assert grid.shape == full.shape
+    elif wraps and grid.width < width:
+        assert grid.width % 2 == 0
+
+
+def test_resizing_a_sphere_keeps_its_edges() -> None:
+    full = working.full_grid(SPHERE, boxes((0, 0, 802, 401)))
+    grid = full.resized(77, 53)
+    for field in (0, 2):
+        assert grid.lens[field] == full.lens[field]
+    assert grid.lens[1] * 77 == pytest.approx(2 * math.pi)
+    assert grid.lens[3] * 53 == pytest.approx(math.pi)
+    assert grid.circumference == 2 * math.pi
+    assert grid_over(full.region, 77, 53).circumference == 77
+
+
+def test_half_is_read_as_float(device: Device) -> None:
+    pixels = random_pixels(8, 33, 21, np.float16, 3, 0)
+    layer = Layer.from_array("half", pixels)
+    assert working.pixel_options(layer) == ("-DPIXEL=float -DSAMPLES=4", 1.0)
+    assert working.device_rows(layer, 3, 9).dtype == np.float32
+    assert np.array_equal(working.device_rows(layer, 3, 9), pixels[3:9].astype(np.float32))
