@@ -64,10 +64,22 @@ def masks(device: Device, layers: Sequence[WorkingLayer], grid: Grid) -> Masks:
     return Masks(mask_grid, tuple(buffers), np.stack([b.get() for b in buffers]).astype(bool))
 
 
+def _table(grid: Grid) -> npt.NDArray[np.float32]:
+    """Parts of the distance between two pixels of the mask grid, as coefficient.cl takes them."""
+    rows, columns = np.arange(grid.height), np.arange(grid.width)
+    if not grid.lens[1]:
+        return np.concatenate([rows, columns, np.ones(grid.height)]).astype(np.float32)
+    _, dlon, lat, dlat = grid.lens
+    latitudes = lat - (rows + 0.5) * dlat
+    parts = [np.sin(rows * dlat / 2), np.sin(columns * dlon / 2), np.cos(latitudes)]
+    return np.concatenate(parts).astype(np.float32)
+
+
 def distance(device: Device, masks_: Masks, index: int, cover: Buffer, working: Grid) -> Buffer:
     """D_k of layer `index` in working pixels, float32 on the mask grid; `cover` is the union's mask."""
     grid = masks_.grid
     size = grid.border[:2]
+    table = device.upload(_table(grid))
     seed, flooded = (device.empty(grid.shape, np.int32) for _ in range(2))
     mask = masks_.buffers[index]
     device.run("coefficient", "coefficient_seed", size, mask, cover, grid.border, seed)
@@ -77,23 +89,16 @@ def distance(device: Device, masks_: Masks, index: int, cover: Buffer, working: 
         steps.append(step)
         step //= 2
     for jump in [*steps, 2, 1]:
-        device.run("coefficient", "coefficient_flood", size, seed, grid.border, grid.lens, jump, flooded)
+        device.run("coefficient", "coefficient_flood", size, seed, grid.border, table, jump, flooded)
         seed, flooded = flooded, seed
-    unit = working.width / grid.width
-    furthest = math.pi / working.lens[1] if working.lens[1] else math.hypot(*working.shape)
+    spherical = working.lens[1] > 0
+    unit = 1 / working.lens[1] if spherical else working.width / grid.width
+    furthest = math.pi / working.lens[1] if spherical else math.hypot(*working.shape)
     result = device.empty(grid.shape)
     device.run(
-        "coefficient",
-        "coefficient_distance",
-        size,
-        seed,
-        mask,
-        grid.border,
-        grid.lens,
-        unit,
-        furthest,
-        result,
-    )
+        "coefficient", "coefficient_distance", size,
+        seed, mask, grid.border, table, int(spherical), unit, furthest, result,
+    )  # fmt: skip
     return result
 
 

@@ -8,7 +8,7 @@ import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -240,6 +240,10 @@ def _argument(value: Any) -> Any:
         return np.int32(value)
     if isinstance(value, float | np.floating):
         return np.float32(value)
-    vector = np.asarray(value)
-    kind = "int" if vector.dtype.kind in "iu" else "float"
-    return getattr(cl.cltypes, f"make_{kind}{vector.size}")(*vector.tolist())
+    return _vector(tuple(value))
+
+
+@lru_cache(maxsize=1024)  # pyopencl takes a tenth of a millisecond for each, and grids come again and again
+def _vector(values: tuple[float, ...]) -> Any:
+    kind = "int" if np.asarray(values).dtype.kind in "iu" else "float"
+    return getattr(cl.cltypes, f"make_{kind}{len(values)}")(*(np.asarray(values).tolist()))

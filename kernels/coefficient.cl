@@ -20,7 +20,7 @@ __kernel void coefficient_mask(__global const float4 *layer, /* (box.w, box.z) r
     mask[y * grid.x + x] = valid;
 }
 
-/* Seeds of D_k: the union's pixels that layer k does not cover, as packed index; -1 elsewhere. */
+/* Seeds of D_k: the union's pixels that layer k does not cover, packed as x + 65536 y; -1 elsewhere. */
 __kernel void coefficient_seed(__global const uchar *mask,  /* (grid.y, grid.x) of layer k */
                                __global const uchar *cover, /* (grid.y, grid.x) union */
                                int4 grid,                   /* run size */
@@ -30,25 +30,27 @@ __kernel void coefficient_seed(__global const uchar *mask,  /* (grid.y, grid.x) 
     if (x >= grid.x || y >= grid.y)
         return;
     const int at = y * grid.x + x;
-    seed[at] = cover[at] && !mask[at] ? at : -1;
+    seed[at] = cover[at] && !mask[at] ? x + (y << 16) : -1;
 }
 
-/* Distance in mask pixels; on the sphere the chord's angle over the angle of a column. */
-inline float coefficient_between(int2 p, int2 q, int4 grid, float4 lens) {
-    float dx = fabs((float)(p.x - q.x));
+/* A measure that grows with the distance of two mask pixels; coefficient_distance makes it one. The table holds
+   a vertical part by |dy| (grid.y), a horizontal part by |dx| (grid.x) and a factor per row (grid.y). On a
+   plane: dy, dx, 1, hence the squared distance. On the sphere: sin(dlat / 2), sin(dlon / 2), cos(lat), hence the
+   haversine, which is exact for small angles. */
+inline float coefficient_measure(int2 p, int2 q, int4 grid, __global const float *table) {
+    int dx = abs(p.x - q.x);
     if (grid.z)
-        dx = fmin(dx, grid.x - dx);
-    if (lens.y == 0.0f)
-        return hypot(dx, (float)(p.y - q.y));
-    const float a = lens.z - (p.y + 0.5f) * lens.w, b = lens.z - (q.y + 0.5f) * lens.w;
-    const float u = sin(0.5f * (a - b)), v = sin(0.5f * dx * lens.y); /* haversine: exact for small angles */
-    return 2.0f * asin(fmin(1.0f, sqrt(u * u + cos(a) * cos(b) * v * v))) / lens.y;
+        dx = min(dx, grid.x - dx);
+    const float u = table[abs(p.y - q.y)], v = table[grid.y + dx];
+    __global const float *row = table + grid.x + grid.y;
+    return u * u + row[p.y] * row[q.y] * v * v;
 }
 
-__kernel void coefficient_flood(__global const int *seed, /* (grid.y, grid.x) */
-                                int4 grid, float4 lens,   /* mask grid, run size */
+__kernel void coefficient_flood(__global const int *seed,    /* (grid.y, grid.x) packed */
+                                int4 grid,                   /* run size */
+                                __global const float *table, /* see coefficient_measure */
                                 int step,
-                                __global int *flooded) /* (grid.y, grid.x) */
+                                __global int *flooded) /* (grid.y, grid.x) packed */
 {
     const int x = get_global_id(0), y = get_global_id(1);
     if (x >= grid.x || y >= grid.y)
@@ -63,7 +65,7 @@ __kernel void coefficient_flood(__global const int *seed, /* (grid.y, grid.x) */
             const int s = seed[p.y * grid.x + p.x];
             if (s < 0)
                 continue;
-            const float d = coefficient_between((int2)(x, y), (int2)(s % grid.x, s / grid.x), grid, lens);
+            const float d = coefficient_measure((int2)(x, y), (int2)(s & 0xffff, s >> 16), grid, table);
             if (d < nearest || (d == nearest && s < best)) {
                 nearest = d;
                 best = s;
@@ -73,22 +75,28 @@ __kernel void coefficient_flood(__global const int *seed, /* (grid.y, grid.x) */
 }
 
 /* D_k in working pixels: 0 outside the layer, `furthest` where the union has nothing outside it. */
-__kernel void coefficient_distance(__global const int *seed,   /* (grid.y, grid.x) */
+__kernel void coefficient_distance(__global const int *seed,   /* (grid.y, grid.x) packed */
                                    __global const uchar *mask, /* (grid.y, grid.x) */
-                                   int4 grid, float4 lens,     /* mask grid, run size */
-                                   float unit,                 /* working px per mask px */
-                                   float furthest,             /* working px */
-                                   __global float *distance)   /* (grid.y, grid.x) */
+                                   int4 grid,                  /* run size */
+                                   __global const float *table, /* see coefficient_measure */
+                                   int spherical,
+                                   float unit,               /* working px per mask px, or per radian */
+                                   float furthest,           /* working px */
+                                   __global float *distance) /* (grid.y, grid.x) */
 {
     const int x = get_global_id(0), y = get_global_id(1);
     if (x >= grid.x || y >= grid.y)
         return;
     const int at = y * grid.x + x, s = seed[at];
-    if (!mask[at])
-        distance[at] = 0.0f;
-    else
-        distance[at] = s < 0 ? furthest
-                             : unit * coefficient_between((int2)(x, y), (int2)(s % grid.x, s / grid.x), grid, lens);
+    float d = 0.0f;
+    if (mask[at] && s < 0)
+        d = furthest;
+    else if (mask[at]) {
+        const float root =
+            sqrt(coefficient_measure((int2)(x, y), (int2)(s & 0xffff, s >> 16), grid, table));
+        d = unit * (spherical ? 2.0f * asin(fmin(1.0f, root)) : root);
+    }
+    distance[at] = d;
 }
 
 /* D_k on the working grid, bilinear; never 0 on a valid pixel, so that a lone layer has coefficient 1. */
