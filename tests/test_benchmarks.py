@@ -36,7 +36,7 @@ def seen_from(t: float, far: np.ndarray, near: np.ndarray) -> np.ndarray:
     x, y = np.meshgrid(np.arange(WIDTH, dtype=np.float32), np.arange(HEIGHT, dtype=np.float32))
     board = cv2.remap(near, x + PARALLAX * (1 + t), y, cv2.INTER_CUBIC)
     wall = cv2.remap(far, x + PARALLAX, y, cv2.INTER_CUBIC)
-    return np.where(y < HEIGHT / 2, wall, board).astype(np.float32)
+    return np.asarray(np.where(y < HEIGHT / 2, wall, board), np.float32)
 
 
 @pytest.fixture(scope="module")
