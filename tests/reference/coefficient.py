@@ -24,20 +24,24 @@ def coefficient_mask(layer: Array, box: Sequence[int], working: Sequence[int], g
 
 
 def coefficient_seed(mask: Array, cover: Array) -> Array:
-    """int32 (height, width): a pixel's own index where the union is covered, but not by this layer."""
-    index = np.arange(mask.size).reshape(mask.shape)
-    return np.where((cover != 0) & (mask == 0), index, -1).astype(np.int32)
+    """int32 (height, width): a pixel's own place where the union is covered, but not by this layer."""
+    return np.where((cover != 0) & (mask == 0), packed(mask.shape), -1).astype(np.int32)
 
 
-def between(x: Array, y: Array, index: Array, grid: Sequence[int], lens: Numbers) -> Array:
-    """Distance in mask px from pixels to the pixels of packed indices; on the sphere angle / column."""
-    sx, sy = index % grid[0], index // grid[0]
+def packed(shape: tuple[int, int]) -> Array:
+    """Every pixel's own place, packed as x + 65536 y."""
+    return np.arange(shape[1])[None, :] + 65536 * np.arange(shape[0])[:, None]
+
+
+def between(x: Array, y: Array, place: Array, grid: Sequence[int], lens: Numbers) -> Array:
+    """Distance in mask px from pixels to packed places; on the sphere an angle in radians."""
+    sx, sy = place % 65536, place // 65536
     if not lens[1]:
         dx = np.abs(x - sx)
         return np.hypot(np.minimum(dx, grid[0] - dx) if grid[2] else dx, y - sy)
     here, there = canvas_point(x + 0.5, y + 0.5, lens), canvas_point(sx + 0.5, sy + 0.5, lens)
     chord = np.linalg.norm(here - there, axis=-1)
-    return 2 * np.arcsin(np.minimum(1, chord / 2)) / lens[1]
+    return 2 * np.arcsin(np.minimum(1, chord / 2))
 
 
 def coefficient_flood(seed: Array, grid: Sequence[int], lens: Numbers, step: int) -> Array:
@@ -57,7 +61,7 @@ def coefficient_flood(seed: Array, grid: Sequence[int], lens: Numbers, step: int
 def coefficient_distance(
     seed: Array, mask: Array, grid: Sequence[int], lens: Numbers, unit: float, furthest: float
 ) -> Array:
-    """D_k in working pixels on the mask grid."""
+    """D_k in working pixels on the mask grid; unit: working px per mask px, or per radian."""
     x, y = pixels(grid[0], grid[1])
     inside = np.where(seed >= 0, unit * between(x, y, np.maximum(seed, 0), grid, lens), furthest)
     return np.where(mask != 0, inside, 0.0)
