@@ -69,8 +69,11 @@ def _axes(points: npt.NDArray[np.float64], weights: npt.NDArray[np.float64]) -> 
     scatter = (points * weights[:, None]).T @ points
     values, vectors = np.linalg.eigh(scatter)
     z = vectors[:, 0]
-    if values[1] - values[0] < 0.02 * values[2]:  # as wide as long: the canvas's own axis will do
-        z = np.array([0.0, 0.0, 1.0])
+    if values[1] - values[0] < 0.02 * values[2]:  # as wide as long: of all axes beside it the most upright
+        free = 3 if values[2] - values[0] < 0.02 * values[2] else 2
+        upright = vectors[:, :free] @ vectors[2, :free]
+        length = np.linalg.norm(upright)
+        z = upright / length if length > 0.1 else z  # none is upright where it lies around a pole
     z = z * (1.0 if z[np.argmax(np.abs(z))] > 0 else -1.0)
     mean = points.T @ weights
     y = mean - z * (z @ mean)
