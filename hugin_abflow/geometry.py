@@ -103,6 +103,7 @@ def reach(device: Device, layer: WorkingLayer, field: Buffer, grid: Grid) -> lis
         "geometry", "geometry_reach", (layer.box[3], 1), field, layer.box, int(grid.lens[1] == 0), rows
     )
     lengths = rows.get()
-    if grid.lens[1]:  # a chord is a little shorter than its angle
-        return [2 * math.asin(min(1.0, value / 2)) / grid.lens[3] for value in lengths.tolist()]
+    if grid.lens[1]:  # half a chord turns a direction by half its angle: more than a chord of that length
+        angles = [math.asin(value) if value < 1 else math.pi for value in lengths.tolist()]
+        return [angle / grid.lens[3] for angle in angles]
     return [float(value) for value in lengths]
