@@ -1,0 +1,322 @@
+"""Where layers are sampled and how much they count: kernels against twins, twins against loops."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from grids import GRIDS, on_device, patches, plane, random_layer, sphere
+from reference import common
+from reference import geometry as twin
+from scipy import ndimage
+from tolerances import POSITION, SUM, TRIGONOMETRY, assert_close
+
+from hugin_abflow import geometry
+from hugin_abflow.chart import Chart, pair_chart
+from hugin_abflow.coefficient import Coefficients
+from hugin_abflow.geometry import PairFlow
+from hugin_abflow.opencl import Device
+from hugin_abflow.settings import Settings
+from hugin_abflow.working import Grid, WorkingLayer
+
+NAMES = list(GRIDS)
+PUBLISHED = Settings(fixed_point_steps=0, border_feather=0.0)
+
+
+def smooth_flow(seed: int, found: Chart, strength: float = 3.0) -> np.ndarray:
+    """A flow field (height, width, 2) that changes slowly, in chart px."""
+    random = np.random.default_rng(seed)
+    noise = random.normal(size=(found.height, found.width, 2))
+    mode = ("nearest", "wrap" if found.wraps else "nearest")
+    flow = np.stack([ndimage.gaussian_filter(noise[..., i], 4, mode=mode) for i in (0, 1)], -1)
+    return (strength * flow / np.abs(flow).max()).astype(np.float32)
+
+
+def flow_error(grid: Grid) -> float:
+    """How far displacements may be off: positions' rounding in px, in the unit of a point."""
+    return POSITION * (grid.lens[1] or 1.0)
+
+
+@pytest.mark.parametrize("wraps", [False, True])
+def test_twin_of_flow_reading_is_linear_interpolation(wraps: bool) -> None:
+    random = np.random.default_rng(0)
+    flow = random.normal(size=(31, 41, 2))
+    u, v = random.random((2, 500)) * [[41], [31]]
+    read = twin.flow_at(flow, u, v, (41, 31, int(wraps), 0))
+    wide = np.pad(flow, ((1, 1), (1, 1), (0, 0)), mode="edge")
+    if wraps:
+        wide[:, 0], wide[:, -1] = wide[:, -2], wide[:, 1]
+    for i in (0, 1):
+        assert np.allclose(read[:, i], ndimage.map_coordinates(wide[..., i], [v + 0.5, u + 0.5], order=1))
+    beyond = twin.flow_at(flow, np.array([20.0, -1.0]), np.array([-3.0, 9.0]), (41, 31, int(wraps), 0))
+    assert not beyond[0].any()
+    assert beyond[1].any() == wraps
+
+
+@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("use_guess", [0, 1])
+def test_add_equals_its_twin(device: Device, name: str, use_guess: int) -> None:
+    """On a chart of its own axis, for boxes that overlap in part."""
+    grid = GRIDS[name]
+    overlap = np.zeros(grid.shape, bool)
+    overlap[: grid.height // 2, 20:40] = True
+    found = pair_chart(overlap, grid, grid)
+    flow = smooth_flow(1, found)
+    layer, box = random_layer(2, 51, 19), (5, 0, 51, 19)
+    blend, box_j = patches(3, 40, 17, 0.8) * np.float32(0.7), (30, 1, 40, 17)
+    random = np.random.default_rng(4)
+    guess = (0.05 * random.normal(size=(19, 51, 4)) * (1 if grid.lens[1] else 30)).astype(np.float32)
+    field = random.normal(size=(19, 51, 4)).astype(np.float32)
+    out = device.upload(field)
+    chart_grid = (found.width, found.height, int(found.wraps), 0)
+    device.run(
+        "geometry", "geometry_add", box[2:], device.upload(blend), box_j, device.upload(layer), box,
+        grid.border, grid.lens, device.upload(flow), chart_grid, found.transform, use_guess,
+        device.upload(guess), out,
+    )  # fmt: skip
+    expected = twin.geometry_add(
+        blend, box_j, layer, box, grid.lens, flow, chart_grid, found.transform, use_guess, guess, field
+    )
+    kernel = out.get()
+    assert np.array_equal(kernel[..., 3], field[..., 3])
+    moved = np.abs(expected - field).max(-1) > 0
+    assert 0.1 < moved.mean() < 0.6
+    assert np.array_equal(kernel[~moved], field[~moved])
+    # a flow read beyond the chart's rim falls from its last value to 0 at once
+    assert_close(kernel, expected, 10 * flow_error(grid) + SUM, decisions=1e-3)
+
+
+@pytest.mark.parametrize("name", ["plane", "sphere"])
+def test_activation_and_softmax_equal_their_twins(device: Device, name: str) -> None:
+    grid = GRIDS[name]
+    random = np.random.default_rng(5)
+    box = (7, 3, 51, 29)
+    field = random.normal(size=(29, 51, 4)).astype(np.float32)
+    blend = (random.random((29, 51)) * patches(6, 51, 29, 0.8)).astype(np.float32)
+    blend[3, 5:9] = 1
+    rim = random.random((29, 51)).astype(np.float32)
+    before = (random.random(grid.shape) * 12).astype(np.float32)
+    highest, out = device.upload(before), device.upload(field)
+    device.run(
+        "geometry", "geometry_activation", box[2:], out, device.upload(blend), box, grid.border,
+        10.0, 100.0, 77.0, 7.7, highest,
+    )  # fmt: skip
+    expected, top = twin.geometry_activation(field, blend, box, 10.0, 100.0, 77.0, 7.7, before)
+    assert_close(out.get(), expected, TRIGONOMETRY)
+    assert_close(highest.get(), top, TRIGONOMETRY)
+    field[..., 3] = expected[..., 3]
+    out.set(field)
+    device.run(
+        "geometry", "geometry_softmax", box[2:], out, device.upload(blend), device.upload(rim), box,
+        grid.border, device.upload(top, np.float32),
+    )  # fmt: skip
+    weights = twin.geometry_softmax(field, blend, rim, box, top)
+    assert_close(out.get(), weights, TRIGONOMETRY)
+    assert weights[..., 3].max() > 0.5
+    assert np.array_equal(out.get()[..., 3] == 0, weights[..., 3] < 1e-45)
+
+
+def test_twins_of_the_softmax_are_the_formulas() -> None:
+    """One pixel by hand: exp(a_k) over the sum, with a_k of the design; and no overflow at 8 % flow."""
+    sharpness, magnitude, width = 10.0, 100.0, 77.0
+    blends, ways = [0.2, 0.5, 0.3], [(3.0, 4.0), (0.0, 1.0), (6.0, 0.0)]
+    fields, top = [], np.zeros((1, 1))
+    for blend, way in zip(blends, ways, strict=True):
+        field = np.array([[[*way, 0.0, 0.0]]])
+        field, top = twin.geometry_activation(
+            field, np.array([[blend]]), (0, 0, 1, 1), sharpness, magnitude, width, 7.7, top
+        )
+        fields.append(field)
+    weights = [
+        twin.geometry_softmax(f, np.array([[b]]), np.ones((1, 1)), (0, 0, 1, 1), top)[0, 0, 3]
+        for f, b in zip(fields, blends, strict=True)
+    ]
+    activations = [
+        math.fsum([sharpness * b * (1 + magnitude * min(math.hypot(*way) / (1 - b), 7.7) / width)])
+        for b, way in zip(blends, ways, strict=True)
+    ]
+    expected = [math.exp(a) / math.fsum(map(math.exp, activations)) for a in activations]
+    assert np.allclose(np.array(weights) / sum(weights), expected, rtol=1e-12)
+
+
+@pytest.mark.parametrize("plane_", [0, 1])
+def test_reach_equals_its_twin(device: Device, plane_: int) -> None:
+    field = np.random.default_rng(7).normal(size=(53, 77, 4)).astype(np.float32)
+    rows = device.empty((53,))
+    device.run("geometry", "geometry_reach", (53, 1), device.upload(field), (0, 0, 77, 53), plane_, rows)
+    expected = twin.geometry_reach(field, plane_)
+    by_hand = [max(abs(p[1]) if plane_ else math.hypot(*p[:3]) for p in row) for row in field.tolist()]
+    assert np.allclose(expected, by_hand)
+    assert_close(rows.get(), expected, SUM)
+
+
+def test_reach_on_a_sphere_is_no_less_than_any_rows_way(device: Device) -> None:
+    """A mean of chords ends inside the sphere: half a chord turns a direction by half its angle, which is
+    more than a chord of that length does. Rows that a band needs must not be missed."""
+    grid = sphere(402, 201)
+    columns, rows = common.pixels(402, 201)
+    here = common.canvas_point(columns + 0.5, rows + 0.5, grid.lens)
+    south = np.array([0, 0, -1]) - here * -here[..., 2:]
+    turned = here * math.cos(0.8) + south / np.linalg.norm(south, axis=-1, keepdims=True) * math.sin(0.8)
+    way = 0.5 * (turned - here)
+    field = np.concatenate([way, np.ones((201, 402, 1))], -1).astype(np.float32)
+    layer = on_device(device, np.ones((201, 402, 4)))
+    reach = geometry.reach(device, layer, device.upload(field), grid)
+    _, y = common.canvas_position(here + field[..., :3], grid.lens)
+    moved = np.abs(y - rows - 0.5).max(1)
+    assert moved[60] == pytest.approx(0.4 / grid.lens[3], rel=1e-3)
+    assert (moved <= np.array(reach) + POSITION).all()
+
+
+def pair(device: Device, a: int, b: int, found: Chart, forward: np.ndarray, backward: np.ndarray) -> PairFlow:
+    return PairFlow(a, b, found, device.upload(forward), device.upload(backward))
+
+
+def whole(device: Device, grid: Grid, blend: float | np.ndarray) -> tuple[WorkingLayer, Coefficients]:
+    """A layer that covers the grid, with a coefficient."""
+    layer = on_device(device, np.ones((*grid.shape, 4)))
+    blends = np.broadcast_to(np.float32(blend), grid.shape)
+    return layer, Coefficients(device.upload(blends), device.upload(np.ones(grid.shape, np.float32)))
+
+
+def whole_chart(grid: Grid) -> Chart:
+    return pair_chart(np.ones(grid.shape, bool), grid, grid)
+
+
+def test_two_layers_move_as_published(device: Device) -> None:
+    """ColorL is read at p + F_RL(p) BlendR; F_RL starts on R. Weights are those of Code 1."""
+    grid = plane()
+    found = whole_chart(grid)
+    share = np.tile(np.linspace(0.01, 0.99, 77, dtype=np.float32), (53, 1))
+    left, right = whole(device, grid, share), whole(device, grid, 1 - share)
+    lr, rl = smooth_flow(9, found), smooth_flow(10, found)
+    both = [left[0], right[0]], [left[1], right[1]]
+    fields = geometry.fields(device, *both, [pair(device, 0, 1, found, lr, rl)], grid, PUBLISHED)
+    l_field, r_field = (f.get().astype(np.float64) for f in fields)
+    blend_l, blend_r = share[..., None], 1 - share[..., None]
+    assert np.allclose(l_field[..., :2], rl * blend_r, atol=1e-5)
+    assert np.allclose(r_field[..., :2], lr * blend_l, atol=1e-5)
+    exponents = []
+    for blend, flow in ((blend_l, rl), (blend_r, lr)):
+        long = np.linalg.norm(flow, axis=-1)
+        exponents.append(10 * blend[..., 0] * (1 + 100 * np.minimum(long, 7.7) / 77))
+    expected = 1 / (1 + np.exp(exponents[1] - exponents[0]))
+    total = l_field[..., 3] + r_field[..., 3]
+    assert np.allclose(l_field[..., 3] / total, expected, atol=1e-4)
+
+
+def test_more_layers_add_up(device: Device) -> None:
+    """x_k = p + sum over j of w_j F_jk: three layers with constant flows between them."""
+    grid = plane()
+    found = whole_chart(grid)
+    blends = (0.2, 0.3, 0.5)
+    parts = [whole(device, grid, blend) for blend in blends]
+    layers, coefficients = [p[0] for p in parts], [p[1] for p in parts]
+    ways = {(0, 1): (1.0, -2.0), (0, 2): (-3.0, 0.5), (1, 2): (-4.0, 2.5)}
+
+    def constant(way: tuple[float, float], sign: int) -> np.ndarray:
+        return np.broadcast_to(np.float32(way) * np.float32(sign), (found.height, found.width, 2))
+
+    flows = [pair(device, a, b, found, constant(w, 1), constant(w, -1)) for (a, b), w in ways.items()]
+    fields = [f.get() for f in geometry.fields(device, layers, coefficients, flows, grid, PUBLISHED)]
+    for k, field in enumerate(fields):
+        expected = np.zeros(2)
+        for (a, b), way in ways.items():
+            if k == b:
+                expected += blends[a] * np.array(way)
+            elif k == a:
+                expected -= blends[b] * np.array(way)
+        assert np.allclose(field[..., :2], expected, atol=1e-5)
+
+
+@pytest.mark.parametrize("name", ["plane", "cylinder", "sphere"])
+def test_identical_layers_do_not_move(device: Device, name: str) -> None:
+    grid = GRIDS[name]
+    found = whole_chart(grid)
+    parts = [whole(device, grid, 0.5) for _ in range(2)]
+    zero = np.zeros((found.height, found.width, 2), np.float32)
+    for steps in (0, 3):
+        fields = geometry.fields(
+            device, [p[0] for p in parts], [p[1] for p in parts], [pair(device, 0, 1, found, zero, zero)],
+            grid, Settings(fixed_point_steps=steps),
+        )  # fmt: skip
+        for field in fields:
+            assert not field.get()[..., :3].any()
+            assert (field.get()[..., 3] == 1).all()
+
+
+def test_the_fixed_point_puts_layers_on_one_point(device: Device) -> None:
+    """With F_ab and F_ba inverse to each other, but not constant, x_b = x_a + F_ab(x_a) after some steps."""
+    grid = plane(120, 90)
+    found = whole_chart(grid)
+    x, y = common.pixels(120, 90)
+    bend, offset = np.array([0.001, -0.001]), np.array([1.0, 2.0])
+    place = np.stack([x, y], -1) + 0.5
+
+    def forward_at(at: np.ndarray) -> np.ndarray:
+        return offset + bend * at**2
+
+    backward = (-1 + np.sqrt(1 - 4 * bend * (offset - place))) / (2 * bend) - place
+    parts = [whole(device, grid, blend) for blend in (0.4, 0.6)]
+    both = forward_at(place).astype(np.float32), backward.astype(np.float32)
+    flows = [pair(device, 0, 1, found, *both)]
+    errors = []
+    for steps in (0, 6):
+        a, b = geometry.fields(
+            device,
+            [p[0] for p in parts],
+            [p[1] for p in parts],
+            flows,
+            grid,
+            Settings(fixed_point_steps=steps),
+        )
+        at_a, at_b = (place + one.get()[..., :2] for one in (a, b))
+        errors.append(np.abs(at_b - at_a - forward_at(at_a))[20:-20, 20:-20].max())
+    assert errors[0] > 0.02
+    assert errors[1] < errors[0] / 10
+
+
+def test_displacement_over_the_pole_is_continuous(device: Device) -> None:
+    """A constant flow on a chart over the pole: the displacement, as a difference of points, hardly changes
+    from pixel to neighbour, also across row 0, half a turn further; and it is the chart's own way."""
+    grid = sphere(402, 201)
+    columns, rows = common.pixels(402, 201)
+    point = common.canvas_point(columns + 0.5, rows + 0.5, grid.lens)
+    near = np.arccos(point[..., 2]) < 0.4
+    found = pair_chart(near, grid, grid)
+    way = np.array([4.0, -3.0], np.float32)
+    flow = np.broadcast_to(way, (found.height, found.width, 2))
+    parts = [whole(device, grid, 0.5) for _ in range(2)]
+    fields = geometry.fields(
+        device, [p[0] for p in parts], [p[1] for p in parts], [pair(device, 0, 1, found, flow, -flow)],
+        grid, PUBLISHED,
+    )  # fmt: skip
+    d = fields[1].get()[..., :3].astype(np.float64)
+    step = grid.lens[1]
+    # 5 px of angle, half of it for this layer; stretched where the chart's rows are
+    assert np.allclose(np.linalg.norm(d[near], axis=-1), 2.5 * step, rtol=0.1)
+    across = np.linalg.norm(d[0] - np.roll(d[0], 201, 0), axis=-1)
+    along = np.linalg.norm(d[:8] - np.roll(d[:8], 1, 1), axis=-1)
+    down = np.linalg.norm(d[:7] - d[1:8], axis=-1)
+    assert max(across.max(), along.max(), down.max()) < 0.05 * step
+    u, v = common.chart_position(point[near], found.transform)
+    there = common.chart_point(u + way[0], v + way[1], found.transform)
+    assert np.allclose(d[near], 0.5 * (there - point[near]), atol=2 * flow_error(grid))
+
+
+def test_motion_across_the_border_is_short(device: Device) -> None:
+    """On a cylinder the displacement beside the border is the flow, not a turn."""
+    grid = plane(wraps=True)
+    overlap = np.zeros(grid.shape, bool)
+    overlap[10:40, :8] = overlap[10:40, -8:] = True
+    found = pair_chart(overlap, grid, grid)
+    assert not found.wraps
+    flow = np.broadcast_to(np.float32([6, 1]), (found.height, found.width, 2))
+    parts = [whole(device, grid, 0.5) for _ in range(2)]
+    fields = geometry.fields(
+        device, [p[0] for p in parts], [p[1] for p in parts], [pair(device, 0, 1, found, flow, -flow)],
+        grid, PUBLISHED,
+    )  # fmt: skip
+    assert np.allclose(fields[1].get()[overlap][:, :2], [3, 0.5], atol=1e-4)
+    assert np.allclose(fields[0].get()[overlap][:, :2], [-3, -0.5], atol=1e-4)
