@@ -1,0 +1,320 @@
+"""The full-resolution pass: kernels against twins, twins against loops, bands against the whole."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+import pytest
+from grids import patches, plane, sphere
+from reference import blend as twin
+from reference import common
+from scipy import ndimage
+from tolerances import DECISIONS, POSITION, TRIGONOMETRY, assert_close
+
+from hugin_abflow import blend, geometry, working
+from hugin_abflow.blend import BlendLayer
+from hugin_abflow.layer import Box, Layer, full_scale
+from hugin_abflow.opencl import Device
+from hugin_abflow.settings import Settings
+from hugin_abflow.working import Grid, WorkingLayer
+
+STORED = [(dtype, channels) for dtype in (np.uint8, np.uint16, np.float32) for channels in (1, 3)]
+GRIDS = {"plane": plane(), "cylinder": plane(wraps=True), "sphere": sphere(), "odd sphere": sphere(77, 39)}
+
+
+def stored_pixels(seed: int, width: int, height: int, dtype: type, channels: int, share: float) -> np.ndarray:
+    """Random samples, smooth enough to be sampled between pixels, with a ragged mask; not black outside."""
+    random = np.random.default_rng(seed)
+    values = ndimage.gaussian_filter(random.random((height, width, channels)), (1, 1, 0))
+    values = (values - values.min()) / np.ptp(values)
+    values = np.concatenate([values, patches(seed + 1, width, height, share)[..., None]], -1)
+    return (values if dtype == np.float32 else np.rint(values * full_scale(dtype))).astype(dtype)
+
+
+def field_of(seed: int, grid: Grid, box: Sequence[int], strength: float) -> np.ndarray:
+    """Displacement up to `strength` working px (as points on a sphere) and a weight with some zeros."""
+    random = np.random.default_rng(seed)
+    noise = ndimage.gaussian_filter(random.normal(size=(box[3], box[2], 4)), (3, 3, 0))
+    noise /= np.abs(noise).max((0, 1))
+    field = noise * strength * (grid.lens[1] or 1)
+    if not grid.lens[1]:
+        field[..., 2] = 0
+    field[:4, :, :3] = 0  # some do not move
+    field[..., 3] = np.maximum(noise[..., 3] + 0.5, 0)
+    return field.astype(np.float32)
+
+
+def options_of(layer: Layer) -> tuple[str, float]:
+    pixel, white = working.pixel_options(layer)
+    return f"{pixel} -DWHITE={white:.1f}f -DINTEGER={int(layer.dtype.kind == 'u')}", white
+
+
+def test_twin_of_sample_is_what_its_words_say() -> None:
+    """Bicubic where 16 taps are valid, else the mean of the valid ones of four and their share."""
+    rows = stored_pixels(0, 40, 30, np.uint8, 3, 0.9)
+    pixels = twin.opaque(rows, 255.0)
+    random = np.random.default_rng(1)
+    x, y = random.random((2, 300)) * [[44], [34]] - 2
+    result = twin.sample(pixels, (0, 0, 40, 30), x, y, (40, 30, 0, 0), 0)
+    kinds = set()
+    for u, v, value in zip(x - 0.5, y - 0.5, result, strict=True):
+        taps, near = {}, []
+        for j in range(math.floor(v) - 1, math.floor(v) + 3):
+            for i in range(math.floor(u) - 1, math.floor(u) + 3):
+                if 0 <= i < 40 and 0 <= j < 30 and pixels[j, i, 3]:
+                    taps[i, j] = pixels[j, i, :3]
+                    if abs(i - u) < 1 and abs(j - v) < 1:
+                        near.append(((1 - abs(i - u)) * (1 - abs(j - v)), pixels[j, i, :3]))
+        share = sum(weight for weight, _ in near)
+        if len(taps) == 16:
+            ax = common.catmull_rom(np.array(u - math.floor(u)))
+            ay = common.catmull_rom(np.array(v - math.floor(v)))
+            expected = sum(
+                ax[i - math.floor(u) + 1] * ay[j - math.floor(v) + 1] * colour
+                for (i, j), colour in taps.items()
+            )
+            assert np.allclose(value, [*expected, 1])
+        elif share > 0:
+            assert np.allclose(value, [*(sum(w * c for w, c in near) / share), share])
+        else:
+            assert not value.any()
+        kinds.add((len(taps) == 16, share > 0))
+    assert kinds == {(True, True), (False, True), (False, False)}
+
+
+def test_twin_of_field_reading_is_scipys() -> None:
+    """One turn wide it wraps, else it repeats its rim."""
+    field = np.random.default_rng(2).normal(size=(31, 41, 4))
+    x, y = np.random.default_rng(3).random((2, 400)) * [[45], [35]] - 2
+    for wraps, width in ((1, 41), (0, 41), (1, 60)):
+        left = 0 if width == 41 else 7
+        read = twin.read_field(field, (left, 0, 41, 31), x + left, y, (width, 31, wraps, 0))
+        wide = np.pad(field, ((4, 4), (0, 0), (0, 0)), mode="edge")
+        wide = np.pad(wide, ((0, 0), (4, 4), (0, 0)), mode="wrap" if wraps and width == 41 else "edge")
+        for i in range(4):
+            assert np.allclose(read[:, i], ndimage.map_coordinates(wide[..., i], [y + 3.5, x + 3.5], order=1))
+
+
+def test_twin_of_position_turns_by_an_angle() -> None:
+    """Half a pixel of longitude is half a pixel; over the pole the way goes on, half a turn further."""
+    lens = sphere(402, 201).lens
+    x, y = np.array([10.5, 200.5, 401.9, 33.0]), np.array([100.5, 3.0, 100.5, 2.0])
+    there = np.array([11.0, 200.5, 402.4, 33.0]), np.array([100.5, 9.0, 100.0, -3.0])
+    way = common.canvas_point(*there, lens) - common.canvas_point(x, y, lens)
+    u, v = twin.position(x, y, way, (1, 1), lens)
+    assert np.allclose(np.mod(u, 402), [11.0, 200.5, 0.4, 33 + 201])
+    assert np.allclose(v, [100.5, 9.0, 100.0, 3.0])
+    assert np.allclose(
+        twin.position(x, y, way, (1.5, 2), (0, 0, 0, 0)), [x + 1.5 * way[:, 0], y + 2 * way[:, 1]]
+    )
+
+
+@pytest.mark.parametrize(("dtype", "channels"), STORED)
+@pytest.mark.parametrize("name", list(GRIDS))
+@pytest.mark.parametrize("nearest", [0, 1])
+def test_a_band_of_two_layers_equals_its_twin(
+    device: Device, dtype: type, channels: int, name: str, nearest: int
+) -> None:
+    """Every kernel in turn; the layers overlap in part, reach across the border, and differ in exposure."""
+    full = GRIDS[name]
+    grid = full.resized(48, 25)
+    places = ((3, 0, 50, 37), (0, 5, full.width, 34))
+    band = (2, 1, 71, 36)
+    cells = full.resized(7, 5)
+    options, white = options_of(Layer.from_array("a", stored_pixels(4, 5, 5, dtype, channels, 1)))
+    count, total = np.zeros((36, 71), np.uint8), np.zeros((36, 71, 4))
+    reference = np.zeros((36, 71, 4))
+    counts, sums = device.upload(count), device.upload(total, np.float32)
+    references = device.upload(reference, np.float32)
+    stored = [stored_pixels(5 + i, p[2], p[3], dtype, channels, 0.95) for i, p in enumerate(places)]
+    buffers = [device.upload(rows) for rows in stored]
+    for rows, buffer, box in zip(stored, buffers, places, strict=True):
+        device.run("blend", "blend_count", band[2:], buffer, box, band, counts, options=options)
+        count = twin.blend_count(rows, box, band, count, white)
+    assert np.array_equal(counts.get(), count)
+    assert {0, 1, 2} == set(count.ravel())
+    for i, (rows, buffer, box) in enumerate(zip(stored, buffers, places, strict=True)):
+        field_box = (2, 0, 31, 24) if i == 0 else (0, 3, 48, 22)
+        field = field_of(7 + i, grid, field_box, 1.5)
+        gain = np.random.default_rng(9).normal(size=(5, 7, 4)).astype(np.float32) * 0.2 if i else None
+        if gain is not None:
+            gain[:, :3, :3] = 0
+        device.run(
+            "blend", "blend_add", band[2:], buffer, box, band, full.border, full.lens,
+            device.upload(field), field_box, grid.border,
+            device.upload(gain) if gain is not None else counts, cells.border, int(gain is not None),
+            nearest, counts, references, sums, options=options,
+        )  # fmt: skip
+        reference, total = twin.blend_add(
+            rows, box, band, full.border, full.lens, field, field_box, grid.border, gain, cells.border,
+            nearest, count, reference, total, white,
+        )  # fmt: skip
+    assert_close(references.get(), reference, TRIGONOMETRY, scale=white)
+    # smooth pixels change by a third of full scale from one to the next; nearest ones by a step
+    assert_close(sums.get(), total, 10 * POSITION, DECISIONS, scale=white)
+    assert 0.3 < (total[..., 3] > 0).mean() < 0.9
+    out = device.empty((36, 71, channels + 1), dtype)
+    references.set(reference)
+    sums.set(total)
+    device.run("blend", "blend_finish", band[2:], references, sums, band, out, options=options)
+    integer = int(np.dtype(dtype).kind == "u")
+    expected = twin.blend_finish(reference, total, channels + 1, white, integer)
+    assert np.array_equal(out.get()[..., -1] > 0, count > 0)
+    if integer:  # halves may be rounded either way
+        assert np.abs(out.get() - expected).max() <= 1
+        assert (out.get() != expected).mean() <= (DECISIONS if white == 255 else 0.05)
+    else:
+        assert_close(out.get(), expected, TRIGONOMETRY)
+
+
+def blend_layer(
+    device: Device,
+    pixels: np.ndarray,
+    left: int,
+    top: int,
+    full: Grid,
+    grid: Grid,
+    field: np.ndarray | None = None,
+    gain: np.ndarray | None = None,
+) -> BlendLayer:
+    """A layer as the pass takes it; without a field it does not move."""
+    layer = Layer.from_array("layer", pixels, left + full.region.left, top + full.region.top)
+    reduced = working.reduce_layer(device, layer, grid, lambda units: None)
+    if field is None:
+        field = np.zeros((*reduced.pixels.shape[:2], 4), np.float32)
+        field[..., 3] = 1
+    else:
+        field = field[: reduced.box[3], : reduced.box[2]]
+    buffer = device.upload(field)
+    reach = geometry.reach(device, reduced, buffer, grid)
+    return BlendLayer(reduced, buffer, reach, None if gain is None else device.upload(gain))
+
+
+def merged(
+    device: Device, layers: list[BlendLayer], full: Grid, grid: Grid, crop: Box | None = None, rows: int = 0
+) -> np.ndarray:
+    parts = blend.bands(
+        device, layers, full, grid, grid.resized(7, 5), crop or full.region, Settings(band_rows=rows),
+        lambda units: None,
+    )  # fmt: skip
+    return np.concatenate(list(parts))
+
+
+@pytest.mark.parametrize("name", list(GRIDS))
+@pytest.mark.parametrize("dtype", [np.uint8, np.float32])
+def test_bands_of_any_height_give_the_same(device: Device, name: str, dtype: type) -> None:
+    """Bit for bit: a band gets all rows that its own displacements reach, over poles too."""
+    full = GRIDS[name]
+    grid = full.resized(48, 25)
+    field = field_of(10, grid, (0, 0, 48, 25), 4.0)
+    gain = np.random.default_rng(11).normal(size=(5, 7, 4)).astype(np.float32) * 0.2
+    layers = [
+        blend_layer(
+            device, stored_pixels(12, full.width, full.height, dtype, 3, 0.9), 0, 0, full, grid, field
+        ),
+        blend_layer(device, stored_pixels(13, 50, 31, dtype, 3, 0.9), 9, 3, full, grid, -field, gain),
+    ]
+    whole = merged(device, layers, full, grid)
+    assert whole.shape == (full.height, full.width, 4)
+    for rows in (1, 2, 5, 13, 38):
+        assert np.array_equal(merged(device, layers, full, grid, rows=rows), whole), rows
+
+
+def test_a_band_reads_only_rows_that_it_needs(device: Device) -> None:
+    """Memory grows with the band, not with the picture."""
+    full = plane(77, 300)
+    grid = full.resized(39, 150)
+    pixels = stored_pixels(14, 77, 300, np.uint8, 3, 1)
+    asked: list[tuple[int, int]] = []
+    layer = blend_layer(device, pixels, 0, 0, full, grid)
+    watched = Layer(
+        "w", layer.working.layer.box, np.dtype(np.uint8), 3,
+        lambda top, bottom: (asked.append((top, bottom)), pixels[top:bottom])[1],
+    )  # fmt: skip
+    layer = BlendLayer(
+        WorkingLayer(watched, layer.working.box, layer.working.pixels, 0), layer.field, layer.reach, None
+    )
+    assert np.array_equal(merged(device, [layer, layer], full, grid, rows=10), pixels)
+    assert max(bottom - top for top, bottom in asked) <= 10 + 2 * 3
+    assert min(top for top, _ in asked) == 0
+    assert max(bottom for _, bottom in asked) == 300
+
+
+@pytest.mark.parametrize(("dtype", "channels"), [*STORED, (np.float16, 3)])
+@pytest.mark.parametrize("name", ["plane", "sphere"])
+def test_layers_cut_from_one_picture_come_back(device: Device, dtype: type, channels: int, name: str) -> None:
+    """Bit for bit, with ragged masks; a pixel is opaque where a layer covers it, transparent elsewhere."""
+    full = GRIDS[name]
+    grid = full.resized(31, 17)
+    stored = np.float32 if dtype == np.float16 else dtype
+    picture = stored_pixels(15, full.width, full.height, stored, channels, 1).astype(dtype)
+    boxes = [(0, 0, 50, 39), (20, 5, full.width, 30), (0, 2, full.width, full.height)]
+    layers, covered = [], np.zeros(full.shape, bool)
+    for i, (left, top, right, bottom) in enumerate(boxes):
+        cut = picture[top:bottom, left:right].copy()
+        mask = patches(16 + i, right - left, bottom - top, 0.5)
+        cut[..., -1] = np.where(mask, cut[..., -1], 0)
+        cut[mask == 0, :-1] = 0
+        covered[top:bottom, left:right] |= mask > 0
+        layers.append(blend_layer(device, cut, left, top, full, grid))
+    assert 0.6 < covered.mean() < 1
+    out = merged(device, layers, full, grid)
+    assert out.dtype == dtype
+    assert np.array_equal(out[..., -1] > 0, covered)
+    assert np.array_equal(out[covered], picture[covered])
+    assert not out[~covered].any()
+
+
+def test_a_union_pixel_is_never_transparent(device: Device) -> None:
+    """Even where both layers are sampled far outside themselves, or nobody has any weight."""
+    full = plane()
+    grid = full.resized(31, 17)
+    lost = np.zeros((17, 31, 4), np.float32)
+    lost[..., 0], lost[..., 3] = 500, 1
+    lost[:, 15:, 3] = 0
+    pixels = [stored_pixels(17 + i, 77, 53, np.uint8, 3, 1) for i in (0, 1)]
+    layers = [blend_layer(device, p, 0, 0, full, grid, lost) for p in pixels]
+    assert np.array_equal(merged(device, layers, full, grid), pixels[0])
+
+
+def test_the_crop_may_reach_beyond_the_region_and_cut_it(device: Device) -> None:
+    full = Grid(Box(30, 20, 107, 73), 77, 53, False, 0, (0.0, 0.0, 0.0, 0.0))
+    grid = full.resized(40, 27)
+    pixels = stored_pixels(19, 77, 53, np.uint8, 3, 0.9)
+    pixels[pixels[..., 3] == 0] = 0
+    out = merged(device, [blend_layer(device, pixels, 0, 0, full, grid)], full, grid, Box(10, 50, 120, 90), 7)
+    expected = np.zeros((40, 110, 4), np.uint8)
+    expected[:23, 20:97] = pixels[30:]
+    assert np.array_equal(out, expected)
+
+
+@pytest.mark.parametrize("shift", [(4, 0), (0, 3), (-5, 2)])
+@pytest.mark.parametrize("name", ["plane", "cylinder"])
+def test_a_whole_pixels_displacement_copies(device: Device, shift: tuple[int, int], name: str) -> None:
+    """Working pixels are two pixels wide here, so displacements count double; the cylinder's border too."""
+    full = Grid(Box(0, 0, 78, 54), 78, 54, name == "cylinder", 0, (0.0, 0.0, 0.0, 0.0))
+    grid = full.resized(39, 27)
+    pixels = stored_pixels(20, 78, 54, np.uint16, 3, 1)
+    field = np.zeros((27, 39, 4), np.float32)
+    field[...] = (shift[0] / 2, shift[1] / 2, 0, 1)
+    layer = blend_layer(device, pixels, 0, 0, full, grid, field)
+    out = merged(device, [layer, layer], full, grid, rows=20)
+    columns, rows = common.pixels(78, 54)
+    x, y, inside = common.grid_border(columns + shift[0], rows + shift[1], full.border)
+    assert np.array_equal(out[inside], pixels[y[inside], x[inside]])
+
+
+def test_dark_gains_do_not_lift_noise_and_none_is_exact(device: Device) -> None:
+    """Correction is (c + floor) exp(g) - floor; where the gain is 0 pixels stay as they are."""
+    full = plane()
+    grid = full.resized(40, 27)
+    pixels = stored_pixels(21, 77, 53, np.float32, 3, 1)
+    gain = np.zeros((5, 7, 4), np.float32)
+    gain[:, 4:, 1] = 0.5
+    out = merged(device, [blend_layer(device, pixels, 0, 0, full, grid, gain=gain)], full, grid)
+    assert np.array_equal(out[:, :38], pixels[:, :38])
+    assert np.array_equal(out[..., [0, 2, 3]], pixels[..., [0, 2, 3]])
+    right = out[:, 60:, 1]
+    assert np.allclose(right, (pixels[:, 60:, 1] + 0.02) * math.exp(0.5) - 0.02, rtol=1e-5, atol=1e-6)
