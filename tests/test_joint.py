@@ -1,0 +1,283 @@
+"""Joint merging keeps what the layers agree on, covers the union and nothing else, and knows no order."""
+
+from __future__ import annotations
+
+from itertools import permutations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from pictures import (
+    DTYPES,
+    expected_picture,
+    masked,
+    masks_of,
+    merged,
+    noise,
+    one_device,
+    pixel_places,
+    texture,
+)
+
+from hugin_abflow import joint, merge
+from hugin_abflow.layer import Box, Canvas, Layer
+from hugin_abflow.opencl import Device
+
+PLANE = Canvas.plane(301, 151)
+CYLINDER = Canvas.plane(301, 151, wraps=True)
+SPHERE = Canvas.sphere(302, 151)
+CANVASES = {"plane": PLANE, "cylinder": CYLINDER, "sphere": SPHERE}
+
+pytestmark = pytest.mark.usefixtures(one_device.__name__)
+
+
+def columns(canvas: Canvas, first: int, end: int) -> np.ndarray:
+    """The mask of columns [first, end), around the border if the canvas wraps."""
+    x = np.arange(canvas.width)
+    inside = (x - first) % canvas.width < end - first if canvas.wraps else (x >= first) & (x < end)
+    return np.broadcast_to(inside, (canvas.height, canvas.width)).copy()
+
+
+def ring(canvas: Canvas, parts: int = 4, overlap: int = 29) -> list[np.ndarray]:
+    """Masks of strips that overlap; on a canvas that wraps the last overlaps the first. On a sphere two
+    more cover the poles."""
+    ends = np.linspace(0, canvas.width, parts + 1).astype(int)
+    masks = [columns(canvas, a - overlap, b) for a, b in zip(ends[:-1], ends[1:], strict=True)]
+    if canvas.spherical:
+        rows = np.arange(canvas.height)[:, None]
+        masks = [mask & (rows >= 31) & (rows < 119) for mask in masks]
+        everywhere = columns(canvas, 0, canvas.width)
+        masks += [everywhere & (rows < 47), everywhere & (rows >= 101)]
+    return masks
+
+
+def moved(
+    canvas: Canvas, mask: np.ndarray, dx: float, dy: float = 0.0, dtype: type = np.uint8, light: float = 1.0
+) -> Layer:
+    """A layer that shows the texture moved by (dx, dy) pixels, darker if light < 1."""
+    y, x = pixel_places(canvas.height, canvas.width)
+    picture = texture(y - dy, x - dx, dtype, canvas.width if canvas.wraps else 0)
+    picture[..., :3] = (picture[..., :3] * light).astype(dtype)
+    return masked(picture, mask, f"moved {dx} {dy}")
+
+
+def moving(canvas: Canvas) -> list[Layer]:
+    """Layers with parallax, differently exposed: each shows the scene somewhere else."""
+    return [
+        moved(canvas, mask, 2.5 * (-1) ** index, 1.5 * (index % 3 - 1), light=1 - 0.2 * (index % 2))
+        for index, mask in enumerate(ring(canvas))
+    ]
+
+
+# What layers agree on comes back to the bit
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+@pytest.mark.parametrize("channels", [1, 3])
+def test_identical_layers_come_out_identical(dtype, channels):
+    picture = noise(53, 77, dtype, channels)
+    layers = [Layer.from_array(str(k), picture, 19, 11) for k in range(3)]
+    canvas = Canvas(131, 79, Box(19, 11, 96, 64))
+    result = merged(layers, canvas)
+    assert result.dtype == dtype
+    np.testing.assert_array_equal(result, picture)  # floats too, where 2 ulp would be allowed
+
+
+@pytest.mark.parametrize("canvas", CANVASES.values(), ids=CANVASES)
+@pytest.mark.parametrize("exposure", [True, False], ids=["exposure", "no exposure"])
+# 7000 working pixels are neither a whole fraction of the canvas nor in step with any layer's box
+@pytest.mark.parametrize("working_pixels", [2_100_000, 7_000])
+def test_picture_cut_into_layers_comes_back(canvas, exposure, working_pixels):
+    picture = noise(canvas.height, canvas.width)
+    layers = [masked(picture, mask) for mask in ring(canvas)]
+    result = merged(layers, canvas, exposure=exposure, working_pixels=working_pixels)
+    np.testing.assert_array_equal(result, picture)
+
+
+@pytest.mark.parametrize("dtype", DTYPES[1:])
+def test_cut_picture_comes_back_in_every_depth(dtype):
+    picture = noise(SPHERE.height, SPHERE.width, dtype)
+    layers = [masked(picture, mask) for mask in ring(SPHERE)]
+    np.testing.assert_array_equal(merged(layers, SPHERE), picture)
+
+
+def test_odd_sphere_without_a_pixel_half_a_turn_away():
+    """Where the width is odd no column lies opposite another; then the poles are borders."""
+    canvas = Canvas.sphere(301, 151)
+    picture = noise(canvas.height, canvas.width)
+    layers = [masked(picture, mask) for mask in ring(canvas)]
+    np.testing.assert_array_equal(merged(layers, canvas), picture)
+
+
+@st.composite
+def shapes(draw, canvas: Canvas, count: int = 3) -> list[np.ndarray]:
+    """Random masks of patches, each at least one pixel large."""
+    size = draw(st.sampled_from([1, 7, 23]))
+    random = np.random.default_rng(draw(st.integers(0, 2**32 - 1)))
+    masks = []
+    for _ in range(count):
+        share = draw(st.sampled_from([0.05, 0.6, 0.95]))
+        coarse = random.random((canvas.height // size + 1, canvas.width // size + 1)) < share
+        coarse[0, 0] = True
+        masks.append(np.kron(coarse, np.ones((size, size), bool))[: canvas.height, : canvas.width])
+    return masks
+
+
+SMALL = {"plane": Canvas.plane(131, 77), "cylinder": Canvas.plane(131, 77, True), "sphere": Canvas.sphere(130, 65)}
+few_examples = settings(max_examples=8, deadline=None, derandomize=True)
+
+
+@pytest.fixture(scope="module")
+def one_device_for_all(device: Device):
+    """As `one_device`, for hypothesis, which keeps a fixture for all its examples."""
+    patch = pytest.MonkeyPatch()
+    patch.setattr(merge, "Device", lambda wanted: device)
+    yield
+    patch.undo()
+
+
+@pytest.mark.parametrize("canvas", SMALL.values(), ids=SMALL)
+@few_examples
+@given(data=st.data())
+def test_picture_cut_along_any_shapes_comes_back(canvas, one_device_for_all, data):
+    masks = data.draw(shapes(canvas))
+    working_pixels = data.draw(st.sampled_from([2_100_000, 1_500]))
+    picture = noise(canvas.height, canvas.width)
+    result = merged([masked(picture, mask) for mask in masks], canvas, working_pixels=working_pixels)
+    np.testing.assert_array_equal(result, expected_picture(picture, np.logical_or.reduce(masks)))
+
+
+# What is opaque
+
+
+@pytest.mark.parametrize("canvas", SMALL.values(), ids=SMALL)
+@few_examples
+@given(data=st.data())
+def test_result_is_opaque_where_a_layer_is_and_nowhere_else(canvas, one_device_for_all, data):
+    masks = data.draw(shapes(canvas))
+    layers = [moved(canvas, mask, 3.0 * k, -2.0 * k) for k, mask in enumerate(masks)]
+    exposure = data.draw(st.booleans())
+    working_pixels = data.draw(st.sampled_from([2_100_000, 1_500]))
+    result = merged(layers, canvas, exposure=exposure, working_pixels=working_pixels)
+    union = np.logical_or.reduce(masks)
+    np.testing.assert_array_equal(result[..., 3] == 255, union)
+    np.testing.assert_array_equal(result[~union], 0)
+    # not darkened by what lies outside a mask either: the texture is nowhere as dark as black
+    darkest = min(layer.read(0, layer.box.height)[..., :3].min() for layer in layers)
+    assert darkest > 0 and (result[union][:, :3] > 0).all()
+
+
+@pytest.mark.parametrize("canvas", CANVASES.values(), ids=CANVASES)
+def test_whole_canvas_is_covered_with_parallax(canvas):
+    layers = moving(canvas)
+    result = merged(layers, canvas)
+    assert (result[..., 3] == 255).all()
+    assert np.ptp(result[..., :3].reshape(-1, 3), axis=0).min() > 150  # and it shows something
+
+
+# What only one layer covers
+
+
+@pytest.mark.parametrize("canvas", CANVASES.values(), ids=CANVASES)
+@pytest.mark.parametrize("dtype", [np.uint16, np.float32])
+def test_pixels_of_one_layer_are_copied(canvas, dtype):
+    layers = [moved(canvas, mask, 4.0 * k, dtype=dtype) for k, mask in enumerate(ring(canvas)[:3])]
+    covered = masks_of(layers, canvas)
+    result = merged(layers, canvas, exposure=False)
+    for layer, own in zip(layers, covered, strict=True):
+        alone = own & (covered.sum(0) == 1)
+        assert alone.sum() > 1000
+        box = layer.box
+        pixels = np.zeros(result.shape, dtype)
+        pixels[box.top : box.bottom, box.left : box.right] = layer.read(0, box.height)
+        np.testing.assert_array_equal(result[alone], pixels[alone])
+
+
+def test_pixels_of_one_layer_are_copied_where_the_correction_is_zero(monkeypatch):
+    """A correction that the overlap asks for fades out, and ends."""
+    seen = []
+    original = joint.colour.correction
+
+    def remember(*arguments):
+        seen.append(original(*arguments))
+        return seen[-1]
+
+    monkeypatch.setattr(joint.colour, "correction", remember)
+    canvas = Canvas.plane(601, 101)
+    masks = [columns(canvas, 0, 131), columns(canvas, 90, 601)]
+    pixels = [layer.read(0, 101) for layer in (moved(canvas, masks[0], 0), moved(canvas, masks[1], 0))]
+    pixels[0][..., :3] = np.rint(pixels[0][..., :3] * 0.95)
+    layers = [Layer.from_array("dark", pixels[0]), Layer.from_array("light", pixels[1], 90)]
+    result = merged(layers, canvas)
+    (correction,) = seen
+    gain = correction.gains[1].get()[..., :3]
+    far = [k for k in range(1, gain.shape[1] - 1) if not gain[:, k - 1 : k + 2].any()]
+    assert 0 < len(far) < gain.shape[1] - 2  # it is not zero everywhere
+    cell = canvas.width / gain.shape[1]
+    untouched = np.zeros(canvas.width, bool)
+    for k in far:
+        untouched[int(np.ceil(k * cell)) : int((k + 1) * cell)] = True
+    untouched[:131] = False  # where the other layer is
+    assert untouched.sum() > 100
+    np.testing.assert_array_equal(result[:, untouched], pixels[1][:, untouched[90:]])
+    changed = result[:, 131:200, :3].astype(int) - pixels[1][:, 41:110, :3]
+    assert changed.any()  # near the overlap it is corrected
+
+
+# 360 degrees
+
+
+# How much a shifted canvas's result may differ, in levels of 8 bit: largest, mean. Its layers come in another
+# order, so that sums round otherwise. On the sphere charts have their pixels elsewhere, so that flow differs by
+# hundredths of a pixel and colours by the texture's slope times that. Cells of the colour grid, of 16 px, lie
+# elsewhere, so that gains are blurred over other pixels.
+SHIFTED = {
+    ("cylinder", False): (1, 0.001),
+    ("cylinder", True): (8, 0.8),
+    ("sphere", False): (16, 0.1),
+    ("sphere", True): (16, 0.6),
+}
+
+
+@pytest.mark.parametrize(("name", "exposure"), SHIFTED)
+def test_shifted_canvas_gives_the_shifted_result(name, exposure):
+    canvas = CANVASES[name]
+    layers = moving(canvas)
+    covered = masks_of(layers, canvas)
+    original = merged(layers, canvas, exposure=exposure).astype(int)
+    for shift in (1, 64, 237):
+        shifted = []
+        for layer, mask in zip(layers, covered, strict=True):
+            box, pixels = layer.box, np.zeros((*mask.shape, 4), np.uint8)
+            pixels[box.top : box.bottom, box.left : box.right] = layer.read(0, box.height)
+            shifted.append(masked(np.roll(pixels, shift, 1), np.roll(mask, shift, 1), layer.name))
+        result = merged(shifted, canvas, exposure=exposure)
+        difference = np.abs(np.roll(original, shift, 1) - result)
+        largest, mean = SHIFTED[name, exposure]
+        assert difference.max() <= largest and difference.mean() <= mean
+        # one pixel off would be far beyond
+        assert np.abs(np.roll(original, shift + 1, 1) - result).mean() > 5 * max(mean, 0.1)
+
+
+# Order
+
+
+def test_order_does_not_matter():
+    layers = moving(SPHERE)
+    first = merged(layers, SPHERE)
+    random = np.random.default_rng(0)
+    for _ in range(2):
+        shuffled = [layers[k] for k in random.permutation(len(layers))]
+        np.testing.assert_array_equal(merged(shuffled, SPHERE), first)
+
+
+def test_order_does_not_matter_where_boxes_are_equal():
+    """Uncropped layers all lie at the same place with the same size, and these even have one mask."""
+    canvas = SMALL["plane"]
+    everywhere = columns(canvas, 0, canvas.width)
+    layers = [moved(canvas, everywhere, dx, dy) for dx, dy in ((0, 0), (3, 1), (-2, 2))]
+    results = [merged(order, canvas) for order in permutations(layers)]
+    for result in results[1:]:
+        np.testing.assert_array_equal(result, results[0])
+    assert len({layer.box for layer in layers}) == 1
