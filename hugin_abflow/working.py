@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from zlib import crc32
 
 import numpy as np
@@ -35,6 +35,7 @@ class Grid:
     width, height    of the grid.
     wraps, poles     border rules (kernels/common.cl); poles: bit 0 at the top, bit 1 at the bottom.
     lens        (lon of x = 0, radians per column, lat of y = 0, radians per row); zeros on a plane.
+    canvas_width    of the whole canvas, full-resolution px; 0: the region's.
     """
 
     region: Box
@@ -43,6 +44,7 @@ class Grid:
     wraps: bool
     poles: int
     lens: tuple[float, float, float, float]
+    canvas_width: int = 0
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -56,14 +58,17 @@ class Grid:
 
     @property
     def circumference(self) -> float:
-        """The canvas's width as the flow-magnitude term takes it: 2 pi on the sphere, else grid px."""
-        return 2 * math.pi if self.lens[1] else float(self.width)
+        """The canvas's width as the flow-magnitude term takes it: radians on the sphere, else grid px."""
+        if self.lens[1] and self.wraps:
+            return 2 * math.pi
+        share = self.canvas_width / self.region.width if self.canvas_width else 1.0
+        return share * self.width * (self.lens[1] or 1.0)
 
     def resized(self, width: int, height: int) -> Grid:
         """The same region on another number of pixels."""
         lon, dlon, lat, dlat = self.lens
         lens = (lon, dlon * self.width / width, lat, dlat * self.height / height)
-        return Grid(self.region, width, height, self.wraps, self.poles, lens)
+        return replace(self, width=width, height=height, lens=lens)
 
 
 @dataclass(frozen=True)
@@ -93,7 +98,8 @@ def full_grid(canvas: Canvas, layers: Sequence[Layer]) -> Grid:
         if canvas.wraps and canvas.width % 2 == 0:
             poles += abs(lens[2] - math.pi / 2) < step / 2
             poles += 2 * (abs(lens[2] - (bottom - top) * step + math.pi / 2) < step / 2)
-    return Grid(Box(left, top, right, bottom), right - left, bottom - top, canvas.wraps, poles, lens)
+    region = Box(left, top, right, bottom)
+    return Grid(region, region.width, region.height, canvas.wraps, poles, lens, canvas.width)
 
 
 def working_grid(full: Grid, settings: Settings) -> Grid:
