@@ -240,10 +240,12 @@ def _argument(value: Any) -> Any:
         return np.int32(value)
     if isinstance(value, float | np.floating):
         return np.float32(value)
-    return _vector(tuple(value))
+    kind = "int" if np.asarray(value).dtype.kind in "iu" else "float"
+    return _vector(kind, tuple(value))
 
 
-@lru_cache(maxsize=1024)  # pyopencl takes a tenth of a millisecond for each, and grids come again and again
-def _vector(values: tuple[float, ...]) -> Any:
-    kind = "int" if np.asarray(values).dtype.kind in "iu" else "float"
+# pyopencl takes a tenth of a millisecond for each, and grids come again and again. The kind is part of the
+# key, because (1, 1) equals (1.0, 1.0)
+@lru_cache(maxsize=1024)
+def _vector(kind: str, values: tuple[float, ...]) -> Any:
     return getattr(cl.cltypes, f"make_{kind}{len(values)}")(*(np.asarray(values).tolist()))
