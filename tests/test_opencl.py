@@ -1,0 +1,194 @@
+"""Choosing a device; every kernel builds alone and has a twin."""
+
+from __future__ import annotations
+
+import importlib
+import re
+import sys
+from itertools import product
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pyopencl as cl
+import pytest
+
+from hugin_abflow import opencl, working
+from hugin_abflow.errors import DeviceError, ExitCode
+from hugin_abflow.opencl import Device, kernel_source, list_devices
+
+KERNELS = Path(__file__).parent.parent / "kernels"
+MODULES = sorted(path.stem for path in KERNELS.glob("*.cl") if path.stem != "common")
+
+
+def kernels_of(module: str) -> list[str]:
+    return re.findall(r"__kernel\s+void\s+(\w+)", (KERNELS / f"{module}.cl").read_text())
+
+
+def option_sets(module: str) -> list[str]:
+    """All that the host builds a file with: per depth and channel count where samples are read."""
+    if module not in ("working", "blend"):
+        return [""]
+    sets = []
+    for (name, white), samples in product(working.PIXEL.values(), (2, 4)):
+        full_scale = f" -DWHITE={white:.1f}f -DINTEGER={int(white > 1)}" if module == "blend" else ""
+        sets.append(f"-DPIXEL={name} -DSAMPLES={samples}{full_scale}")
+    return sets
+
+
+@pytest.mark.parametrize("module", MODULES)
+def test_every_kernel_has_a_twin_of_its_name(module: str) -> None:
+    names = kernels_of(module)
+    assert names
+    twins = importlib.import_module(f"reference.{module}")
+    missing = [name for name in names if not callable(getattr(twins, name, None))]
+    assert not missing, f"tests/reference/{module}.py has no twin of {', '.join(missing)}"
+
+
+@pytest.mark.parametrize("module", MODULES)
+def test_kernels_are_named_after_their_file(module: str) -> None:
+    assert all(name.startswith(f"{module}_") for name in kernels_of(module))
+
+
+@pytest.mark.parametrize(("module", "options"), [(m, o) for m in MODULES for o in option_sets(m)])
+def test_every_file_builds_alone_without_warnings(device: Device, module: str, options: str) -> None:
+    pocl = "Portable" in device.device.platform.name
+    # no fault of ours: clang notes that float16 arguments go another way without AVX-512
+    source = '#pragma clang diagnostic ignored "-Wpsabi"\n' * pocl + kernel_source(module)
+    program = cl.Program(device.context, source)
+    program.build(["-cl-std=CL1.2", *["-Werror"] * pocl, *options.split()], cache_dir=False)
+    built = sorted(kernel.function_name for kernel in program.all_kernels())
+    assert built == sorted(kernels_of(module))
+
+
+def test_a_file_that_does_not_build_is_a_device_error_with_its_name(
+    device: Device, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(opencl, "kernel_source", lambda module: "__kernel void broken( {")
+    with pytest.raises(DeviceError, match=r"(?s)kernels/broken\.cl does not build on .*driver"):
+        device.kernel("broken", "broken")
+
+
+def test_source_lines_keep_their_own_file_and_number() -> None:
+    source = kernel_source("working")
+    assert source.startswith('#line 1 "common.cl"\n')
+    own = source.partition('#line 1 "working.cl"\n')[2]
+    assert own.rstrip("\n") == (KERNELS / "working.cl").read_text().rstrip("\n")
+
+
+def test_a_kernel_is_built_once(device: Device) -> None:
+    assert device.kernel("pyramid", "pyramid_reduce") is device.kernel("pyramid", "pyramid_reduce")
+
+
+def fake(name: str, kind: int, units: int = 4, platform: str = "Some platform") -> SimpleNamespace:
+    return SimpleNamespace(
+        name=f"{name} ", type=kind, max_compute_units=units, max_clock_frequency=1000,
+        global_mem_size=1 << 30, platform=SimpleNamespace(name=platform),
+    )  # fmt: skip
+
+
+@pytest.fixture
+def shelf(monkeypatch: pytest.MonkeyPatch) -> list[SimpleNamespace]:
+    """Four devices of two platforms, and a platform whose query fails, as a broken driver's does."""
+    devices = [
+        fake("Big CPU", cl.device_type.CPU, 128),
+        fake("Small GPU", cl.device_type.GPU, 2, "Grey platform"),
+        fake("Large GPU", cl.device_type.GPU, 60, "Grey platform"),
+        fake("Odd one", cl.device_type.ACCELERATOR),
+    ]
+
+    def fails() -> None:
+        raise cl.RuntimeError("clGetDeviceIDs failed: DEVICE_NOT_FOUND")
+
+    platforms = [
+        SimpleNamespace(name="broken", get_devices=fails),
+        SimpleNamespace(name="first", get_devices=lambda: devices[:1]),
+        SimpleNamespace(name="second", get_devices=lambda: devices[1:]),
+    ]
+    monkeypatch.setattr(cl, "get_platforms", lambda: platforms)
+    return devices
+
+
+def test_default_is_the_fastest_gpu(shelf: list[SimpleNamespace]) -> None:
+    assert opencl._choose(None) is shelf[2]
+    assert [d.default for d in list_devices()] == [False, False, True, False]
+
+
+def test_without_a_gpu_the_cpu_is_the_default(shelf: list[SimpleNamespace]) -> None:
+    del shelf[1:3]
+    assert opencl._choose(None) is shelf[0]
+
+
+@pytest.mark.parametrize(("wanted", "index"), [("0", 0), ("3", 3), ("large", 2), ("GREY", 1), ("odd ONE", 3)])
+def test_a_device_is_chosen_by_index_or_part_of_its_name(
+    shelf: list[SimpleNamespace], wanted: str, index: int
+) -> None:
+    assert opencl._choose(wanted) is shelf[index]
+
+
+@pytest.mark.parametrize("wanted", ["4", "99", "no such"])
+def test_an_unknown_device_names_what_there_is(shelf: list[SimpleNamespace], wanted: str) -> None:
+    with pytest.raises(DeviceError) as caught:
+        Device(wanted)
+    message = str(caught.value)
+    assert f"--device {wanted}" in message
+    assert all(f"{i}: {d.name.strip()}" in message for i, d in enumerate(shelf))
+    assert caught.value.exit_code == ExitCode.DEVICE
+
+
+def test_list_devices_describes_each(shelf: list[SimpleNamespace]) -> None:
+    found = list_devices()
+    assert [d.index for d in found] == [0, 1, 2, 3]
+    assert [d.kind for d in found] == ["CPU", "GPU", "GPU", "other"]
+    assert found[1].name == "Small GPU"
+    assert found[1].platform == "Grey platform"
+    assert found[0].memory == 1 << 30
+
+
+def no_platforms() -> list[object]:
+    return []
+
+
+def no_loader() -> list[object]:
+    raise cl.LogicError("clGetPlatformIDs failed: PLATFORM_NOT_FOUND_KHR")
+
+
+@pytest.mark.parametrize("platforms", [no_platforms, no_loader])
+@pytest.mark.parametrize(
+    ("system", "remedy"), [("linux", "pocl"), ("win32", "driver"), ("darwin", "pocl"), ("plan9", "pocl")]
+)
+def test_without_any_device_the_error_says_what_to_install(
+    monkeypatch: pytest.MonkeyPatch, platforms: object, system: str, remedy: str
+) -> None:
+    monkeypatch.setattr(cl, "get_platforms", platforms)
+    monkeypatch.setattr(sys, "platform", system)
+    with pytest.raises(DeviceError, match=f"no OpenCL device found; .*{remedy}"):
+        Device()
+    assert list_devices() == []
+
+
+def test_buffers_carry_arrays_of_any_size(device: Device) -> None:
+    values = np.arange(77 * 53 * 3, dtype=np.uint16).reshape(53, 77, 3)
+    buffer = device.upload(values[:, ::-1])
+    assert buffer.nbytes == values.nbytes
+    assert np.array_equal(buffer.get(), values[:, ::-1])
+    assert np.array_equal(device.upload(values, np.float32).get(), values.astype(np.float32))
+    assert (device.empty((5, 7)).fill(1.5).get() == 1.5).all()
+    assert device.zeros((0, 3)).get().shape == (0, 3)
+
+
+def test_vectors_are_of_their_numbers_kind() -> None:
+    """(1, 1) equals (1.0, 1.0), but a kernel reads other bits."""
+    for values in ((1, 1), (1.0, 1.0), (1, 2, 3, 4), (1.0, 2.0, 3.0, 4.0), np.arange(16, dtype=np.float32)):
+        vector = opencl._argument(values)
+        kind = np.int32 if isinstance(values[0], int) else np.float32
+        assert vector.tobytes()[: 4 * len(values)] == np.array(values, kind).tobytes()
+    assert opencl._argument(True).dtype == np.int32
+    assert opencl._argument(2).dtype == np.int32
+    assert opencl._argument(2.0).dtype == np.float32
+
+
+def test_running_over_nothing_does_nothing(device: Device) -> None:
+    image = device.empty((0, 7))
+    device.run("pyramid", "pyramid_reduce", (7, 0), image, image, (7, 0, 0, 0), image, image, (4, 0))
+    device.finish()
