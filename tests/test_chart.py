@@ -241,6 +241,21 @@ def test_on_a_plane_a_chart_copies_pixels(device: Device) -> None:
     assert_close(level.image.get(), grey, TRIGONOMETRY)
 
 
+@pytest.mark.parametrize("rounding", [-1e-6, 0.0, 1e-6])
+def test_whole_pixels_but_for_rounding_are_copies(device: Device, rounding: float) -> None:
+    """A tap whose weight is only rounding neither changes a colour nor fails a mask."""
+    pixels = random_layer(7, 154, 106, 0.8)
+    grid = plane(154, 106)
+    found = Chart(
+        np.array([0] * 9 + [(1 + rounding) / 3, (1 + rounding) / 3, 0, 0, 0, 0, 0], np.float32), 50, 34, False
+    )
+    level = chart.sample(device, on_device(device, pixels), grid, found)
+    part = pixels[1:102:3, 1:150:3]
+    assert np.array_equal(level.mask.get(), part[..., 3])
+    grey = np.log(part[..., :3] @ [0.299, 0.587, 0.114] + FLOOR) * part[..., 3]
+    assert_close(level.image.get(), grey, TRIGONOMETRY)
+
+
 def test_over_a_pole_a_chart_is_smooth(device: Device) -> None:
     """A scene that is smooth on the sphere is smooth on a chart over its pole: every tap was right."""
     grid = sphere(402, 201)

@@ -122,6 +122,25 @@ def test_a_layer_smaller_than_a_working_pixel_stays_on_the_grid(device: Device, 
     assert not reduced.pixels.get().any()
 
 
+@pytest.mark.parametrize(("width", "height"), [(1, 60), (90, 2)])
+def test_a_layer_narrower_than_a_working_pixel_covers_none(device: Device, width: int, height: int) -> None:
+    layer = Layer.from_array("line", np.full((height, width, 4), 255, np.uint8), 25, 17)
+    reduced = working.reduce_layer(device, layer, grid_over(Box(0, 0, 120, 80), 30, 20), nothing)
+    assert not reduced.pixels.get().any()
+
+
+@pytest.mark.parametrize(
+    ("dtype", "alphas"), [(np.uint8, (127, 128)), (np.uint16, (32767, 32768)), (np.float32, (0.499, 0.5))]
+)
+def test_half_alpha_is_valid(device: Device, dtype: type, alphas: tuple[float, float]) -> None:
+    pixels = np.ones((2, 2, 2), dtype)
+    pixels[0, :, 1], pixels[1, :, 1] = alphas
+    layer = Layer.from_array("half", pixels)
+    kernel = working.reduce_layer(device, layer, grid_over(Box(0, 0, 2, 2), 2, 2), nothing).pixels.get()
+    twin = working_reduce(pixels, (0, 0, 2, 2), (2, 2, 2, 2), (0, 0, 2, 2), 0, (2, 2), full_scale(dtype))
+    assert kernel[..., 3].tolist() == twin[..., 3].tolist() == [[0, 0], [1, 1]]
+
+
 def test_advance_counts_every_row_of_a_layer_once(device: Device) -> None:
     seen: list[int] = []
     layer = Layer.from_array("a", random_pixels(5, 77, 53, np.uint8, 1, 0), left=1, top=2)
