@@ -124,7 +124,11 @@ def shapes(draw, canvas: Canvas, count: int = 3) -> list[np.ndarray]:
     return masks
 
 
-SMALL = {"plane": Canvas.plane(131, 77), "cylinder": Canvas.plane(131, 77, True), "sphere": Canvas.sphere(130, 65)}
+SMALL = {
+    "plane": Canvas.plane(131, 77),
+    "cylinder": Canvas.plane(131, 77, True),
+    "sphere": Canvas.sphere(130, 65),
+}
 few_examples = settings(max_examples=8, deadline=None, derandomize=True)
 
 
