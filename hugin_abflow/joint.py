@@ -57,11 +57,12 @@ def _prepare_in_memory(
     device: Device, layers: Sequence[Layer], canvas: Canvas, settings: Settings, progress: Progress
 ) -> Prepared:
     """`prepare`, on a smaller working canvas where the device's memory does not hold the wanted one."""
+    region = working.full_grid(canvas, layers).region
     while True:
         try:
             return prepare(device, layers, canvas, settings, progress)
         except DeviceMemoryError:
-            fewer = settings.working_pixels // 2
+            fewer = min(settings.working_pixels, region.width * region.height) // 2
             if fewer < _LEAST_WORKING_PIXELS:
                 raise
             _log.warning("the device's memory is too small; trying again at a lower working resolution")
