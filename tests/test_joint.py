@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from itertools import permutations
+from itertools import pairwise, permutations
 
 import numpy as np
 import pytest
@@ -43,7 +43,7 @@ def ring(canvas: Canvas, parts: int = 4, overlap: int = 29) -> list[np.ndarray]:
     """Masks of strips that overlap; on a canvas that wraps the last overlaps the first. On a sphere two
     more cover the poles."""
     ends = np.linspace(0, canvas.width, parts + 1).astype(int)
-    masks = [columns(canvas, a - overlap, b) for a, b in zip(ends[:-1], ends[1:], strict=True)]
+    masks = [columns(canvas, a - overlap, b) for a, b in pairwise(ends)]
     if canvas.spherical:
         rows = np.arange(canvas.height)[:, None]
         masks = [mask & (rows >= 31) & (rows < 119) for mask in masks]
@@ -233,9 +233,9 @@ def test_pixels_of_one_layer_are_copied_where_the_correction_is_zero(monkeypatch
 
 
 # How much a shifted canvas's result may differ, in levels of 8 bit: largest, mean. Its layers come in another
-# order, so that sums round otherwise. On the sphere charts have their pixels elsewhere, so that flow differs by
-# hundredths of a pixel and colours by the texture's slope times that. Cells of the colour grid, of 16 px, lie
-# elsewhere, so that gains are blurred over other pixels.
+# order, so that sums round otherwise. On the sphere charts have their pixels elsewhere, so that flow differs
+# by hundredths of a pixel and colours by the texture's slope times that. Cells of the colour grid, of 16 px,
+# lie elsewhere, so that gains are blurred over other pixels.
 SHIFTED = {
     ("cylinder", False): (1, 0.001),
     ("cylinder", True): (8, 0.8),

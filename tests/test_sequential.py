@@ -24,10 +24,10 @@ AS_PUBLISHED = {
     "fixed_point_steps": 0,
 }
 
-# Where p + F * Blend falls within float32's rounding (2e-5 px) of a pixel's edge, either pixel is nearest; with two
-# layers and two axes that is a share of 1e-4. Jump flooding may miss the nearest seed by a fraction of a pixel at
-# a few pixels. Elsewhere the sum of two colours may round to the other side of .5.
-TIES = 1e-3  # share of pixels that may differ by more than a level, of each merge
+# Where p + F * Blend falls within float32's rounding (2e-5 px) of a pixel's edge, either pixel is nearest;
+# with two layers and two axes that is a share of 1e-4. Jump flooding may miss the nearest seed by a fraction
+# of a pixel at a few pixels. Elsewhere the sum of two colours may round to the other side of .5.
+TIES = 5e-4  # share of pixels that may differ by more than a level; twice that by one
 
 
 def move(layer: np.ndarray, dx: float, dy: float, period: int = 0) -> np.ndarray:
@@ -48,8 +48,7 @@ def layers_of(canvas: Canvas, masks: list[np.ndarray]) -> list[Layer]:
 
 @pytest.fixture
 def flows(monkeypatch):
-    """The flow of each merge of two layers: a list of (F_01, F_10) on the canvas's pixels, in the engine's order
-    of the two layers, with their boxes."""
+    """Each merge's two layers, in the engine's order, their flow and the working grid."""
     seen = []
     original = joint._flows
 
@@ -140,7 +139,7 @@ def spread(layer: Layer, canvas: Canvas) -> np.ndarray:
 
 
 def iterate(flows, canvas: Canvas, **parameters) -> tuple[np.ndarray, np.ndarray]:
-    """The engine's merges again with Code 1, each onto the mosaic of the last; and where no answer is missing."""
+    """The engine's merges again with Code 1, each onto the mosaic of the last; and where it says anything."""
     mosaic, defined = None, True
     for one, other, pair, grid in flows:
         forward, backward = (
@@ -153,13 +152,13 @@ def iterate(flows, canvas: Canvas, **parameters) -> tuple[np.ndarray, np.ndarray
     return mosaic, defined
 
 
-def check(result: np.ndarray, expected: tuple[np.ndarray, np.ndarray], ties: float = TIES) -> None:
+def check(result: np.ndarray, expected: tuple[np.ndarray, np.ndarray]) -> None:
     pixels, defined = expected
     assert defined.mean() > 0.97
     np.testing.assert_array_equal(result[..., 3], pixels[..., 3])
     off = np.abs(result.astype(int) - pixels).max(-1)[defined]
-    assert (off > 1).mean() <= ties
-    assert (off > 0).mean() <= 10 * ties
+    assert (off > 1).mean() <= TIES
+    assert (off > 0).mean() <= 2 * TIES
 
 
 def two_masks(canvas: Canvas) -> list[np.ndarray]:
@@ -220,7 +219,7 @@ def test_three_layers_are_code_1_twice(flows):
     result = merged(layers, PLANE, **AS_PUBLISHED)
     names = {tuple(sorted((one.name, other.name))) for one, other, _, _ in flows}
     assert names == {("layer 1", "layer 2"), ("layer 0", "layer 1+layer 2")}
-    check(result, iterate(flows, PLANE), 2 * TIES)  # what differs in the mosaic may be moved, too
+    check(result, iterate(flows, PLANE))
 
 
 def test_order_given_by_the_caller_does_not_matter_to_which_come_first(flows):

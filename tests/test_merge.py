@@ -1,0 +1,326 @@
+"""The pipeline around the engine: simple cases, crops, bands, small devices, and no borrowed flow."""
+
+from __future__ import annotations
+
+import logging
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from pictures import expected_picture, masked, masks_of, merged, noise, one_device, pixel_places, texture
+
+from hugin_abflow import blend, merge, opencl
+from hugin_abflow.errors import DeviceError, LayersMismatchError, LayersMissingError, SettingsError
+from hugin_abflow.images import read_layer
+from hugin_abflow.layer import Box, Canvas, Layer
+from hugin_abflow.merge import merge_layers, merge_project
+from hugin_abflow.project import read_plan
+from hugin_abflow.settings import Settings
+
+shared_device = pytest.mark.usefixtures(one_device.__name__)
+
+ROOM = Path(__file__).resolve().parent.parent / "sample_projects" / "room"
+WIDTH, HEIGHT = 301, 151
+CANVASES = {
+    "plane": Canvas.plane(WIDTH, HEIGHT),
+    "cylinder": Canvas.plane(WIDTH, HEIGHT, wraps=True),
+    "sphere": Canvas.sphere(302, HEIGHT),
+}
+
+
+def cropped(canvas: Canvas, *crop: int) -> Canvas:
+    return Canvas(canvas.width, canvas.height, Box(*crop), canvas.wraps, canvas.spherical, canvas.hfov)
+
+
+def with_parallax(canvas: Canvas, dtype: type = np.uint8) -> list[Layer]:
+    """Three layers that leave the canvas's corners free; the last two cross the border if it wraps."""
+    y, x = pixel_places(canvas.height, canvas.width)
+    period = canvas.width if canvas.wraps else 0
+    masks = [(x >= 20) & (x < 141) & (y > 11), (x >= 101) & (x < 281), (x >= 229) & (y < 139)]
+    if canvas.wraps:
+        masks[2] |= (x < 50) & (y < 139)
+    motions = [(0, 0), (4, -2), (-3, 1)]
+    return [
+        masked(texture(y - dy, x - dx, dtype, period), mask, f"layer {k}")
+        for k, (mask, (dx, dy)) in enumerate(zip(masks, motions, strict=True))
+    ]
+
+
+# Cases that need no blending
+
+
+@shared_device
+@pytest.mark.parametrize("canvas", CANVASES.values(), ids=CANVASES)
+@pytest.mark.parametrize("mode", ["joint", "sequential"])
+def test_one_layer_passes_through(canvas, mode):
+    picture = noise(canvas.height, canvas.width, np.uint16)
+    random = np.random.default_rng(1).random((canvas.height, canvas.width))
+    layer = masked(picture, (random > 0.3) & (pixel_places(canvas.height, canvas.width)[1] > 30))
+    result = merged([layer], canvas, merge=mode)
+    np.testing.assert_array_equal(result, expected_picture(picture, masks_of([layer], canvas)[0]))
+
+
+@shared_device
+@pytest.mark.parametrize("canvas", CANVASES.values(), ids=CANVASES)
+@pytest.mark.parametrize("mode", ["joint", "sequential"])
+def test_layers_that_do_not_overlap_are_pasted(canvas, mode):
+    """Even if they touch: there is nothing that could tell them to change."""
+    y, x = pixel_places(canvas.height, canvas.width)
+    masks = [(x < 97) & (y > 5), (x >= 97) & (x < 180), (x >= 211) & (y < 60), (x >= 211) & (y >= 83)]
+    pictures = [noise(canvas.height, canvas.width, seed=k) for k in range(4)]
+    layers = [masked(picture, mask) for picture, mask in zip(pictures, masks, strict=True)]
+    result = merged(layers, canvas, merge=mode)
+    expected = sum(expected_picture(p, m) for p, m in zip(pictures, masks, strict=True))
+    np.testing.assert_array_equal(result, expected)
+
+
+@shared_device
+@pytest.mark.parametrize("exposure", [True, False])
+def test_layer_inside_another_takes_no_part(exposure, caplog):
+    canvas = CANVASES["plane"]
+    layers = with_parallax(canvas)
+    without = merged(layers, canvas, exposure=exposure)
+    inner = Layer.from_array("patch", noise(41, 57), 31, 47)
+    with caplog.at_level(logging.INFO, "hugin_abflow"):
+        result = merged([inner, *layers], canvas, exposure=exposure)
+    np.testing.assert_array_equal(result, without)
+    assert [r.message for r in caplog.records if "wholly inside" in r.message] == [
+        "patch lies wholly inside layer 0: not used"
+    ]
+
+
+@shared_device
+def test_layer_inside_another_but_for_a_column_still_shows_there(caplog):
+    """At working resolution it is wholly inside; what it alone covers may not become a hole."""
+    canvas = CANVASES["plane"]
+    y, x = pixel_places(HEIGHT, WIDTH)
+    masks = [(x >= 20) & (y >= 20), (x >= 19) & (x < 131) & (y >= 50) & (y < 101)]
+    pictures = [noise(HEIGHT, WIDTH, seed=k) for k in range(2)]
+    layers = [masked(p, mask, f"layer {k}") for k, (p, mask) in enumerate(zip(pictures, masks, strict=True))]
+    with caplog.at_level(logging.INFO, "hugin_abflow"):
+        result = merged(layers, canvas, working_pixels=9_000)
+    assert "layer 1 lies wholly inside layer 0: not used" in caplog.messages
+    expected = expected_picture(pictures[0], masks[0])
+    expected[masks[1] & ~masks[0]] = pictures[1][masks[1] & ~masks[0]]
+    np.testing.assert_array_equal(result, expected)
+
+
+# Crop and bands
+
+
+@shared_device
+@pytest.mark.parametrize("canvas", CANVASES.values(), ids=CANVASES)
+@pytest.mark.parametrize(
+    "crop", [(13, 7, 288, 140), (0, 60, 77, 61), (250, 0, 301, 151), (150, 145, 301, 151)]
+)
+def test_exactly_the_crop_comes_out(canvas, crop):
+    layers = with_parallax(canvas)
+    left, top, right, bottom = crop
+    whole = merged(layers, canvas)
+    result = merged(layers, cropped(canvas, *crop))
+    assert result.shape == (bottom - top, right - left, 4)
+    np.testing.assert_array_equal(result, whole[top:bottom, left:right])
+
+
+@shared_device
+@pytest.mark.parametrize("mode", ["joint", "sequential"])
+def test_crop_beyond_the_layers_is_transparent(mode):
+    canvas = Canvas.plane(401, 203)
+    picture = noise(41, 57)
+    layers = [
+        Layer.from_array("a", picture[:, :40], 110, 90),
+        Layer.from_array("b", picture[:, 20:], 130, 90),
+    ]
+    expected = np.zeros((203, 401, 4), np.uint8)
+    expected[90:131, 110:167] = picture
+    for left, top, right, bottom in [
+        (0, 0, 401, 203),
+        (100, 80, 401, 120),
+        (0, 0, 60, 203),
+        (0, 140, 401, 203),
+    ]:
+        result = merged(layers, cropped(canvas, left, top, right, bottom), merge=mode)
+        np.testing.assert_array_equal(result, expected[top:bottom, left:right])
+
+
+@shared_device
+@pytest.mark.parametrize("canvas", CANVASES.values(), ids=CANVASES)
+@pytest.mark.parametrize("working_pixels", [2_100_000, 7_000])
+def test_height_of_bands_changes_nothing(canvas, working_pixels):
+    layers = with_parallax(canvas)
+    whole = merged(layers, canvas, working_pixels=working_pixels, band_rows=canvas.height)
+    for rows in (1, 13, 64, 1000) if working_pixels > 7_000 else (17,):
+        result = merged(layers, canvas, working_pixels=working_pixels, band_rows=rows)
+        np.testing.assert_array_equal(result, whole)
+
+
+@shared_device
+def test_bands_read_only_rows_near_them():
+    """Full resolution is a stream: no layer is read whole for a band, but for a band of its height."""
+    canvas = CANVASES["plane"]
+    longest = []
+
+    def watched(layer: Layer) -> Layer:
+        def read(top: int, bottom: int) -> np.ndarray:
+            longest.append(bottom - top)
+            return layer.read(top, bottom)
+
+        return Layer(layer.name, layer.box, layer.dtype, layer.channels, read)
+
+    layers = [watched(layer) for layer in with_parallax(canvas)]
+    bands = merge.joint.merge(merge.Device(None), layers, canvas, Settings(band_rows=16), merge.silent)
+    next(bands)
+    longest.clear()  # reading for the working canvas
+    assert sum(len(rows) for rows in bands) == HEIGHT - 16
+    assert 16 <= max(longest) <= 16 + 2 * 10  # motion of 4 px, three more for taps
+
+
+# What merge_layers refuses
+
+
+def test_no_layers():
+    with pytest.raises(LayersMissingError, match="no layers to merge"):
+        merge_layers([], CANVASES["plane"])
+
+
+@pytest.mark.parametrize(
+    "other, message",
+    [
+        (
+            Layer.from_array("b", noise(20, 20), 290, 0),
+            "b covers columns 290 to 310 .* outside the canvas of 301x151",
+        ),
+        (Layer.from_array("b", noise(20, 20, np.uint16)), "b has uint16 samples, a has uint8"),
+        (Layer.from_array("b", noise(20, 20, channels=1)), "b is grey, a is RGB"),
+    ],
+)
+def test_layers_that_do_not_belong_together(other, message):
+    with pytest.raises(LayersMismatchError, match=message):
+        merge_layers([Layer.from_array("a", noise(20, 20)), other], CANVASES["plane"])
+
+
+@pytest.mark.parametrize(
+    "values",
+    [
+        {"softmax_sharpness": -1},
+        {"flow_magnitude": 1e5},
+        {"working_pixels": 1},
+        {"border_feather": float("nan")},
+        {"band_rows": -1},
+        {"merge": "average"},
+        {"interpolation": "sinc"},
+    ],
+)
+def test_settings_out_of_range(values):
+    with pytest.raises(SettingsError, match=next(iter(values))):
+        Settings(**values)
+
+
+# Devices with little memory
+
+
+@pytest.fixture
+def small_memory(monkeypatch):
+    """`small_memory(bytes)`: a device on which all buffers that are alive together may take so much."""
+
+    def limit(size: int) -> list[int]:
+        peak, alive = [0], [0]
+
+        class Limited(opencl.Buffer):
+            def __init__(self, device, shape, dtype):
+                self.counted = 0
+                wanted = int(np.prod(shape, dtype=np.int64)) * np.dtype(dtype).itemsize
+                if alive[0] + wanted > size:
+                    raise opencl.DeviceMemoryError(f"no {wanted} bytes left; close other programs")
+                super().__init__(device, shape, dtype)
+                self.counted = wanted
+                alive[0] += wanted
+                peak[0] = max(peak[0], alive[0])
+
+            def __del__(self):
+                alive[0] -= self.counted
+
+        monkeypatch.setattr(opencl, "Buffer", Limited)
+        return peak
+
+    return limit
+
+
+@shared_device
+def test_bands_shrink_where_memory_ends(small_memory, caplog):
+    """All that is needed at working resolution fits, a band of the whole height does not."""
+    canvas = Canvas.plane(701, 601)
+    y, x = pixel_places(canvas.height, canvas.width)
+    layers = [
+        masked(texture(y, x), x < 400, "a"),
+        masked(texture(y, x - 5), x >= 300, "b"),
+    ]
+    settings = {"working_pixels": 25_000}
+    peak = small_memory(1 << 40)
+    expected = merged(layers, canvas, **settings)
+    needed = peak[0]
+    peak = small_memory(needed // 3)
+    result = merged(layers, canvas, **settings)
+    np.testing.assert_array_equal(result, expected)
+    assert peak[0] <= needed // 3
+    assert not caplog.records  # the same result is nothing to warn of
+
+
+@shared_device
+def test_working_resolution_falls_where_memory_ends(small_memory, caplog):
+    canvas = CANVASES["plane"]
+    layers = with_parallax(canvas)
+    peak = small_memory(1 << 40)
+    expected = merged(layers, canvas, band_rows=16)
+    peak = small_memory(peak[0] * 2 // 3)
+    result = merged(layers, canvas, band_rows=16)
+    (record,) = caplog.records
+    assert record.levelno == logging.WARNING and "lower working resolution" in record.message
+    np.testing.assert_array_equal(result[..., 3], expected[..., 3])
+    assert np.abs(result.astype(int) - expected).mean() < 2  # much the same picture
+
+
+@shared_device
+def test_memory_below_any_sense_is_an_error(small_memory):
+    small_memory(20_000)
+    with pytest.raises(DeviceError, match="close other programs"):
+        merged(with_parallax(CANVASES["plane"]), CANVASES["plane"])
+
+
+@shared_device
+def test_memory_too_small_for_the_smallest_band_is_an_error(small_memory, monkeypatch):
+    def too_small(*arguments):
+        raise opencl.DeviceMemoryError("no memory for a band")
+
+    monkeypatch.setattr(blend, "_band", too_small)
+    with pytest.raises(DeviceError, match="no memory for a band"):
+        merged(with_parallax(CANVASES["plane"]), CANVASES["plane"])
+
+
+# The engine is ours
+
+
+def test_sample_merges_without_opencv(monkeypatch, tmp_path):
+    """No function of OpenCV is called that could do our work."""
+    words = ("flow", "remap", "distance", "warp", "blur", "pyr", "filter", "resize", "blend", "inpaint")
+    patched = []
+    for name in dir(cv2):
+        function = getattr(cv2, name)
+        if callable(function) and any(word in name.lower() for word in words):
+
+            def refuse(*arguments, name=name, **options):
+                raise AssertionError(f"cv2.{name} was called")
+
+            monkeypatch.setattr(cv2, name, refuse)
+            patched.append(name)
+    assert {"remap", "distanceTransform", "calcOpticalFlowFarneback", "warpAffine"} <= set(patched)
+    assert {"DISOpticalFlow_create", "GaussianBlur", "resize", "pyrDown", "filter2D"} <= set(patched)
+    output = tmp_path / "room.tif"
+    merge_project(ROOM / "room.pto", Settings(working_pixels=60_000), prefix="room", output=output)
+    layer = read_layer(output)
+    pixels = layer.read(0, layer.box.height)
+    crop = read_plan(ROOM / "room.pto").canvas.crop
+    assert pixels.shape == (crop.height, crop.width, 4)
+    assert (pixels[..., 3] == 255).all()
+    assert pixels[..., :3].std() > 20
