@@ -95,15 +95,16 @@ def test_layer_inside_another_but_for_a_column_still_shows_there(caplog):
     """At working resolution it is wholly inside; what it alone covers may not become a hole."""
     canvas = CANVASES["plane"]
     y, x = pixel_places(HEIGHT, WIDTH)
-    masks = [(x >= 20) & (y >= 20), (x >= 19) & (x < 131) & (y >= 50) & (y < 101)]
-    pictures = [noise(HEIGHT, WIDTH, seed=k) for k in range(2)]
+    # column 19 lies under a working pixel of which neither layer covers all
+    masks = [(x >= 20) & (y >= 30), (x >= 19) & (x < 131) & (y >= 50) & (y < 101), y < 40]
+    pictures = [noise(HEIGHT, WIDTH, seed=k) for k in range(3)]
     layers = [masked(p, mask, f"layer {k}") for k, (p, mask) in enumerate(zip(pictures, masks, strict=True))]
     with caplog.at_level(logging.INFO, "hugin_abflow"):
-        result = merged(layers, canvas, working_pixels=9_000)
+        result = merged(layers, canvas, working_pixels=9_000, exposure=False)
     assert "layer 1 lies wholly inside layer 0: not used" in caplog.messages
     expected = expected_picture(pictures[0], masks[0])
     expected[masks[1] & ~masks[0]] = pictures[1][masks[1] & ~masks[0]]
-    np.testing.assert_array_equal(result, expected)
+    np.testing.assert_array_equal(result[40:], expected[40:])
 
 
 # Crop and bands
