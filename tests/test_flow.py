@@ -1,0 +1,480 @@
+"""Flow: synthetic truth, kernels against twins, twins against SciPy and dense algebra."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+from grids import patches
+from reference import common
+from reference import flow as twin
+from scipy import ndimage
+from tolerances import DECISIONS, SUM, TRIGONOMETRY, assert_close
+
+from hugin_abflow import flow, pyramid
+from hugin_abflow.opencl import Buffer, Device
+from hugin_abflow.pyramid import Level
+
+GRIDS = {"plane": (77, 53, 0, 0), "cylinder": (78, 53, 1, 0), "odd cylinder": (77, 53, 1, 0)}
+Scene = Callable[[np.ndarray, np.ndarray], np.ndarray]
+
+
+def scene(seed: int, period: float) -> Scene:
+    """A texture of many waves at all scales, brightness 0.05 to 1, defined at any position; columns repeat
+    after `period`."""
+    random = np.random.default_rng(seed)
+    turns = random.integers(-28, 29, 90)
+    down = random.normal(size=90) * 0.35
+    phases = random.random(90) * 2 * np.pi
+    strength = 1 / (0.1 + np.hypot(turns * 2 * np.pi / period, down))
+
+    def brightness(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+        total = np.zeros(np.broadcast(x, y).shape)
+        for turn, v, phase, a in zip(turns, down, phases, strength, strict=True):
+            total += a * np.sin(2 * np.pi * turn / period * x + v * y + phase)
+        return 0.5 + 0.45 * np.tanh(total / (2 * np.sqrt((strength**2).sum() / 2)))
+
+    return brightness
+
+
+def level(device: Device, image: np.ndarray, mask: np.ndarray | None = None, wraps: bool = False) -> Level:
+    mask = np.ones_like(image) if mask is None else mask
+    return Level(
+        device.upload((image * mask).astype(np.float32)), device.upload(mask.astype(np.float32)), wraps
+    )
+
+
+def log(brightness: np.ndarray) -> np.ndarray:
+    return np.log(brightness + 0.05)
+
+
+WIDTH, HEIGHT = 203, 117
+
+
+def shifted(
+    seed: int, by: tuple[float, float], width: int = WIDTH, wraps: bool = False
+) -> tuple[np.ndarray, np.ndarray]:
+    """Brightness of a, and of b in which everything is moved by `by`."""
+    view = scene(seed, float(width) if wraps else 211.0)
+    x, y = common.pixels(width, HEIGHT)
+    return view(x + 0.5, y + 0.5), view(x + 0.5 - by[0], y + 0.5 - by[1])
+
+
+def found(device: Device, a: Level, b: Level) -> tuple[np.ndarray, np.ndarray]:
+    forward, backward = flow.pair_flow(device, a, b)
+    return forward.get().astype(np.float64), backward.get().astype(np.float64)
+
+
+# --- synthetic truth
+
+
+@pytest.mark.parametrize("wraps", [False, True])
+def test_no_motion_is_exactly_zero(device: Device, wraps: bool) -> None:
+    """Also with a ragged mask, if both have it."""
+    a, _ = shifted(0, (0, 0), 256)
+    for mask in (None, patches(1, 256, HEIGHT, 0.8, 20)):
+        same = level(device, log(a), mask, wraps)
+        for field in found(device, same, same):
+            assert not field.any()
+
+
+@pytest.mark.parametrize("by", [(7, 0), (-7, 0), (0, 7), (0, -7), (7, -7)])
+def test_a_layer_moved_by_seven_pixels_gives_seven(device: Device, by: tuple[int, int]) -> None:
+    """Everywhere, also at the border beyond which b shows nothing of what a does."""
+    a, b = shifted(2, by)
+    forward, backward = found(device, level(device, log(a)), level(device, log(b)))
+    off = np.linalg.norm(forward - by, axis=-1), np.linalg.norm(backward + by, axis=-1)
+    for error in off:
+        assert np.median(error) < 0.02
+        assert np.quantile(error, 0.97) < 0.08
+        assert error.max() < 0.3
+
+
+@pytest.mark.parametrize("by", [(0.25, 0), (0, -0.5), (1.7, 0.4), (-3.3, 2.6)])
+def test_parts_of_a_pixel_are_found(device: Device, by: tuple[float, float]) -> None:
+    a, b = shifted(3, by)
+    forward, backward = found(device, level(device, log(a)), level(device, log(b)))
+    for error in (np.linalg.norm(forward - by, axis=-1), np.linalg.norm(backward + by, axis=-1)):
+        assert np.median(error) < 0.04
+        assert np.quantile(error, 0.97) < 0.12
+        assert error.max() < 0.4
+
+
+@pytest.mark.parametrize("by", [(7, 0), (-5.5, 2)])
+def test_motion_across_the_border_of_a_cylinder(device: Device, by: tuple[float, float]) -> None:
+    """No column is worse than another, and turning the cylinder turns the flow."""
+    a, b = shifted(4, by, 256, wraps=True)
+    forward, _ = found(device, level(device, log(a), None, True), level(device, log(b), None, True))
+    error = np.linalg.norm(forward - by, axis=-1)[16:-16]
+    assert error.max() < 0.3
+    assert error[:, [0, 1, 2, -3, -2, -1]].max() < 0.3
+    turned = [level(device, log(np.roll(v, 64, 1)), None, True) for v in (a, b)]
+    again, _ = found(device, *turned)
+    assert np.allclose(np.roll(forward, 64, 1), again, atol=1e-4)
+
+
+@pytest.mark.parametrize(("gain", "offset"), [(2.0, 0.0), (0.5, 0.0), (1.0, 0.03)])
+def test_exposure_hardly_changes_flow(device: Device, gain: float, offset: float) -> None:
+    """One stop more or less, or some haze."""
+    a, b = shifted(5, (4.5, -2))
+    forward, backward = found(device, level(device, log(a)), level(device, log(gain * b + offset)))
+    for field, way in ((forward, (4.5, -2)), (backward, (-4.5, 2))):
+        error = np.linalg.norm(field - way, axis=-1)[8:-8, 8:-8]
+        assert np.median(error) < 0.06
+        assert np.quantile(error, 0.97) < 0.15
+        assert error.max() < 0.4
+
+
+def test_vignetting_hardly_changes_flow(device: Device) -> None:
+    a, b = shifted(6, (3, 2))
+    x, y = common.pixels(WIDTH, HEIGHT)
+    falling = 1 - 0.6 * ((x / WIDTH - 0.5) ** 2 + (y / HEIGHT - 0.5) ** 2) / 0.5
+    forward, _ = found(
+        device, level(device, log(a * falling)), level(device, log(b * falling[:, ::-1] ** 0.3))
+    )
+    error = np.linalg.norm(forward - (3, 2), axis=-1)[8:-8, 8:-8]
+    assert np.median(error) < 0.1
+    assert (error < 0.5).mean() > 0.95
+
+
+def test_flow_goes_on_smoothly_beyond_the_mask(device: Device) -> None:
+    """Known in the middle only: outside it is continued, without a step at the mask's rim."""
+    by = (5.0, -3.0)
+    a, b = shifted(7, by)
+    x, y = common.pixels(WIDTH, HEIGHT)
+    mask = (np.hypot((x - 100) / 1.6, y - 58) < 40).astype(np.float64)
+    forward, backward = found(device, level(device, log(a), mask), level(device, log(b), mask))
+    inner = ndimage.binary_erosion(mask, iterations=8)
+    for field, way in ((forward, by), (backward, (-by[0], -by[1]))):
+        error = np.linalg.norm(field - way, axis=-1)
+        assert np.median(error[inner]) < 0.05
+        assert error[mask == 0].max() < 2
+        steps = [np.linalg.norm(np.diff(field, axis=i), axis=-1) for i in (0, 1)]
+        assert max(step.max() for step in steps) < 0.6
+
+
+def test_ragged_masks_do_not_show_in_flow(device: Device) -> None:
+    """Each image has holes of its own; black in them would pull the flow towards their rims."""
+    a, b = (log(v) for v in shifted(8, (3, 1)))
+    masks = patches(9, WIDTH, HEIGHT, 0.8, 25), patches(10, WIDTH, HEIGHT, 0.8, 25)
+    forward, _ = found(device, level(device, a, masks[0]), level(device, b, masks[1]))
+    both = masks[0] * ndimage.shift(masks[1], (-1, -3), order=0) > 0
+    error = np.linalg.norm(forward - (3, 1), axis=-1)
+    assert 0.4 < both.mean() < 0.8
+    assert np.median(error[both]) < 0.05
+    assert np.quantile(error[ndimage.binary_erosion(both, iterations=2)], 0.97) < 0.3
+
+
+def test_forward_and_backward_are_inverse(device: Device) -> None:
+    """F_ab(q) + F_ba(q + F_ab(q)) is nothing, for a motion that changes from place to place."""
+    view = scene(10, 211.0)
+    x, y = common.pixels(WIDTH, HEIGHT)
+    x, y = x + 0.5, y + 0.5
+    dx, dy = 4 + 2 * np.sin(y / 30), 2 * np.cos(x / 40)
+    a, b = log(view(x + dx, y + dy)), log(view(x, y))  # what a shows at q, b shows at q + (dx, dy)
+    forward, backward = found(device, level(device, a), level(device, b))
+    error = np.linalg.norm(forward - np.stack([dx, dy], -1), axis=-1)[8:-8, 8:-8]
+    assert np.median(error) < 0.08
+    assert np.quantile(error, 0.97) < 0.3
+    there = [x - 0.5 + forward[..., 0], y - 0.5 + forward[..., 1]]
+    back = np.stack(
+        [ndimage.map_coordinates(backward[..., i], there[::-1], order=1, mode="nearest") for i in (0, 1)], -1
+    )
+    closed = np.linalg.norm(forward + back, axis=-1)[8:-8, 8:-8]
+    assert np.median(closed) < 0.1
+    assert np.quantile(closed, 0.97) < 0.3
+
+
+def test_what_moved_alone_has_its_own_motion(device: Device) -> None:
+    """A patch that moves against the rest: both motions are found, a few pixels from its edge."""
+    back, front = scene(11, 211.0), scene(12, 211.0)
+    x, y = common.pixels(WIDTH, HEIGHT)
+    x, y = x + 0.5, y + 0.5
+
+    def inside(u: np.ndarray, v: np.ndarray) -> np.ndarray:
+        return (np.abs(u - 100) < 35) & (np.abs(v - 58) < 30)
+
+    a = np.where(inside(x, y), front(x, y), back(x, y))
+    b = np.where(inside(x - 4, y), front(x - 4, y), back(x + 2, y))
+    forward, _ = found(device, level(device, log(a)), level(device, log(b)))
+    patch = inside(x, y)
+    core, rest = ndimage.binary_erosion(patch, iterations=6), ndimage.binary_erosion(~patch, iterations=10)
+    assert (np.linalg.norm(forward - (4, 0), axis=-1)[core] < 0.5).mean() > 0.9
+    assert (np.linalg.norm(forward - (-2, 0), axis=-1)[rest] < 0.5).mean() > 0.9
+
+
+# --- kernels and twins
+
+
+def run_expand(device: Device, coarse: np.ndarray, wraps: int, size: tuple[int, int]) -> np.ndarray:
+    height, width = coarse.shape[:2]
+    fine = device.empty((size[1], size[0], 2))
+    grid = (width, height, wraps, 0)
+    device.run("flow", "flow_expand", size, device.upload(coarse.astype(np.float32)), grid, fine, size)
+    return fine.get()
+
+
+@pytest.mark.parametrize("wraps", [0, 1])
+def test_linear_flow_is_reproduced_by_expanding(device: Device, wraps: int) -> None:
+    """Coarse position = fine position / 2, and flow doubles: within 1e-3 px, odd sizes too."""
+    size = (77, 53)
+    v, u = 2 * (np.mgrid[0:27, 0:39] + 0.5)
+    y, x = np.mgrid[0:53, 0:77] + 0.5
+    coarse = np.stack([0.3 * u - 0.1 * v + 2, 0.05 * u + 0.2 * v - 7], -1) / 2
+    expected = np.stack([0.3 * x - 0.1 * y + 2, 0.05 * x + 0.2 * y - 7], -1)
+    fine = run_expand(device, coarse, wraps, size)
+    assert np.abs(fine - expected)[1:-1, 1:-1].max() < 1e-3
+    assert_close(fine, twin.flow_expand(coarse, (39, 27, wraps, 0), size), SUM, scale=30)
+
+
+def test_twin_of_expand_is_scipys() -> None:
+    coarse = np.random.default_rng(13).normal(size=(27, 39, 2))
+    y, x = (np.mgrid[0:53, 0:77] + 0.5) / 2 - 0.5
+    for i in (0, 1):
+        expected = 2 * ndimage.map_coordinates(coarse[..., i], [y, x], order=1, mode="nearest")
+        assert np.allclose(twin.flow_expand(coarse, (39, 27, 0, 0), (77, 53))[..., i], expected)
+
+
+def smooth_noise(seed: int, grid: tuple[int, int, int, int], channels: int, sigma: float) -> np.ndarray:
+    random = np.random.default_rng(seed)
+    values = random.normal(size=(grid[1], grid[0], channels))
+    values = ndimage.gaussian_filter(values, (sigma, sigma, 0), mode=["nearest", "wrap", "nearest"])
+    return (values / np.abs(values).max()).astype(np.float32)
+
+
+def make_feature(seed: int, grid: tuple[int, int, int, int], share: float = 0.85) -> np.ndarray:
+    """A feature with a ragged mask; its slopes are not those of its first channel."""
+    feature = smooth_noise(seed, grid, 4, 1.5)
+    feature[..., 3] = 1
+    return feature * patches(seed + 1, grid[0], grid[1], share, 7)[..., None]
+
+
+def run(device: Device, name: str, grid: tuple[int, int, int, int], *arguments: object, shapes: list[int]):
+    """Outputs of a kernel over the grid; arrays among the arguments are uploaded."""
+    outputs = [device.empty((grid[1], grid[0], n)) for n in shapes]
+    sent = [device.upload(a.astype(np.float32)) if isinstance(a, np.ndarray) else a for a in arguments]
+    device.run("flow", name, grid[:2], *sent, *outputs)
+    return [one.get() for one in outputs]
+
+
+@pytest.mark.parametrize("name", list(GRIDS))
+def test_feature_equals_its_twin(device: Device, name: str) -> None:
+    grid = GRIDS[name]
+    mask = patches(14, grid[0], grid[1], 0.7)
+    image = smooth_noise(15, grid, 1, 1)[..., 0] * mask
+    small = pyramid.reduce(device, level(device, image, mask, bool(grid[2])))
+    mean = pyramid.smooth(device, small, 3.0)
+    feature = device.empty((grid[1], grid[0], 4))
+    device.run(
+        "flow", "flow_feature", grid[:2], device.upload(image), device.upload(mask), grid,
+        mean.image, mean.mask, mean.grid, feature,
+    )  # fmt: skip
+    expected = twin.flow_feature(image, mask, grid, mean.image.get(), mean.mask.get(), mean.grid)
+    assert_close(feature.get(), expected, SUM)
+
+
+def test_twin_of_feature_is_numpys_gradient() -> None:
+    """With a whole mask, one-sided at the border; the mean is interpolated as SciPy does."""
+    image = smooth_noise(16, (77, 53, 0, 0), 1, 1)[..., 0].astype(np.float64)
+    mean = np.random.default_rng(17).normal(size=(27, 39))
+    feature = twin.flow_feature(
+        image, np.ones((53, 77)), (77, 53, 0, 0), mean, np.ones((27, 39)), (39, 27, 0, 0)
+    )
+    down, across = np.gradient(image)
+    y, x = (np.mgrid[0:53, 0:77] + 0.5) / 2 - 0.5
+    assert np.allclose(feature[..., 1], across)
+    assert np.allclose(feature[..., 2], down)
+    assert np.allclose(
+        feature[..., 0], image - ndimage.map_coordinates(mean, [y, x], order=1, mode="nearest")
+    )
+
+
+@pytest.mark.parametrize("name", list(GRIDS))
+def test_warp_equals_its_twin(device: Device, name: str) -> None:
+    grid = GRIDS[name]
+    feature, moved = make_feature(18, grid), 9 * smooth_noise(19, grid, 2, 4)
+    moved[:9] = np.rint(moved[:9])
+    (kernel,) = run(device, "flow_warp", grid, feature, moved, grid, shapes=[4])
+    expected = twin.flow_warp(feature, moved, grid)
+    assert 0.2 < expected[..., 3].mean() < 0.9
+    assert_close(kernel, expected, 1e-5, DECISIONS)
+
+
+def test_twin_of_warp_is_scipys() -> None:
+    grid = GRIDS["plane"]
+    feature, moved = make_feature(20, grid, 1.0), 3 * smooth_noise(21, grid, 2, 4)
+    y, x = np.mgrid[0:53, 0:77]
+    there = [y + moved[..., 1], x + moved[..., 0]]
+    warped = twin.flow_warp(feature, moved, grid)
+    inside = (there[0] > 0) & (there[0] < 52) & (there[1] > 0) & (there[1] < 76)
+    assert np.array_equal(warped[..., 3][inside] > 0, np.ones(inside.sum(), bool))
+    for i in range(3):
+        expected = ndimage.map_coordinates(feature[..., i].astype(np.float64), there, order=1)
+        assert np.allclose(warped[..., i][inside], expected[inside], atol=1e-7)
+
+
+@pytest.mark.parametrize("name", list(GRIDS))
+def test_tensor_and_window_equal_their_twins(device: Device, name: str) -> None:
+    grid = GRIDS[name]
+    a, b = make_feature(22, grid), make_feature(24, grid)
+    kernel = run(device, "flow_tensor", grid, a, b, grid, 5.0, 10.0, 0.01, shapes=[4, 2])
+    expected = twin.flow_tensor(a, b, grid, 5.0, 10.0, 0.01)
+    assert 0.3 < expected[0][..., 3].mean() < 0.9
+    for one, other in zip(kernel, expected, strict=True):
+        # sums of squares of slopes with both signs: rounding is relative to the largest
+        assert_close(one, other, TRIGONOMETRY, scale=float(np.abs(other).max()) / 10)
+    window = run(device, "flow_window", grid, *expected, grid, shapes=[4, 2])
+    for one, other in zip(window, twin.flow_window(*expected, grid), strict=True):
+        assert_close(one, other, SUM, scale=float(np.abs(other).max()))
+
+
+def test_twin_of_tensor_is_the_energys_curvature() -> None:
+    """E(u) = sum of weighted squared constraints is a parabola: J and b from its values at six places."""
+    grid = GRIDS["plane"]
+    a, b = make_feature(26, grid), make_feature(28, grid)
+    found = twin.constraints(a, b, grid, 5.0, 10.0, 0.01)
+
+    def energy(u: float, v: float) -> np.ndarray:
+        return sum(w * (d[..., 0] * u + d[..., 1] * v + t) ** 2 for w, d, t in found)
+
+    tensor, right = twin.flow_tensor(a, b, grid, 5.0, 10.0, 0.01)
+    flat = energy(0, 0)
+    scale = np.abs(tensor).max()
+    assert np.allclose((energy(1, 0) + energy(-1, 0)) / 2 - flat, tensor[..., 0], atol=1e-9 * scale)
+    assert np.allclose((energy(0, 1) + energy(0, -1)) / 2 - flat, tensor[..., 2], atol=1e-9 * scale)
+    assert np.allclose(
+        (energy(1, 1) - energy(1, -1)) / 2 - 2 * right[..., 1], 2 * tensor[..., 1], atol=1e-8 * scale
+    )
+    assert np.allclose((energy(1, 0) - energy(-1, 0)) / 4, right[..., 0], atol=1e-9 * scale)
+    # one pixel of the brightness term by hand: normalised by its slope, penalised like |t|
+    y, x = np.argwhere((a[..., 3] > 0) & (b[..., 3] > 0))[100]
+    slope = (a[y, x, 1:3] + b[y, x, 1:3]).astype(np.float64) / 2
+    t, n = float(b[y, x, 0]) - float(a[y, x, 0]), 1 / (slope @ slope + 1e-4)
+    assert found[0][0][y, x] == pytest.approx(5 * n / np.sqrt(t * t * n + 1e-6))
+
+
+@pytest.mark.parametrize("wraps", [0, 1])
+def test_twin_of_window_is_scipys(wraps: int) -> None:
+    grid = (77, 53, wraps, 0)
+    values = np.random.default_rng(30).normal(size=(53, 77, 4))
+    taps = np.outer([1, 2, 1], [1, 2, 1]) / 16
+    window, right = twin.flow_window(values, values[..., :2], grid)
+    for i in range(4):
+        wide = np.pad(values[..., i], ((1, 1), (0, 0)))
+        wide = np.pad(wide, ((0, 0), (1, 1)), mode="wrap" if wraps else "constant")
+        assert np.allclose(window[..., i], ndimage.convolve(wide, taps)[1:-1, 1:-1])
+    assert np.array_equal(right, window[..., :2])
+
+
+def system_of(grid: tuple[int, int, int, int], seed: int) -> tuple[np.ndarray, ...]:
+    """tensor, right, base, flow, feature: a positive definite system, empty where nothing is known."""
+    a, b = make_feature(seed, grid, 0.7), make_feature(seed + 2, grid, 0.7)
+    tensor, right = twin.flow_window(*twin.flow_tensor(a, b, grid, 5.0, 10.0, 0.05), grid)
+    scale = np.abs(tensor).max()
+    return (
+        tensor / scale,
+        right / scale,
+        smooth_noise(seed + 4, grid, 2, 3),
+        smooth_noise(seed + 5, grid, 2, 3),
+        a,
+    )
+
+
+@pytest.mark.parametrize("name", list(GRIDS))
+def test_system_equals_its_twin(device: Device, name: str) -> None:
+    grid = GRIDS[name]
+    parts = [part.astype(np.float32) for part in system_of(grid, 31)]
+    kernel = run(device, "flow_system", grid, *parts, grid, 12.0, 0.3, shapes=[4, 4])
+    for one, other in zip(kernel, twin.flow_system(*parts, grid, 12.0, 0.3), strict=True):
+        assert_close(one, other, TRIGONOMETRY, scale=10)
+
+
+def test_twin_of_system_by_hand() -> None:
+    """Smoothness towards the east neighbour: less across a contrast, total variation of the flow."""
+    grid = GRIDS["plane"]
+    tensor, right, base, moved, feature = system_of(grid, 37)
+    left_side, right_side = twin.flow_system(tensor, right, base, moved, feature, grid, 12.0, 0.3)
+    for y, x in ((10, 20), (30, 50), (52, 3)):
+        step = float(((moved[y, x].astype(float) - moved[y, x + 1]) ** 2).sum())
+        both = feature[y, x, 3] * feature[y, x + 1, 3]
+        contrast = abs(float(feature[y, x, 0]) - float(feature[y, x + 1, 0])) / 0.3 * both
+        assert left_side[y, x, 3] == pytest.approx(12 * np.exp(-contrast) / np.sqrt(step + 1e-4))
+    assert not left_side[:, -1, 3].any()
+    assert not right_side[-1, :, 2].any()
+    j = tensor[10, 20]
+    matrix = np.array([[j[0], j[1]], [j[1], j[2]]])
+    assert np.allclose(right_side[10, 20, :2], matrix @ base[10, 20] - right[10, 20])
+
+
+def dense_solution(left_side: np.ndarray, right_side: np.ndarray, wraps: bool) -> np.ndarray:
+    """The flow that solves the system: (J + graph Laplacian of the smoothness) flow = b."""
+    height, width = left_side.shape[:2]
+    index = np.arange(height * width).reshape(height, width)
+    matrix = np.zeros((2 * index.size, 2 * index.size))
+    for y, x in np.ndindex(height, width):
+        at = index[y, x]
+        j = left_side[y, x]
+        matrix[2 * at : 2 * at + 2, 2 * at : 2 * at + 2] += [[j[0], j[1]], [j[1], j[2]]]
+        for ty, tx, weight in ((y, x + 1, j[3]), (y + 1, x, right_side[y, x, 2])):
+            if ty == height or (tx == width and not wraps):
+                continue
+            to = index[ty, tx % width]
+            for i in (0, 1):
+                matrix[2 * at + i, 2 * at + i] += weight
+                matrix[2 * to + i, 2 * to + i] += weight
+                matrix[2 * at + i, 2 * to + i] -= weight
+                matrix[2 * to + i, 2 * at + i] -= weight
+    return np.linalg.solve(matrix, right_side[..., :2].ravel()).reshape(height, width, 2)
+
+
+@pytest.mark.parametrize("wraps", [0, 1])
+def test_relaxation_solves_the_system(device: Device, wraps: int) -> None:
+    """Twin and kernel, iterated, come to the solution of dense algebra."""
+    grid = (18, 13, wraps, 0)
+    tensor, right, base, moved, feature = system_of(grid, 43)
+    sides = twin.flow_system(tensor, right, base, moved, feature, grid, 0.02, 0.3)
+    expected = dense_solution(*sides, bool(wraps))
+    iterated, kernel = moved.astype(np.float64), device.upload(moved)
+    buffers = [device.upload(side.astype(np.float32)) for side in sides]
+    for _ in range(300):
+        for colour in (0, 1):
+            iterated = twin.flow_relax(*sides, grid, colour, 1.8, iterated)
+            device.run("flow", "flow_relax", (9, 13), *buffers, grid, colour, 1.8, kernel)
+    assert np.abs(expected).max() > 0.05
+    assert np.allclose(iterated, expected, atol=1e-9)
+    assert np.allclose(kernel.get(), expected, atol=1e-4)
+
+
+@pytest.mark.parametrize("name", ["plane", "cylinder"])
+@pytest.mark.parametrize("colour", [0, 1])
+def test_relax_equals_its_twin(device: Device, name: str, colour: int) -> None:
+    grid = GRIDS[name]
+    tensor, right, base, moved, feature = system_of(grid, 49)
+    sides = [
+        s.astype(np.float32) for s in twin.flow_system(tensor, right, base, moved, feature, grid, 1.0, 0.3)
+    ]
+    result: Buffer = device.upload(moved)
+    size = ((grid[0] + 1) // 2, grid[1])
+    device.run("flow", "flow_relax", size, *map(device.upload, sides), grid, colour, 1.85, result)
+    expected = twin.flow_relax(*sides, grid, colour, 1.85, moved)
+    x, y = common.pixels(grid[0], grid[1])
+    assert np.array_equal(result.get()[(x + y) % 2 != colour], moved[(x + y) % 2 != colour])
+    assert_close(result.get(), expected, TRIGONOMETRY)
+
+
+@pytest.mark.parametrize("name", list(GRIDS))
+def test_median_is_scipys(device: Device, name: str) -> None:
+    """Kernel and twin; rows beyond the border are the pixel itself, which SciPy cannot do."""
+    grid = GRIDS[name]
+    moved = np.random.default_rng(55).normal(size=(53, grid[0], 2)).astype(np.float32)
+    (kernel,) = run(device, "flow_median", grid, moved, grid, shapes=[2])
+    expected = twin.flow_median(moved, grid)
+    for i in (0, 1):
+        median = ndimage.median_filter(moved[..., i], 3, mode="wrap")
+        columns = slice(None) if grid[2] else slice(1, -1)
+        assert np.array_equal(expected[1:-1, columns, i], median[1:-1, columns])
+    own = moved[0, 5]
+    corner = np.concatenate([moved[:2, 4:7].reshape(-1, 2), [own] * 3])
+    assert np.array_equal(expected[0, 5], np.median(corner, 0).astype(np.float32))
+    assert np.array_equal(kernel, expected)
