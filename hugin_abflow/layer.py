@@ -109,8 +109,14 @@ class Layer:
     def from_array(
         cls, name: str, pixels: npt.NDArray[Any], left: int = 0, top: int = 0, icc: bytes | None = None
     ) -> Layer:
-        """A layer from pixels in memory: (height, width, 2 or 4), alpha last."""
+        """A layer from pixels in memory: (height, width, 2 or 4), alpha last.
+
+        Pixels with NaN or infinity are invalid, as in files.
+        """
         height, width, samples = pixels.shape
         stored = np.ascontiguousarray(pixels)
+        if stored.dtype.kind == "f":
+            finite = np.isfinite(stored).all(axis=2, keepdims=True)
+            stored = stored if finite.all() else np.where(finite, stored, stored.dtype.type(0))
         box = Box(left, top, left + width, top + height)
         return cls(name, box, stored.dtype, samples - 1, lambda first, last: stored[first:last], icc)

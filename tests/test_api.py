@@ -158,6 +158,20 @@ def test_merge_layers_gives_pixels_in_the_layers_depth(dtype):
     assert recorder.done == recorder.totals
 
 
+@pytest.mark.parametrize("dtype", [np.float16, np.float32])
+def test_nan_and_infinity_in_memory_are_invalid_pixels(dtype):
+    """As in files: another layer shows there, or nothing; none of it spreads."""
+    picture = noise(HEIGHT, WIDTH, dtype)
+    left, right = (layer.read(0, layer.box.height).copy() for layer in layers_of(picture))
+    left[30:33, 100:103, 0] = np.nan  # both layers are here
+    left[50, 60, 1], left[51, 61, 3] = np.inf, np.nan  # only this one is
+    layers = [Layer.from_array("left", left), Layer.from_array("right", right)]
+    result = merge_layers(layers, Canvas.sphere(WIDTH, HEIGHT), Settings(exposure=False))
+    picture[50, 60] = picture[51, 61] = 0
+    np.testing.assert_array_equal(result, picture)
+    assert np.isnan(left).sum() == 10  # what came in is not changed
+
+
 def test_layers_are_read_only(folder):
     """Neither files nor arrays that come in are changed."""
     picture, second = noise(HEIGHT, WIDTH), noise(HEIGHT, WIDTH, seed=1)
