@@ -235,6 +235,16 @@ def test_resizing_a_sphere_keeps_its_edges() -> None:
     assert grid_over(full.region, 77, 53).circumference == 77
 
 
+@pytest.mark.parametrize("small", [(100, 60), (31, 17)])
+def test_the_circumference_is_the_canvass_whatever_layers_cover(small: tuple[int, int]) -> None:
+    """Flow's share of the canvas's width must not depend on how much of the canvas is used."""
+    layers = boxes((40, 20, 140, 80))
+    flat = working.full_grid(Canvas.plane(500, 300), layers).resized(*small)
+    assert flat.circumference == pytest.approx(500 * small[0] / 100)
+    part = working.full_grid(Canvas.sphere(500, 300, 120.0), layers).resized(*small)
+    assert part.circumference == pytest.approx(math.radians(120))
+
+
 def test_half_is_read_as_float(device: Device) -> None:
     pixels = random_pixels(8, 33, 21, np.float16, 3, 0)
     layer = Layer.from_array("half", pixels)
