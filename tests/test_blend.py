@@ -222,6 +222,21 @@ def test_bands_of_any_height_give_the_same(device: Device, name: str, dtype: typ
         assert np.array_equal(merged(device, layers, full, grid, rows=rows), whole), rows
 
 
+def test_a_band_sees_the_next_rows_displacements(device: Device) -> None:
+    """Only one working row moves, far; rows of the picture beside it move by a share of that."""
+    full = plane(60, 120)
+    grid = full.resized(20, 40)
+    pixels = stored_pixels(22, 60, 120, np.uint8, 3, 1)
+    field = np.zeros((40, 20, 4), np.float32)
+    field[..., 3] = 1
+    field[17, :, 1], field[22, :, 1] = 9, -9
+    layer = blend_layer(device, pixels, 0, 0, full, grid, field)
+    whole = merged(device, [layer, layer], full, grid)
+    assert not np.array_equal(whole, pixels)
+    for rows in (1, 2, 3):
+        assert np.array_equal(merged(device, [layer, layer], full, grid, rows=rows), whole)
+
+
 def test_a_band_reads_only_rows_that_it_needs(device: Device) -> None:
     """Memory grows with the band, not with the picture."""
     full = plane(77, 300)
@@ -304,6 +319,29 @@ def test_a_whole_pixels_displacement_copies(device: Device, shift: tuple[int, in
     columns, rows = common.pixels(78, 54)
     x, y, inside = common.grid_border(columns + shift[0], rows + shift[1], full.border)
     assert np.array_equal(out[inside], pixels[y[inside], x[inside]])
+
+
+@pytest.mark.parametrize("size", [(47, 29), (31, 17), (77, 53)])
+def test_linear_flow_is_carried_to_full_resolution(device: Device, size: tuple[int, int]) -> None:
+    """By factors that divide nothing, x and y apart, within 1e-3 px: seen on a picture of positions."""
+    full = plane()
+    grid = full.resized(*size)
+    scale = 77 / size[0], 53 / size[1]
+    x, y = (places + 0.5 for places in common.pixels(77, 53))
+    picture = np.stack([x, y, x - y, np.ones_like(x)], -1).astype(np.float32)
+    columns, rows = ((places + 0.5) * s for places, s in zip(common.pixels(*size), scale, strict=True))
+
+    def way(u: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        return 0.05 * u - 0.03 * v + 1.5, 0.02 * u + 0.04 * v - 2
+
+    across, down = way(columns, rows)
+    field = np.zeros((*grid.shape, 4), np.float32)
+    field[..., 0], field[..., 1], field[..., 3] = across / scale[0], down / scale[1], 1
+    layer = blend_layer(device, picture, 0, 0, full, grid, field)
+    out = merged(device, [layer, layer], full, grid)
+    moved = out[..., 0] - x, out[..., 1] - y
+    for found, expected in zip(moved, way(x, y), strict=True):
+        assert np.abs(found - expected)[8:-8, 8:-12].max() < 1e-3
 
 
 def test_dark_gains_do_not_lift_noise_and_none_is_exact(device: Device) -> None:

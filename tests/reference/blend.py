@@ -12,6 +12,7 @@ from reference.common import (
     canvas_point,
     canvas_position,
     catmull_rom,
+    exposure_shift,
     four_taps,
     grid_border,
     pixels,
@@ -83,9 +84,8 @@ def position(x: Array, y: Array, displacement: Array, scale: Numbers, lens: Numb
 
 
 def correct(colour: Array, gain: Array, white: float) -> Array:
-    """Colour times exp(gain), on a floor of 2 % of full scale."""
-    dark = 0.02 * white
-    return np.where(gain == 0, colour, (colour + dark) * np.exp(gain) - dark)
+    """Colour in stored units with its exposure corrected; integer samples are told by their full scale."""
+    return np.where(gain == 0, colour, exposure_shift(colour / white, gain, int(white > 1)) * white)
 
 
 def blend_add(

@@ -112,6 +112,25 @@ def chart_position(point: Array, chart: Numbers) -> tuple[Array, Array]:
     return lon * t[9] + t[11], t[12] - lat * t[10]
 
 
+EXPOSURE_FLOOR = 0.02
+
+
+def exposure_scale(c: Array, integer: int) -> Array:
+    """Log, or log odds for integer images, of colours in 0..1 of full scale, on a floor."""
+    low = np.log(np.maximum(c, 0) + EXPOSURE_FLOOR)
+    return low - np.log(np.maximum(1 - c, 0) + EXPOSURE_FLOOR) if integer else low
+
+
+def exposure_shift(c: Array, gain: Array, integer: int) -> Array:
+    """Colours moved by `gain` on that scale."""
+    low = (c + EXPOSURE_FLOOR) * np.exp(gain)
+    if not integer:
+        return np.where(gain == 0, c, low - EXPOSURE_FLOOR)
+    high = np.maximum(1 - c + EXPOSURE_FLOOR, EXPOSURE_FLOOR)
+    share = low / (low + high)  # of the way from -floor to 1 + floor
+    return np.where(gain == 0, c, share * (1 + 2 * EXPOSURE_FLOOR) - EXPOSURE_FLOOR)
+
+
 def pixels(width: int, height: int, left: int = 0, top: int = 0) -> tuple[Array, Array]:
     """Columns and rows of all pixels of a box, each (height, width)."""
     rows, columns = np.mgrid[top : top + height, left : left + width]
