@@ -25,13 +25,11 @@ from hugin_abflow.working import Grid, WorkingLayer
 
 # Working pixels per cell of the colour grid.
 _CELL = 16
-# Brightness added before logarithms, as in kernels/blend.cl: gains of near-black pixels mean nothing.
-_FLOOR = 0.02
 _CLIPPED = 0.98
-_SPREAD = 0.15
+_SPREAD = 0.3
 # Rounds of (weight of the measured differences against smoothness, residual that halves a cell's trust). The
 # first round fits the trend; what lies far from it is no exposure but something that only one layer shows.
-_ROUNDS = ((0.1, 0.5), (1.0, 0.3), (30.0, 0.3))
+_ROUNDS = ((0.1, 1.5), (1.0, 1.0), (100.0, 0.8))
 # The correction fades out over this share of the canvas's width.
 _FADE = 0.12
 # Gains below this (a quarter of an 8-bit level at full scale) are taken to exactly 0.
@@ -69,7 +67,7 @@ def correction(
     cells = colour_grid(grid)
     if not settings.exposure:
         return Correction(cells, (None,) * len(layers))
-    floating = layers[0].layer.dtype.kind == "f"
+    integer = layers[0].layer.dtype.kind == "u"
     measured = []
     for pair in pairs:
         difference = device.empty((*cells.shape, 4))
@@ -77,7 +75,8 @@ def correction(
         device.run(
             "colour", "colour_difference", cells.border[:2],
             a.pixels, fields[pair.a], a.box, b.pixels, fields[pair.b], b.box,
-            grid.border, grid.lens, cells.border, _FLOOR, 1e30 if floating else _CLIPPED, _SPREAD, difference,
+            grid.border, grid.lens, cells.border, int(integer), _CLIPPED if integer else 1e30, _SPREAD,
+            difference,
         )  # fmt: skip
         measured.append((pair.a, pair.b, difference.get().astype(np.float64)))
     if not any(np.any(d[..., :3] * d[..., 3:]) for _, _, d in measured):
@@ -116,7 +115,7 @@ def solve(
         east[:, :, -1] = 0
     south = np.zeros(inside.shape)
     south[:, :-1] = (inside[:, :-1] & inside[:, 1:]) * np.sqrt(area[:-1] * area[1:])
-    fade = max(1.0, _FADE * (cells.width if not cells.lens[1] else 2 * np.pi / cells.lens[1]))
+    fade = max(1.0, _FADE * cells.circumference / (cells.lens[1] or 1.0))  # cells
     hold = inside * area / fade**2
     solution = np.zeros((*inside.shape, 3))
     for data, residual in _ROUNDS:

@@ -20,7 +20,7 @@ class FlowParameters:
 
     coarsest: int = 12  # px: the shorter side of the coarsest level
     warps: tuple[int, ...] = (2, 5)  # linearisations per level, finest first; the last holds for all coarser
-    sweeps: int = 12  # red-black sweeps per linearisation
+    sweeps: tuple[int, ...] = (12, 12, 24, 48)  # red-black sweeps per linearisation, likewise
     relaxation: float = 1.85  # of successive over-relaxation
     brightness: float = 5.0  # weight of brightness constancy
     gradient: float = 10.0  # weight of gradient constancy
@@ -48,7 +48,7 @@ def _features(device: Device, level: Level, coarser: Level, parameters: FlowPara
 
 
 def _refine(
-    device: Device, a: _Features, b: _Features, flow: Buffer, warps: int, parameters: FlowParameters
+    device: Device, a: _Features, b: _Features, flow: Buffer, level: int, parameters: FlowParameters
 ) -> Buffer:
     """Improve `flow` from a to b on one level."""
     grid, size = a.grid, a.grid[:2]
@@ -57,6 +57,9 @@ def _refine(
     right, base = (device.empty((*shape, 2)) for _ in range(2))
     system_left, system_right = (device.empty((*shape, 4)) for _ in range(2))
     window_right = device.empty((*shape, 2))
+    warps, sweeps = (
+        per_level[min(level, len(per_level) - 1)] for per_level in (parameters.warps, parameters.sweeps)
+    )
     for _ in range(warps):
         device.run("flow", "flow_warp", size, b.feature, flow, grid, warped)
         device.run(
@@ -69,7 +72,7 @@ def _refine(
             parameters.smoothness, parameters.contrast, system_left, system_right,
         )  # fmt: skip
         half = ((size[0] + 1) // 2, size[1])
-        for _ in range(parameters.sweeps):
+        for _ in range(sweeps):
             for colour in (0, 1):
                 device.run(
                     "flow", "flow_relax", half, system_left, system_right, grid, colour,
@@ -96,13 +99,12 @@ def pair_flow(
     for level in reversed(range(levels)):
         features = [_features(device, p[level], p[level + 1], parameters) for p in pyramids]
         grid = features[0].grid
-        warps = parameters.warps[min(level, len(parameters.warps) - 1)]
         if flows is None:
             flows = [device.zeros((grid[1], grid[0], 2)) for _ in range(2)]
         else:
             flows = [_expand(device, flow, grid) for flow in flows]
         flows = [
-            _refine(device, features[i], features[1 - i], flow, warps, parameters)
+            _refine(device, features[i], features[1 - i], flow, level, parameters)
             for i, flow in enumerate(flows)
         ]
     assert flows is not None

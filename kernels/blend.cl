@@ -2,7 +2,7 @@
    last), WHITE (full scale) and INTEGER (1: round and saturate). Band pixels are canvas pixels; `band` is the
    band's place in the region: left, top, width, height. */
 
-/* Count the layers that cover each pixel. */
+/* How many layers cover each pixel: 0, 1 or 2 for several. */
 __kernel void blend_count(__global const PIXEL *rows, /* (box.w, box.z, SAMPLES) */
                           int4 box, int4 band,        /* place of `rows`; band, run size */
                           __global uchar *count)      /* (band.w, band.z) */
@@ -12,16 +12,16 @@ __kernel void blend_count(__global const PIXEL *rows, /* (box.w, box.z, SAMPLES)
         return;
     const int at = box_index((int2)(x + band.x, y + band.y), box);
     if (at >= 0 && (float)rows[(size_t)at * SAMPLES + SAMPLES - 1] >= 0.5f * WHITE)
-        count[y * band.z + x] += 1;
+        count[y * band.z + x] = min(count[y * band.z + x] + 1, 2); /* one or several is all that matters */
 }
 
-inline float4 blend_pixel(__global const PIXEL *rows, int at) {
+static inline float4 blend_pixel(__global const PIXEL *rows, int at) {
     __global const PIXEL *p = rows + (size_t)at * SAMPLES;
     const float valid = (float)p[SAMPLES - 1] >= 0.5f * WHITE ? 1.0f : 0.0f;
     return valid != 0.0f ? (float4)(p[0], p[SAMPLES > 2 ? 1 : 0], p[SAMPLES > 2 ? 2 : 0], 1.0f) : (float4)(0.0f);
 }
 
-inline float4 blend_tap(__global const PIXEL *rows, int4 box, int2 p, int4 border) {
+static inline float4 blend_tap(__global const PIXEL *rows, int4 box, int2 p, int4 border) {
     if (!grid_border(&p, border))
         return (float4)(0.0f);
     const int at = box_index(p, box);
@@ -29,7 +29,7 @@ inline float4 blend_tap(__global const PIXEL *rows, int4 box, int2 p, int4 borde
 }
 
 /* Bicubic sample at position q; next to the mask's rim bilinear over the valid taps, whose share is w. */
-inline float4 blend_sample(__global const PIXEL *rows, int4 box, float2 q, int4 border, int nearest) {
+static inline float4 blend_sample(__global const PIXEL *rows, int4 box, float2 q, int4 border, int nearest) {
     if (nearest)
         return blend_tap(rows, box, convert_int2(floor(q)), border);
     const float2 p = q - 0.5f, base = floor(p), t = p - base;
@@ -55,7 +55,7 @@ inline float4 blend_sample(__global const PIXEL *rows, int4 box, float2 q, int4 
 }
 
 /* Bilinear reading of a float4 grid that covers `box` of a canvas grid; beyond the box, the box's rim. */
-inline float4 blend_field(__global const float4 *field, int4 box, float2 q, int4 border) {
+static inline float4 blend_field(__global const float4 *field, int4 box, float2 q, int4 border) {
     const float2 p = q - 0.5f, base = floor(p), t = p - base;
     float4 sum = (float4)(0.0f);
     for (int j = 0; j < 2; ++j)
@@ -72,7 +72,7 @@ inline float4 blend_field(__global const float4 *field, int4 box, float2 q, int4
 }
 
 /* Where layer k is sampled for the pixel at p: the field's displacement carried to full resolution. */
-inline float2 blend_position(float2 p, float3 d, float2 ratio, float4 lens) {
+static inline float2 blend_position(float2 p, float3 d, float2 ratio, float4 lens) {
     if (d.x == 0.0f && d.y == 0.0f && d.z == 0.0f)
         return p;
     if (lens.y == 0.0f)
@@ -87,10 +87,9 @@ inline float2 blend_position(float2 p, float3 d, float2 ratio, float4 lens) {
                     p.y + (lat - atan2(north, hypot(east, out))) / lens.w);
 }
 
-/* Smooth exposure correction, log gain, on a floor that keeps dark noise calm; exactly none where it is 0. */
-inline float3 blend_correct(float3 c, float3 gain) {
-    const float floor_value = 0.02f * WHITE;
-    const float3 corrected = (c + floor_value) * exp(gain) - floor_value;
+/* Smooth exposure correction of a colour in stored units. */
+static inline float3 blend_correct(float3 c, float3 gain) {
+    const float3 corrected = exposure_shift(c / WHITE, gain, INTEGER) * WHITE;
     return select(corrected, c, gain == 0.0f);
 }
 
@@ -99,7 +98,7 @@ __kernel void blend_add(__global const PIXEL *rows, /* (box.w, box.z, SAMPLES) *
                         int4 box, int4 band,        /* place of `rows`; band, run size */
                         int4 border, float4 lens,   /* full-resolution grid of the region */
                         __global const float4 *field, int4 field_box, int4 field_border, /* working grid */
-                        __global const float4 *gain, int4 gain_border, /* colour grid, log gain r, g, b */
+                        __global const float4 *gain, int4 gain_border, /* colour grid, r, g, b */
                         int corrected,                                 /* 0: gain is not read */
                         int nearest,                                   /* 1: nearest-neighbour sampling */
                         __global const uchar *count,                   /* (band.w, band.z) */
@@ -151,7 +150,7 @@ __kernel void blend_finish(__global const float4 *reference, /* (band.w, band.z)
         return;
     const int at = y * band.z + x;
     const float4 s = sum[at], r = reference[at];
-    const float3 c = r.xyz + (s.w > 1e-12f ? s.xyz / s.w : (float3)(0.0f));
+    const float3 c = r.xyz + (s.w > 1e-30f ? s.xyz / s.w : (float3)(0.0f));
     const float v[4] = {c.x, SAMPLES > 2 ? c.y : r.w * WHITE, c.z, r.w * WHITE};
     for (int k = 0; k < SAMPLES; ++k)
         out[(size_t)at * SAMPLES + k] = INTEGER ? (PIXEL)clamp(rint(v[k]), 0.0f, (float)WHITE) : (PIXEL)v[k];

@@ -1,6 +1,6 @@
 /* Layers seen on a pair's chart. */
 
-inline float4 chart_tap(__global const float4 *layer, int4 box, int2 p, int4 border) {
+static inline float4 chart_tap(__global const float4 *layer, int4 box, int2 p, int4 border) {
     if (!grid_border(&p, border))
         return (float4)(0.0f);
     const int at = box_index(p, box);

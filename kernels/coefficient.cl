@@ -37,7 +37,7 @@ __kernel void coefficient_seed(__global const uchar *mask,  /* (grid.y, grid.x) 
    a vertical part by |dy| (grid.y), a horizontal part by |dx| (grid.x) and a factor per row (grid.y). On a
    plane: dy, dx, 1, hence the squared distance. On the sphere: sin(dlat / 2), sin(dlon / 2), cos(lat), hence the
    haversine, which is exact for small angles. */
-inline float coefficient_measure(int2 p, int2 q, int4 grid, __global const float *table) {
+static inline float coefficient_measure(int2 p, int2 q, int4 grid, __global const float *table) {
     int dx = abs(p.x - q.x);
     if (grid.z)
         dx = min(dx, grid.x - dx);

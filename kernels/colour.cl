@@ -1,6 +1,6 @@
 /* How two aligned layers differ in exposure and colour, per cell of a coarse colour grid. */
 
-inline float4 colour_sample(__global const float4 *layer, int4 box, float2 q, int4 border) {
+static inline float4 colour_sample(__global const float4 *layer, int4 box, float2 q, int4 border) {
     const float2 p = q - 0.5f, base = floor(p), t = p - base;
     float4 sum = (float4)(0.0f);
     for (int j = 0; j < 2; ++j)
@@ -16,20 +16,20 @@ inline float4 colour_sample(__global const float4 *layer, int4 box, float2 q, in
 }
 
 /* Where a layer is sampled for working pixel p. */
-inline float2 colour_position(int2 p, float3 d, float4 lens) {
+static inline float2 colour_position(int2 p, float3 d, float4 lens) {
     const float2 q = (float2)(p.x + 0.5f, p.y + 0.5f);
     if (d.x == 0.0f && d.y == 0.0f && d.z == 0.0f)
         return q;
     return canvas_position(canvas_point(q, lens) + d, lens);
 }
 
-/* Mean of log a - log b over the cell's pixels that both layers show unclipped, and how far it can be trusted:
+/* Mean difference a - b on the exposure scale over the cell's pixels that both layers show unclipped, and how far it can be trusted:
    less where the pixels disagree among themselves, that is, where the layers do not show the same thing. */
 __kernel void colour_difference(__global const float4 *layer_a, __global const float4 *field_a, int4 box_a,
                                 __global const float4 *layer_b, __global const float4 *field_b, int4 box_b,
                                 int4 border, float4 lens,   /* working grid */
                                 int4 cells,                 /* colour grid, run size */
-                                float floor_value,          /* added before the logarithm */
+                                int integer,                /* which exposure scale */
                                 float clipped,              /* brighter samples are not used */
                                 float spread,               /* disagreement that halves the trust */
                                 __global float4 *difference) /* (cells.y, cells.x): r, g, b, weight 0..1 */
@@ -52,7 +52,7 @@ __kernel void colour_difference(__global const float4 *layer_a, __global const f
             const float4 b = colour_sample(layer_b, box_b, colour_position(p, field_b[at_b].xyz, lens), border);
             if (a.w == 0.0f || b.w == 0.0f || any(a.xyz > clipped) || any(b.xyz > clipped))
                 continue;
-            const float3 d = log(fmax(a.xyz, 0.0f) + floor_value) - log(fmax(b.xyz, 0.0f) + floor_value);
+            const float3 d = exposure_scale(a.xyz, integer) - exposure_scale(b.xyz, integer);
             sum += d;
             squares += dot(d, d);
             n += 1.0f;

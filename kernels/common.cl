@@ -7,7 +7,7 @@
 
 /* Borders of a grid, given as (width, height, wraps, poles): columns are taken modulo the width where the
    grid wraps; a row beyond a pole is the mirrored row half a turn further. Returns false outside. */
-inline bool grid_border(int2 *p, int4 grid) {
+static inline bool grid_border(int2 *p, int4 grid) {
     if (p->y < 0 || p->y >= grid.y) {
         if (!(grid.w & (p->y < 0 ? 1 : 2)))
             return false;
@@ -26,14 +26,14 @@ inline bool grid_border(int2 *p, int4 grid) {
 }
 
 /* Index of canvas pixel p in an array that covers box (left, top, width, height); -1 outside. */
-inline int box_index(int2 p, int4 box) {
+static inline int box_index(int2 p, int4 box) {
     const int x = p.x - box.x, y = p.y - box.y;
     return x >= 0 && y >= 0 && x < box.z && y < box.w ? y * box.z + x : -1;
 }
 
 /* The lens of a canvas grid: lens = (lon of x = 0, radians per column, lat of y = 0, radians per row);
    radians per column 0 means a plane. */
-inline float3 canvas_point(float2 p, float4 lens) {
+static inline float3 canvas_point(float2 p, float4 lens) {
     if (lens.y == 0.0f)
         return (float3)(p.x, p.y, 0.0f);
     const float lon = lens.x + p.x * lens.y, lat = lens.z - p.y * lens.w;
@@ -41,7 +41,7 @@ inline float3 canvas_point(float2 p, float4 lens) {
     return (float3)(c * sin(lon), c * cos(lon), sin(lat));
 }
 
-inline float2 canvas_position(float3 q, float4 lens) {
+static inline float2 canvas_position(float3 q, float4 lens) {
     if (lens.y == 0.0f)
         return q.xy;
     const float lon = atan2(q.x, q.y), lat = atan2(q.z, hypot(q.x, q.y));
@@ -53,7 +53,7 @@ inline float2 canvas_position(float3 q, float4 lens) {
    s9, sa: pixels per radian (sphere) or per canvas pixel (plane) in x, y; sb, sc: chart position of
    longitude 0, latitude 0 (sphere) or of the canvas's origin (plane); sd: 1 on the sphere;
    se: period of a wrapped plane in canvas pixels, else 0. */
-inline float3 chart_point(float2 u, float16 chart) {
+static inline float3 chart_point(float2 u, float16 chart) {
     if (chart.sd == 0.0f)
         return (float3)((u.x - chart.sb) / chart.s9, (u.y - chart.sc) / chart.sa, 0.0f);
     const float lon = (u.x - chart.sb) / chart.s9, lat = (chart.sc - u.y) / chart.sa;
@@ -62,7 +62,7 @@ inline float3 chart_point(float2 u, float16 chart) {
                     chart.s2 * x + chart.s5 * y + chart.s8 * z);
 }
 
-inline float2 chart_position(float3 q, float16 chart) {
+static inline float2 chart_position(float3 q, float16 chart) {
     if (chart.sd == 0.0f) {
         float2 u = (float2)(q.x * chart.s9 + chart.sb, q.y * chart.sa + chart.sc);
         if (chart.se > 0.0f) /* the copy that lies on the chart, which may reach across the canvas's border */
@@ -75,8 +75,25 @@ inline float2 chart_position(float3 q, float16 chart) {
     return (float2)(atan2(x, y) * chart.s9 + chart.sb, chart.sc - atan2(z, hypot(x, y)) * chart.sa);
 }
 
+/* The scale on which exposure differences are smooth fields, c in 0..1 of full scale. Integer images: log odds,
+   floats: log. The floor keeps dark noise, and what is nearly white, calm where differences are measured. */
+#define EXPOSURE_FLOOR 0.02f
+
+static inline float3 exposure_scale(float3 c, int integer) {
+    const float3 low = fmax(c, 0.0f) + EXPOSURE_FLOOR;
+    return integer ? log(low / (fmax(1.0f - c, 0.0f) + EXPOSURE_FLOOR)) : log(low);
+}
+
+/* Add a gain on that scale: the odds of an integer image's colour, or a float's value, times exp(gain). Black
+   and an integer image's white stay, so that nothing clips or turns grey; exactly c where the gain is 0. */
+static inline float3 exposure_shift(float3 c, float3 gain, int integer) {
+    const float3 factor = exp(gain);
+    const float3 shifted = integer ? c * factor / (1.0f + fmin(c, 1.0f) * (factor - 1.0f)) : c * factor;
+    return select(shifted, c, gain == 0.0f);
+}
+
 /* Catmull-Rom weights of the four taps around fraction t: exactly (0, 1, 0, 0) at t = 0. */
-inline float4 catmull_rom(float t) {
+static inline float4 catmull_rom(float t) {
     const float t2 = t * t, t3 = t2 * t;
     return (float4)(-0.5f * t + t2 - 0.5f * t3, 1.0f - 2.5f * t2 + 1.5f * t3, 0.5f * t + 2.0f * t2 - 1.5f * t3,
                     -0.5f * t2 + 0.5f * t3);

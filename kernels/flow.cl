@@ -6,7 +6,7 @@
    pixels of the level's grid; grid = (width, height, wraps, 0). */
 
 /* Bilinear reading of the local mean, which is kept on the next coarser level. */
-inline float flow_local_mean(__global const float *mean, __global const float *weight, int4 coarse, int x, int y) {
+static inline float flow_local_mean(__global const float *mean, __global const float *weight, int4 coarse, int x, int y) {
     const float2 q = (float2)(x + 0.5f, y + 0.5f) * 0.5f - 0.5f;
     const float2 base = floor(q), t = q - base;
     float sum = 0.0f, total = 0.0f;
@@ -75,7 +75,7 @@ __kernel void flow_warp(__global const float4 *feature, /* (grid.y, grid.x) of t
     warped[y * grid.x + x] = sum.w > 0.999f ? sum / sum.w : (float4)(0.0f);
 }
 
-inline float4 flow_mean_feature(__global const float4 *a, __global const float4 *b, int2 p, int4 grid) {
+static inline float4 flow_mean_feature(__global const float4 *a, __global const float4 *b, int2 p, int4 grid) {
     if (!grid_border(&p, grid))
         return (float4)(0.0f);
     const float4 fa = a[p.y * grid.x + p.x], fb = b[p.y * grid.x + p.x];
@@ -153,7 +153,7 @@ __kernel void flow_window(__global const float4 *tensor, /* (grid.y, grid.x) */
     right_out[y * grid.x + x] = r;
 }
 
-inline float flow_edge(__global const float2 *flow, __global const float4 *feature, int at, int2 p, int4 grid,
+static inline float flow_edge(__global const float2 *flow, __global const float4 *feature, int at, int2 p, int4 grid,
                        float smoothness, float contrast) {
     if (!grid_border(&p, grid))
         return 0.0f;
@@ -234,7 +234,7 @@ __kernel void flow_relax(__global const float4 *left_side,  /* (grid.y, grid.x) 
     flow[at] = f;
 }
 
-inline void flow_sort(float2 *a, float2 *b) {
+static inline void flow_sort(float2 *a, float2 *b) {
     const float2 low = fmin(*a, *b);
     *b = fmax(*a, *b);
     *a = low;

@@ -2,7 +2,7 @@
    of the working grid, (displacement, colour weight); the displacement is a difference of points, so that it
    is continuous over the poles. */
 
-inline float2 geometry_flow(__global const float2 *flow, float2 u, int4 grid) {
+static inline float2 geometry_flow(__global const float2 *flow, float2 u, int4 grid) {
     const float2 q = u - 0.5f, base = floor(q), t = q - base;
     float2 sum = (float2)(0.0f);
     float weight = 0.0f;

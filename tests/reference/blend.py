@@ -31,7 +31,7 @@ def opaque(rows: Array, white: float) -> Array:
 def blend_count(rows: Array, box: Sequence[int], band: Sequence[int], count: Array, white: float) -> Array:
     """How many layers cover each pixel of the band, this one included."""
     x, y = pixels(band[2], band[3], band[0], band[1])
-    return (count + take(opaque(rows, white)[..., 3], box, x, y)).astype(np.uint8)
+    return np.minimum(count + take(opaque(rows, white)[..., 3], box, x, y), 2).astype(np.uint8)
 
 
 def sample(

@@ -122,13 +122,12 @@ def exposure_scale(c: Array, integer: int) -> Array:
 
 
 def exposure_shift(c: Array, gain: Array, integer: int) -> Array:
-    """Colours moved by `gain` on that scale."""
-    low = (c + EXPOSURE_FLOOR) * np.exp(gain)
+    """Colours moved by `gain` on that scale, black and white in their place."""
+    factor = np.exp(gain)
     if not integer:
-        return np.where(gain == 0, c, low - EXPOSURE_FLOOR)
-    high = np.maximum(1 - c + EXPOSURE_FLOOR, EXPOSURE_FLOOR)
-    share = low / (low + high)  # of the way from -floor to 1 + floor
-    return np.where(gain == 0, c, share * (1 + 2 * EXPOSURE_FLOOR) - EXPOSURE_FLOOR)
+        return np.where(gain == 0, c, c * factor)
+    black = 1 - np.minimum(c, 1)
+    return np.where(gain == 0, c, c * factor / (black + (1 - black) * factor))
 
 
 def pixels(width: int, height: int, left: int = 0, top: int = 0) -> tuple[Array, Array]:
