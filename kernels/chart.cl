@@ -19,7 +19,7 @@ __kernel void chart_sample(__global const float4 *layer, /* (box.w, box.z) r, g,
     const int i = get_global_id(0), j = get_global_id(1);
     if (i >= size.x || j >= size.y)
         return;
-    const float2 p = canvas_position(chart_point((float2)(i + 0.5f, j + 0.5f), chart), lens) - 0.5f;
+    const float2 p = canvas_position(chart_point((float2)(i + 0.5f, j + 0.5f), &chart), lens) - 0.5f;
     float2 base = floor(p), t = p - base;
     /* positions come out of trigonometry or scaling: what is a whole pixel but for rounding is a copy */
     if (t.x > 0.9995f) { base.x += 1.0f; t.x = 0.0f; }

@@ -52,27 +52,28 @@ static inline float2 canvas_position(float3 q, float4 lens) {
    axis of its own; s0-2, s3-5, s6-8 are the rows of the rotation from the scene to the chart's axes.
    s9, sa: pixels per radian (sphere) or per canvas pixel (plane) in x, y; sb, sc: chart position of
    longitude 0, latitude 0 (sphere) or of the canvas's origin (plane); sd: 1 on the sphere;
-   se: period of a wrapped plane in canvas pixels, else 0. */
-static inline float3 chart_point(float2 u, float16 chart) {
-    if (chart.sd == 0.0f)
-        return (float3)((u.x - chart.sb) / chart.s9, (u.y - chart.sc) / chart.sa, 0.0f);
-    const float lon = (u.x - chart.sb) / chart.s9, lat = (chart.sc - u.y) / chart.sa;
+   se: period of a wrapped plane in canvas pixels, else 0. Handed on by its address: compilers warn of
+   float16 arguments of functions on a CPU without registers of that size. */
+static inline float3 chart_point(float2 u, const float16 *chart) {
+    if (chart->sd == 0.0f)
+        return (float3)((u.x - chart->sb) / chart->s9, (u.y - chart->sc) / chart->sa, 0.0f);
+    const float lon = (u.x - chart->sb) / chart->s9, lat = (chart->sc - u.y) / chart->sa;
     const float c = cos(lat), x = c * sin(lon), y = c * cos(lon), z = sin(lat);
-    return (float3)(chart.s0 * x + chart.s3 * y + chart.s6 * z, chart.s1 * x + chart.s4 * y + chart.s7 * z,
-                    chart.s2 * x + chart.s5 * y + chart.s8 * z);
+    return (float3)(chart->s0 * x + chart->s3 * y + chart->s6 * z, chart->s1 * x + chart->s4 * y + chart->s7 * z,
+                    chart->s2 * x + chart->s5 * y + chart->s8 * z);
 }
 
-static inline float2 chart_position(float3 q, float16 chart) {
-    if (chart.sd == 0.0f) {
-        float2 u = (float2)(q.x * chart.s9 + chart.sb, q.y * chart.sa + chart.sc);
-        if (chart.se > 0.0f) /* the copy that lies on the chart, which may reach across the canvas's border */
-            u.x -= floor(u.x / (chart.se * chart.s9)) * chart.se * chart.s9;
+static inline float2 chart_position(float3 q, const float16 *chart) {
+    if (chart->sd == 0.0f) {
+        float2 u = (float2)(q.x * chart->s9 + chart->sb, q.y * chart->sa + chart->sc);
+        if (chart->se > 0.0f) /* the copy that lies on the chart, which may reach across the canvas's border */
+            u.x -= floor(u.x / (chart->se * chart->s9)) * chart->se * chart->s9;
         return u;
     }
-    const float x = chart.s0 * q.x + chart.s1 * q.y + chart.s2 * q.z;
-    const float y = chart.s3 * q.x + chart.s4 * q.y + chart.s5 * q.z;
-    const float z = chart.s6 * q.x + chart.s7 * q.y + chart.s8 * q.z;
-    return (float2)(atan2(x, y) * chart.s9 + chart.sb, chart.sc - atan2(z, hypot(x, y)) * chart.sa);
+    const float x = chart->s0 * q.x + chart->s1 * q.y + chart->s2 * q.z;
+    const float y = chart->s3 * q.x + chart->s4 * q.y + chart->s5 * q.z;
+    const float z = chart->s6 * q.x + chart->s7 * q.y + chart->s8 * q.z;
+    return (float2)(atan2(x, y) * chart->s9 + chart->sb, chart->sc - atan2(z, hypot(x, y)) * chart->sa);
 }
 
 /* The scale on which exposure differences are smooth fields, c in 0..1 of full scale. Integer images: log odds,

@@ -48,11 +48,11 @@ __kernel void geometry_add(__global const float *blend_j,   /* (box_j.w, box_j.z
         if (lens.y != 0.0f)
             q = normalize(q);
     }
-    const float2 u = chart_position(q, chart);
+    const float2 u = chart_position(q, &chart);
     const float2 f = geometry_flow(flow, u, grid);
     if (f.x == 0.0f && f.y == 0.0f)
         return;
-    const float3 d = chart_point(u + f, chart) - chart_point(u, chart);
+    const float3 d = chart_point(u + f, &chart) - chart_point(u, &chart);
     field[at].xyz += (use_guess ? -w : w) * d;
 }
 
