@@ -114,19 +114,8 @@ __kernel void coefficient_expand(__global const float *distance, /* (grid.y, gri
     const int at = y * box.z + x;
     float d = 0.0f;
     if (layer[at].w != 0.0f) {
-        const float2 q = ((float2)(x + box.x, y + box.y) + 0.5f) * ratio - 0.5f;
-        const float2 base = floor(q), t = q - base;
-        float weight = 0.0f;
-        for (int j = 0; j < 2; ++j)
-            for (int i = 0; i < 2; ++i) {
-                int2 p = convert_int2(base) + (int2)(i, j);
-                if (!grid_border(&p, grid))
-                    continue;
-                const float w = (i ? t.x : 1.0f - t.x) * (j ? t.y : 1.0f - t.y);
-                d += w * distance[p.y * grid.x + p.x];
-                weight += w;
-            }
-        d = fmax(d / weight, 1e-3f);
+        const float2 q = ((float2)(x + box.x, y + box.y) + 0.5f) * ratio;
+        d = fmax(bilinear_scalar(distance, q, grid), 1e-3f);
     }
     expanded[at] = d;
     total[(y + box.y) * working.x + x + box.x] += d;

@@ -76,6 +76,39 @@ static inline float2 chart_position(float3 q, const float16 *chart) {
     return (float2)(atan2(x, y) * chart->s9 + chart->sb, chart->sc - atan2(z, hypot(x, y)) * chart->sa);
 }
 
+/* Bilinear reading of a grid at position q, over the taps that lie on it; 0 where none does. */
+static inline float bilinear_scalar(__global const float *values, float2 q, int4 grid) {
+    const float2 corner = floor(q - 0.5f), t = q - 0.5f - corner;
+    float sum = (float)(0.0f);
+    float weight = 0.0f;
+    for (int j = 0; j < 2; ++j)
+        for (int i = 0; i < 2; ++i) {
+            int2 p = convert_int2(corner) + (int2)(i, j);
+            if (!grid_border(&p, grid))
+                continue;
+            const float w = (i ? t.x : 1.0f - t.x) * (j ? t.y : 1.0f - t.y);
+            sum += w * values[p.y * grid.x + p.x];
+            weight += w;
+        }
+    return weight > 1e-6f ? sum / weight : (float)(0.0f);
+}
+
+static inline float2 bilinear_flow(__global const float2 *values, float2 q, int4 grid) {
+    const float2 corner = floor(q - 0.5f), t = q - 0.5f - corner;
+    float2 sum = (float2)(0.0f);
+    float weight = 0.0f;
+    for (int j = 0; j < 2; ++j)
+        for (int i = 0; i < 2; ++i) {
+            int2 p = convert_int2(corner) + (int2)(i, j);
+            if (!grid_border(&p, grid))
+                continue;
+            const float w = (i ? t.x : 1.0f - t.x) * (j ? t.y : 1.0f - t.y);
+            sum += w * values[p.y * grid.x + p.x];
+            weight += w;
+        }
+    return weight > 1e-6f ? sum / weight : (float2)(0.0f);
+}
+
 /* The scale on which exposure differences are smooth fields, c in 0..1 of full scale. Integer images: log odds,
    floats: log. The floor keeps dark noise, and what is nearly white, calm where differences are measured. */
 #define EXPOSURE_FLOOR 0.02f

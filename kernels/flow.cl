@@ -273,18 +273,6 @@ __kernel void flow_expand(__global const float2 *coarse, /* (grid.y, grid.x) px 
     const int x = get_global_id(0), y = get_global_id(1);
     if (x >= size.x || y >= size.y)
         return;
-    const float2 q = (float2)(x + 0.5f, y + 0.5f) * 0.5f - 0.5f;
-    const float2 base = floor(q), t = q - base;
-    float2 sum = (float2)(0.0f);
-    float weight = 0.0f;
-    for (int j = 0; j < 2; ++j)
-        for (int i = 0; i < 2; ++i) {
-            int2 p = convert_int2(base) + (int2)(i, j);
-            if (!grid_border(&p, grid))
-                continue;
-            const float w = (i ? t.x : 1.0f - t.x) * (j ? t.y : 1.0f - t.y);
-            sum += w * coarse[p.y * grid.x + p.x];
-            weight += w;
-        }
-    fine[y * size.x + x] = 2.0f * sum / weight;
+    const float2 q = 0.5f * (float2)(x + 0.5f, y + 0.5f);
+    fine[y * size.x + x] = 2.0f * bilinear_flow(coarse, q, grid);
 }

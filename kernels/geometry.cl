@@ -2,22 +2,6 @@
    of the working grid, (displacement, colour weight); the displacement is a difference of points, so that it
    is continuous over the poles. */
 
-static inline float2 geometry_flow(__global const float2 *flow, float2 u, int4 grid) {
-    const float2 q = u - 0.5f, base = floor(q), t = q - base;
-    float2 sum = (float2)(0.0f);
-    float weight = 0.0f;
-    for (int j = 0; j < 2; ++j)
-        for (int i = 0; i < 2; ++i) {
-            int2 p = convert_int2(base) + (int2)(i, j);
-            if (!grid_border(&p, grid))
-                continue;
-            const float w = (i ? t.x : 1.0f - t.x) * (j ? t.y : 1.0f - t.y);
-            sum += w * flow[p.y * grid.x + p.x];
-            weight += w;
-        }
-    return weight > 1e-6f ? sum / weight : (float2)(0.0f);
-}
-
 /* Add one other layer's part. guess = 0: read F_jk at p (first order, as published). Otherwise F_kj is read at
    the place that `guess` says layer k is sampled, whose way to p it is: x_k = p - sum_j w_j F_kj(x_k). */
 __kernel void geometry_add(__global const float *blend_j,   /* (box_j.w, box_j.z) */
@@ -49,7 +33,7 @@ __kernel void geometry_add(__global const float *blend_j,   /* (box_j.w, box_j.z
             q = normalize(q);
     }
     const float2 u = chart_position(q, &chart);
-    const float2 f = geometry_flow(flow, u, grid);
+    const float2 f = bilinear_flow(flow, u, grid);
     if (f.x == 0.0f && f.y == 0.0f)
         return;
     const float3 d = chart_point(u + f, &chart) - chart_point(u, &chart);
