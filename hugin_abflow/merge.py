@@ -11,7 +11,7 @@ import numpy.typing as npt
 
 from hugin_abflow import joint, sequential
 from hugin_abflow.errors import LayersMissingError, OutputError
-from hugin_abflow.images import ImageWriter
+from hugin_abflow.images import ENDINGS, ImageWriter
 from hugin_abflow.layer import Canvas, Layer
 from hugin_abflow.nona import Remap, check_layers, open_layers
 from hugin_abflow.opencl import Device
@@ -37,7 +37,8 @@ def merge_project(
 
     output          format by its ending; default: named and typed as the project says, beside it.
     prefix, layers, remap, keep_layers    where the layers come from, see `nona.open_layers`.
-    compression, jpeg_quality    of the file, see `images.ImageWriter`; default: the project's.
+    compression, jpeg_quality    of the file, see `images.ImageWriter`; default: the project's, if the output
+                    has the project's format.
 
     The file appears when it is complete; inputs are never touched. Raises the `AbflowError` family:
     what the project, its layers, the device or the output can get wrong.
@@ -48,12 +49,14 @@ def merge_project(
         plan, prefix=prefix, layers=layers, remap=remap, keep_layers=keep_layers, progress=progress
     ) as opened:
         target = _target(plan, opened, output)
+        if ENDINGS.get(target.suffix.lower()) == ENDINGS[plan.output.ending]:
+            compression = plan.output.compression if compression is None else compression
+            jpeg_quality = plan.output.jpeg_quality if jpeg_quality is None else jpeg_quality
         crop, first = plan.canvas.crop, opened[0]
         with ImageWriter(
             target, crop.width, crop.height, first.channels, first.dtype,
             offset=(crop.left, crop.top), canvas_size=(plan.canvas.width, plan.canvas.height), icc=first.icc,
-            compression=compression or plan.output.compression,
-            jpeg_quality=jpeg_quality or plan.output.jpeg_quality,
+            compression=compression, jpeg_quality=jpeg_quality,
         ) as writer:  # fmt: skip
             for rows in _bands(opened, plan.canvas, settings, progress):
                 writer.write_rows(rows)

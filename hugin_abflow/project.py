@@ -181,9 +181,11 @@ def _output(project: pto.Project, hdr: bool) -> Output:
     compression = project.option(f"outputImageType{'HDR' if hdr else ''}Compression", "").strip()
     compression = (compression or letters.get("c", "")).lower()
     quality = project.option("outputJPEGQuality", "").strip() or letters.get("q", "")
+    ending = _ENDINGS.get(kind) or (not hdr and _ENDINGS.get(from_n)) or _ENDINGS[default]
     return Output(
-        ending=_ENDINGS.get(kind) or (not hdr and _ENDINGS.get(from_n)) or _ENDINGS[default],
-        compression=compression if compression in _COMPRESSIONS else None,
+        ending=ending,
+        # Hugin's GUI writes TIFF's compression beside any type, LZW for EXR too
+        compression=compression if ending == ".tif" and compression in _COMPRESSIONS else None,
         jpeg_quality=min(100, max(1, int(quality))) if quality.isdecimal() else _JPEG_QUALITY,
     )
 

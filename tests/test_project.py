@@ -176,6 +176,17 @@ def test_hugin_lines_win_and_nonsense_keeps_the_default(make_project):
     assert (output.ending, output.compression, output.jpeg_quality) == (".jpg", None, 90)
 
 
+@pytest.mark.parametrize(("kind", "compression"), [("tif", "lzw"), ("exr", None)])
+def test_compression_is_that_of_a_tiff(make_project, kind, compression):
+    """Hugin writes LZW beside EXR as well, where it means nothing."""
+    extra = (
+        "#hugin_outputLDRBlended false\n#hugin_outputHDRBlended true\n"
+        f"#hugin_outputImageTypeHDR {kind}\n#hugin_outputImageTypeHDRCompression LZW\n"
+    )
+    output = read_plan(make_project(panorama="f2 w802 h401 v360", extra=extra)).output
+    assert (output.ending, output.compression) == (f".{kind}", compression)
+
+
 def test_scripts_without_hugin_lines_say_hdr_in_the_p_line(make_project):
     plan = read_plan(make_project(panorama="f2 w802 h401 v360 R1"))
     assert plan.hdr and plan.output.ending == ".exr"
