@@ -13,7 +13,7 @@ from typing import Any, get_args
 
 import click
 
-from hugin_abflow.errors import AbflowError, DeviceError, ExitCode
+from hugin_abflow.errors import AbflowError, ExitCode
 from hugin_abflow.merge import merge_project
 from hugin_abflow.nona import Remap
 from hugin_abflow.opencl import list_devices
@@ -121,10 +121,7 @@ def _print_devices(context: click.Context, parameter: click.Parameter, wanted: b
     """Answer --list-devices and end."""
     if not wanted or context.resilient_parsing:
         return
-    devices = list_devices()
-    if not devices:
-        raise DeviceError("no OpenCL device found; install a driver for the GPU, or PoCL to use the CPU")
-    for device in devices:
+    for device in list_devices():
         default = ", default" if device.default else ""
         memory = f"{device.memory / 2**30:.1f} GiB"
         click.echo(f"{device.index}: {device.name} ({device.kind}, {memory}, {device.platform}{default})")

@@ -64,6 +64,7 @@ def _kind(device: cl.Device) -> str:
 
 
 def _devices() -> list[cl.Device]:
+    """All devices of all platforms; `DeviceError` where there is none."""
     try:
         platforms = cl.get_platforms()
     except cl.Error:
@@ -74,6 +75,9 @@ def _devices() -> list[cl.Device]:
             found += platform.get_devices()
         except cl.Error as error:  # a platform without devices must not hide the others
             _log.debug("%s: %s", platform.name, error)
+    if not found:
+        remedy = _INSTALL.get(sys.platform, _INSTALL["linux"])
+        raise DeviceError(f"no OpenCL device found; {remedy}")
     return found
 
 
@@ -83,9 +87,12 @@ def _speed(device: cl.Device) -> tuple[bool, int]:
 
 
 def list_devices() -> list[DeviceInfo]:
-    """All OpenCL devices; the one that is used by default is marked."""
+    """All OpenCL devices, at least one; the one that is used by default is marked.
+
+    Raises `DeviceError`, which says what to install, where there is none.
+    """
     found = _devices()
-    best = max(found, key=_speed, default=None)
+    best = max(found, key=_speed)
     return [
         DeviceInfo(i, d.name.strip(), d.platform.name.strip(), _kind(d), d.global_mem_size, d == best)
         for i, d in enumerate(found)
@@ -94,9 +101,6 @@ def list_devices() -> list[DeviceInfo]:
 
 def _choose(wanted: str | None) -> cl.Device:
     found = _devices()
-    if not found:
-        remedy = _INSTALL.get(sys.platform, _INSTALL["linux"])
-        raise DeviceError(f"no OpenCL device found; {remedy}")
     if wanted is None:
         return max(found, key=_speed)
     if wanted.isdecimal():

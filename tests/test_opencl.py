@@ -53,9 +53,7 @@ def test_kernels_are_named_after_their_file(module: str) -> None:
 @pytest.mark.parametrize(("module", "options"), [(m, o) for m in MODULES for o in option_sets(m)])
 def test_every_file_builds_alone_without_warnings(device: Device, module: str, options: str) -> None:
     pocl = "Portable" in device.device.platform.name
-    # no fault of ours: clang notes that float16 arguments go another way without AVX-512
-    source = '#pragma clang diagnostic ignored "-Wpsabi"\n' * pocl + kernel_source(module)
-    program = cl.Program(device.context, source)
+    program = cl.Program(device.context, kernel_source(module))
     program.build(["-cl-std=CL1.2", *["-Werror"] * pocl, *options.split()], cache_dir=False)
     built = sorted(kernel.function_name for kernel in program.all_kernels())
     assert built == sorted(kernels_of(module))
@@ -162,9 +160,9 @@ def test_without_any_device_the_error_says_what_to_install(
 ) -> None:
     monkeypatch.setattr(cl, "get_platforms", platforms)
     monkeypatch.setattr(sys, "platform", system)
-    with pytest.raises(DeviceError, match=f"no OpenCL device found; .*{remedy}"):
-        Device()
-    assert list_devices() == []
+    for needs_one in (Device, list_devices):
+        with pytest.raises(DeviceError, match=f"no OpenCL device found; .*{remedy}"):
+            needs_one()
 
 
 def test_buffers_carry_arrays_of_any_size(device: Device) -> None:
