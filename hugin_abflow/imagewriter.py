@@ -72,6 +72,7 @@ class ImageWriter:
     compression     TIFF: none, lzw (default), packbits, deflate; jpeg and zstd become deflate, with a
                     warning. EXR: none, rle, zips, zip (default), piz. JPEG and PNG: not used.
     jpeg_quality    1..100, default 90 as Hugin's.
+    icc             profile, carried as it is; PNG leaves a broken one out, with a warning.
 
     The attribute `compression` says what is really used. JPEG loses alpha: laid over black.
     Raises `OutputError` for an unknown ending, a depth or size the format cannot hold, an unwritable
@@ -156,13 +157,28 @@ class ImageWriter:
                 "choose another folder with -o"
             ) from None
         try:
-            self._output = oiio.ImageOutput.create(str(self._part))
-            if self._output is None or not self._output.open(str(self._part), self._spec):
-                raise self._failure(self._output.geterror() if self._output else oiio.geterror())
+            why = self._open()
+            if why and self.format == "png" and self._spec.getattribute("ICCProfile") is not None:
+                # PNG's library is the only one that looks into profiles, and it refuses the whole image
+                self._spec.erase_attribute("ICCProfile")
+                fault, why = why.splitlines()[0], self._open()
+                if not why:
+                    log.warning("%s: written without the layers' ICC profile (%s)", self.path, fault)
+            if why:
+                raise self._failure(why)
         except BaseException:
             self._discard()
             raise
         return self
+
+    def _open(self) -> str:
+        """Begin the file; an error's text, or nothing."""
+        self._output = oiio.ImageOutput.create(str(self._part))
+        if self._output is None:
+            return str(oiio.geterror())
+        if self._output.open(str(self._part), self._spec):
+            return ""
+        return str(self._output.geterror()) or "no reason given"
 
     def __exit__(
         self,

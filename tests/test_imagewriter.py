@@ -120,6 +120,17 @@ def test_icc_profile_is_carried_by_png(tmp_path):
     assert b"sRGB" not in chunks and b"gAMA" not in chunks
 
 
+@pytest.mark.parametrize("broken", ["no profile at all" * 20, "short", "cut"])
+def test_png_leaves_a_broken_profile_out(tmp_path, broken, caplog):
+    """Bytes that are none, and one that ends too early."""
+    pixels = noise(np.uint8)
+    icc = rgb_profile()[:-4] if broken == "cut" else broken.encode()
+    write_image(tmp_path / "a.png", pixels, icc=icc)
+    assert "a.png: written without the layers' ICC profile (" in caplog.text
+    assert b"iCCP" not in png_chunks(tmp_path / "a.png")
+    assert np.array_equal(whole(read_layer(tmp_path / "a.png")), pixels)
+
+
 def png_chunks(path: Path) -> dict[bytes, bytes]:
     data, at, found = path.read_bytes(), 8, {}
     while at < len(data):
