@@ -27,7 +27,7 @@ def require_program(name: str) -> str:
         reason = f"{name} is not installed; `make test` says how to get it"
         if os.environ.get("CI", "").lower() == "true":
             pytest.fail(reason)
-        pytest.skip(reason)
+        pytest.skip(reason)  # Hugin is large, and most tests need none of it
     return path
 
 

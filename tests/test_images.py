@@ -73,7 +73,7 @@ def test_positions_as_libtiff_makes_them_from_floats(tmp_path):
 )
 def test_tiff_kinds_are_read_in_any_order(tmp_path, dtype, options):
     if options.get("compression") == "lzw" and not has_codecs():
-        pytest.skip("imagecodecs is not installed")
+        pytest.skip("imagecodecs is not installed")  # tifffile needs it to write LZW, which is all it is for
     pixels = noise(dtype)
     tifffile.imwrite(tmp_path / "a.tif", pixels, photometric="rgb", extrasamples=["unassalpha"], **options)
     layer = read_layer(tmp_path / "a.tif")
@@ -309,5 +309,5 @@ def test_a_layer_read_to_its_end_holds_no_file(tmp_path):
 def open_files() -> int:
     folder = Path("/proc/self/fd")
     if not folder.is_dir():
-        pytest.skip("this system does not list open files")
+        pytest.skip("this system does not list open files")  # only Linux does
     return len(names_in(folder))

@@ -247,7 +247,7 @@ exec sleep 60
 def test_interruption_ends_nona_and_leaves_nothing(make_project, tmp_path):
     """A real Ctrl-C, in a process of its own, while nona is at work."""
     if os.name == "nt":
-        pytest.skip("signals of POSIX")
+        pytest.skip("signals of POSIX")  # Windows sends no Ctrl-C to one process alone
     folder = make_slow_nona(tmp_path)
     project = make_project()
     code = (

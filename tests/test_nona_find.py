@@ -269,7 +269,7 @@ def test_the_gopro_ring_has_layers_but_no_photos(caplog):
     """Layers named by the project's stem, photos gone; times are those of the checkout."""
     project = Path(__file__).parents[2] / "shared" / "photos" / "gopro_ring" / "layer_.pto"
     if not project.is_file():
-        pytest.skip("the photographs are not here")
+        pytest.skip("the photographs are not here")  # they are too large for the repository, and not ours
     with open_layers(read_plan(project)) as layers:
         assert names_of(layers) == [f"layer_{index:04d}.tif" for index in range(6)]
         assert all((item.dtype, item.channels) == (np.uint8, 3) for item in layers)

@@ -237,7 +237,7 @@ def test_a_backslash_may_be_part_of_a_name(tmp_path):
     try:
         (tmp_path / "a\\b.jpg").touch()
     except OSError:
-        pytest.skip("this system has no such names")
+        pytest.skip("this system has no such names")  # on Windows a backslash parts folders
     assert locate_photo(tmp_path, "a\\b.jpg") == tmp_path / "a\\b.jpg"
 
 
@@ -252,7 +252,7 @@ def test_what_is_no_project(tmp_path):
 def test_all_real_projects_have_a_plan():
     corpus = Path(__file__).parents[2] / "shared" / "pto_corpus"
     if not corpus.is_dir():
-        pytest.skip("the corpus of real projects is not here")
+        pytest.skip("the corpus of real projects is not here")  # others wrote them: not ours to publish
     for file in sorted(corpus.glob("*.pto")):
         try:
             plan = read_plan(file)
