@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
+import tarfile
 import tomllib
 import zipfile
 from pathlib import Path
@@ -56,6 +57,26 @@ def test_unpacked_wheel_runs_outside_the_checkout(wheel: Path, tmp_path: Path) -
         )
         assert done.returncode == 0, done.stderr
         assert done.stdout.startswith(expected)
+
+
+def test_source_archive_has_what_its_tests_need(tmp_path: Path) -> None:
+    pytest.importorskip("hatchling")
+    build = BUILD.replace("build_wheel", "build_sdist")
+    subprocess.run([sys.executable, "-c", build, tmp_path], cwd=ROOT, check=True, capture_output=True)
+    (path,) = tmp_path.glob("*.tar.gz")
+    with tarfile.open(path) as archive:
+        names = {name.partition("/")[2] for name in archive.getnames()}
+    folders = ("hugin_abflow", "kernels", "tests", "benchmarks", "sample_projects", "docs")
+    endings = ("*.py", "*.cl", "*.pto", "*.jpg", "*.md", "*.executor")
+    needed = {
+        path.relative_to(ROOT).as_posix()
+        for folder in folders
+        for ending in endings
+        for path in (ROOT / folder).rglob(ending)
+    }
+    needed |= {path.name for path in ROOT.glob("*.md")} | {"Makefile", ".ci/run", "pyproject.toml", "LICENSE"}
+    assert len(needed) > 80
+    assert sorted(needed - names) == []
 
 
 def test_changelog_has_the_version() -> None:
