@@ -18,7 +18,7 @@ class Settings:
     merge               "joint": all layers at once; "sequential": the paper's iteration, two at a time.
     softmax_sharpness   kSoftmaxSharpness of the paper (Code 1); 0..1000, no unit.
     flow_magnitude      kFlowMagCoef of the paper (Code 1); 0..10000, no unit.
-    exposure            match exposure and colour of the layers, and blend low frequencies over the overlap.
+    exposure            match exposure and colour of the layers where they overlap, and spread it smoothly.
     interpolation       how layers are sampled; "nearest" is for comparison with the paper's own code.
     working_pixels      upper bound of the pixels of the working canvas (flow, coefficients, colour).
     border_feather      width of the ramp that brings a layer's weight to 0 at its own border, in working
