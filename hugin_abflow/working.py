@@ -73,7 +73,7 @@ class Grid:
 
 @dataclass(frozen=True)
 class WorkingLayer:
-    """A layer on the working grid: pixels float32 (height, width, 4), r, g, b in 0..1 and valid.
+    """A layer on the working grid: pixels float32 (height, width, 4), r, g, b (full scale is 1) and valid.
 
     box         (left, top, width, height) on the grid.
     checksum    of the stored pixels: tells layers of one size and place apart.
@@ -157,6 +157,8 @@ def reduce_layer(device: Device, layer: Layer, grid: Grid, advance: Advance) -> 
         )  # fmt: skip
         advance(end - done)  # bands share rows; each counts once
         done = end
+    if bottom <= top:  # too flat for a row of the grid: the order of such layers must not be the caller's
+        checksum = crc32(device_rows(layer, 0, layer.box.height).data)
     advance(layer.box.height - done)
     return WorkingLayer(layer, box, pixels, checksum)
 

@@ -285,3 +285,14 @@ def test_order_does_not_matter_where_boxes_are_equal():
     for result in results[1:]:
         np.testing.assert_array_equal(result, results[0])
     assert len({layer.box for layer in layers}) == 1
+
+
+def test_order_does_not_matter_for_layers_below_a_working_pixel():
+    canvas, speck = Canvas.plane(401, 199), noise(1, 1)
+    layers = [
+        Layer.from_array("one", speck, 101, 51),
+        Layer.from_array("other", speck ^ np.uint8([[[255, 255, 255, 0]]]), 101, 51),
+        Layer.from_array("third", noise(51, 47), 301, 101),
+    ]
+    first, second = (merged(order, canvas, working_pixels=10_000) for order in (layers, layers[::-1]))
+    np.testing.assert_array_equal(first, second)
