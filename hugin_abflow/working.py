@@ -23,6 +23,11 @@ from hugin_abflow.settings import Settings
 # Rows of a layer that are decoded and uploaded at a time.
 _ROWS = 256
 
+# Bounds of what kernels calculate with int, less some for rounding; only canvases longer than 30,000 px and
+# very narrow get near them.
+_LARGEST_PRODUCT = 0.99 * 2**31
+_MOST_ROWS = 32_000
+
 # OpenCL type and full-scale value of each depth; half is widened on the host.
 PIXEL = {"uint8": ("uchar", 255.0), "uint16": ("ushort", 65535.0), "float32": ("float", 1.0)}
 
@@ -104,7 +109,10 @@ def full_grid(canvas: Canvas, layers: Sequence[Layer]) -> Grid:
 
 def working_grid(full: Grid, settings: Settings) -> Grid:
     """The grid on which flow, coefficients and colour are calculated."""
-    ratio = max(1.0, math.sqrt(full.width * full.height / settings.working_pixels))
+    # kernels multiply a grid's width by its region's in 32 bits, and pack rows of the mask grid into 15
+    longest = max(full.width, full.height) ** 2 / _LARGEST_PRODUCT
+    pixels = math.sqrt(full.width * full.height / settings.working_pixels)
+    ratio = max(1.0, pixels, longest, full.height / _MOST_ROWS)
     width, height = max(2, round(full.width / ratio)), max(1, round(full.height / ratio))
     if ratio > 1 and full.wraps:
         width += width % 2  # crossing a pole goes half the width further

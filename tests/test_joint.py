@@ -296,3 +296,23 @@ def test_order_does_not_matter_for_layers_below_a_working_pixel():
     ]
     first, second = (merged(order, canvas, working_pixels=10_000) for order in (layers, layers[::-1]))
     np.testing.assert_array_equal(first, second)
+
+
+@pytest.mark.parametrize("upright", [False, True])
+def test_very_long_canvas_is_blended(upright):
+    """Products of such a canvas's sides do not fit into 32 bits."""
+    length, width = 60_001, 5
+    bright, dark = (np.full((width, 40_001, 4), value, np.uint8) for value in (200, 100))
+    bright[..., 3] = dark[..., 3] = 255
+    places = [(0, 0), (20_000, 0)]
+    canvas = Canvas.plane(length, width)
+    if upright:
+        bright, dark = (np.swapaxes(pixels, 0, 1) for pixels in (bright, dark))
+        places = [(0, 0), (0, 20_000)]
+        canvas = Canvas.plane(width, length)
+    layers = [Layer.from_array("layer", p, *place) for p, place in zip((bright, dark), places, strict=True)]
+    result = merged(layers, canvas, exposure=False)
+    profile = result[:, 2, 0] if upright else result[2, :, 0]
+    assert np.all(np.diff(profile.astype(int)) <= 0)
+    assert np.all(profile[:20_000] == 200) and np.all(profile[40_001:] == 100)
+    assert 140 < profile[30_000] < 160
