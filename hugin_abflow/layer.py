@@ -14,6 +14,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from hugin_abflow.errors import ImageReadError
+
 # Rows `top` to `bottom` (exclusive) of a layer: (bottom - top, width, channels + 1), alpha last.
 RowReader = Callable[[int, int], npt.NDArray[Any]]
 
@@ -111,10 +113,20 @@ class Layer:
     ) -> Layer:
         """A layer from pixels in memory: (height, width, 2 or 4), alpha last.
 
-        Pixels with NaN or infinity are invalid, as in files.
+        Pixels with NaN or infinity are invalid, as in files. Raises `ImageReadError` for another shape
+        (colours without alpha, for example), an empty array or a type that layers do not have.
         """
+        if pixels.ndim != 3 or pixels.shape[2] not in (2, 4) or not pixels.size:
+            raise ImageReadError(
+                f"{name} has the shape {pixels.shape}; give (height, width, 4), RGB and alpha, "
+                "or (height, width, 2), grey and alpha"
+            )
+        if pixels.dtype.name not in ("uint8", "uint16", "float16", "float32"):
+            raise ImageReadError(
+                f"{name} has samples of type {pixels.dtype}; possible are uint8, uint16, float16, float32"
+            )
         height, width, samples = pixels.shape
-        stored = np.ascontiguousarray(pixels)
+        stored = np.ascontiguousarray(pixels, pixels.dtype.newbyteorder("="))
         if stored.dtype.kind == "f":
             finite = np.isfinite(stored).all(axis=2, keepdims=True)
             stored = stored if finite.all() else np.where(finite, stored, stored.dtype.type(0))

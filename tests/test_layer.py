@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from hugin_abflow.errors import ImageReadError
 from hugin_abflow.layer import Box, Canvas, Layer, full_scale
 
 
@@ -45,3 +46,22 @@ def test_layer_from_array_serves_the_rows_asked_for():
 )
 def test_full_scale(dtype, full):
     assert full_scale(dtype) == full
+
+
+@pytest.mark.parametrize("shape", [(7, 5), (7, 5, 3), (7, 5, 1), (7, 5, 5), (0, 5, 4), (7, 0, 4)])
+def test_array_of_another_shape_is_refused(shape):
+    with pytest.raises(ImageReadError, match=r"memory has the shape .*RGB and alpha"):
+        Layer.from_array("memory", np.zeros(shape, np.uint8))
+
+
+@pytest.mark.parametrize("dtype", [np.float64, np.int16, np.uint32, bool])
+def test_array_of_another_type_is_refused(dtype):
+    with pytest.raises(ImageReadError, match=r"memory has samples of type .*uint16"):
+        Layer.from_array("memory", np.zeros((7, 5, 4), dtype))
+
+
+def test_array_in_foreign_byte_order_is_converted():
+    pixels = np.arange(7 * 5 * 4, dtype=np.uint16).reshape(7, 5, 4)
+    layer = Layer.from_array("memory", pixels.astype(pixels.dtype.newbyteorder()))
+    assert layer.read(0, 7).dtype.isnative
+    assert np.array_equal(layer.read(0, 7), pixels)
