@@ -224,7 +224,10 @@ def _layers_by_prefix(plan: Plan, prefix: str | Path) -> _Found:
         found = _find_under(plan, place)
         if found:
             for image in found.missing(plan):
-                log.info("no layer of image %d (%s) under %s: not used", image.index, image.name, prefix)
+                # nona makes none for a photo that misses the crop, but one that was lost leaves a hole
+                log.warning(
+                    "no layer of image %d (%s) under %s: it is left out", image.index, image.name, prefix
+                )
             return found
     first = layer_name(prefix, plan.images[0].index, ".tif")
     raise LayersMissingError(

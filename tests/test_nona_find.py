@@ -221,6 +221,16 @@ def test_prefix_is_looked_up_here_and_beside_the_project(make_project, nona, whe
         assert len(layers) == 3
 
 
+def test_prefix_that_lacks_a_layer_says_so(make_project, nona, caplog):
+    plan = read_plan(make_project())
+    remap(plan, "pano")
+    (plan.folder / "pano0001.tif").unlink()
+    with open_layers(plan, prefix="pano") as layers:
+        assert names_of(layers) == ["pano0000.tif", "pano0002.tif"]
+    assert [record.levelname for record in caplog.records] == ["WARNING"]
+    assert "no layer of image 1 (photo 1.tif) under pano: it is left out" in caplog.text
+
+
 def test_prefix_without_layers(make_project):
     with (
         pytest.raises(LayersMissingError, match=r"no layer nope0000\.tif .*check --prefix"),
