@@ -79,7 +79,8 @@ def _open(path: Path, page: int) -> Any:
 def _unreadable(path: Path, why: str) -> ImageReadError:
     if not path.exists():
         return ImageReadError(f"{path} is not there")
-    return ImageReadError(f"{path} cannot be read ({why.strip() or 'unknown format'}); make the layer again")
+    reason = (why.strip() or "unknown format").splitlines()[0]  # OpenImageIO adds a line for each strip
+    return ImageReadError(f"{path} cannot be read ({reason}); make the layer again")
 
 
 def _describe(path: Path, name: str, page: int, source: Any, place: tifftags.Place | None) -> Layer:
