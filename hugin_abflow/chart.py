@@ -19,7 +19,8 @@ from hugin_abflow.working import Grid, WorkingLayer
 
 # Chart pixels around the overlap, so that flow is smooth across its border.
 _MARGIN = 16
-# Widths of charts that wrap are multiples of this, so that they halve exactly on every pyramid level.
+# Widths of charts that wrap are multiples of this, so that they halve exactly seven times: on every level of
+# the pyramid of a chart whose shorter side is below 1536 px.
 _WRAP_MULTIPLE = 128
 # Brightness that is added before the logarithm: about the dark noise of a photo, full scale is 1.
 _FLOOR = 0.05

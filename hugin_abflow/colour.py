@@ -1,8 +1,8 @@
 """Smooth exposure and colour correction of each layer (kernels/colour.cl).
 
-One gain field per layer and channel, in the log domain on a coarse grid: where layers overlap, the corrected
-layers agree; from there the correction spreads through each layer, smoothly, and fades out. It is the
-minimum of
+One gain field per layer and channel on a coarse grid, on the exposure scale of common.cl (log odds of integer
+images, log of floats): where layers overlap, the corrected layers agree; from there the correction spreads
+through each layer, smoothly, and fades out. It is the minimum of
 
     sum_pairs c (g_a - g_b + d_ab)^2  +  sum_k |grad g_k|^2  +  g_k^2 / fade^2
 
@@ -25,14 +25,16 @@ from hugin_abflow.working import Grid, WorkingLayer
 
 # Working pixels per cell of the colour grid.
 _CELL = 16
+# Samples brighter than this, of full scale, may be clipped and measure nothing (integer images only).
 _CLIPPED = 0.98
+# Standard deviation of the differences within a cell that halves its trust, on the exposure scale.
 _SPREAD = 0.3
 # Rounds of (weight of the measured differences against smoothness, residual that halves a cell's trust). The
 # first round fits the trend; what lies far from it is no exposure but something that only one layer shows.
 _ROUNDS = ((0.1, 1.5), (1.0, 1.0), (100.0, 0.8))
 # The correction fades out over this share of the canvas's width.
 _FADE = 0.12
-# Gains below this (a quarter of an 8-bit level at full scale) are taken to exactly 0.
+# All gains are shrunk towards 0 by this, at most a quarter of an 8-bit level, so that small ones are exactly 0.
 _NEGLIGIBLE = 1e-3
 # Of the residual, relative: the gains are then right to a level of 255, where layers differ to a quarter.
 _TOLERANCE, _ITERATIONS = 2e-4, 400
@@ -40,7 +42,9 @@ _TOLERANCE, _ITERATIONS = 2e-4, 400
 
 @dataclass(frozen=True)
 class Correction:
-    """Log gains: grid is the colour grid; gains one per layer, float32 (height, width, 4); None: none."""
+    """grid: the colour grid. gains: per layer, float32 (height, width, 4) on the exposure scale: r, g, b and
+    an unused 0; None: no correction.
+    """
 
     grid: Grid
     gains: tuple[Buffer | None, ...]

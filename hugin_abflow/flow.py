@@ -18,16 +18,16 @@ from hugin_abflow.pyramid import Level
 class FlowParameters:
     """What the solver weighs; units of h are log brightness."""
 
-    coarsest: int = 12  # px: the shorter side of the coarsest level
+    coarsest: int = 12  # px: the coarsest level's shorter side is at least this, less than twice this
     warps: tuple[int, ...] = (2, 5)  # linearisations per level, finest first; the last holds for all coarser
     sweeps: tuple[int, ...] = (12, 12, 24, 48)  # red-black sweeps per linearisation, likewise
     relaxation: float = 1.85  # of successive over-relaxation
     brightness: float = 5.0  # weight of brightness constancy
     gradient: float = 10.0  # weight of gradient constancy
-    smoothness: float = 12.0
+    smoothness: float = 12.0  # weight of the smoothness term
     contrast: float = 0.3  # step of h across which smoothness falls to 1/e
     noise: float = 0.01  # amplitude of h that is no texture
-    mean_sigma: float = 6.0  # px: h is log brightness less its mean over this neighbourhood
+    mean_sigma: float = 6.0  # px: h is log brightness less its Gaussian mean of this sigma
 
 
 @dataclass(frozen=True)

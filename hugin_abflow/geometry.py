@@ -103,7 +103,7 @@ def reach(device: Device, layer: WorkingLayer, field: Buffer, grid: Grid) -> lis
         "geometry", "geometry_reach", (layer.box[3], 1), field, layer.box, int(grid.lens[1] == 0), rows
     )
     lengths = rows.get()
-    if grid.lens[1]:  # half a chord turns a direction by half its angle: more than a chord of that length
+    if grid.lens[1]:  # a vector of length v, added to a unit vector, turns it by asin(v) at most
         angles = [math.asin(value) if value < 1 else math.pi for value in lengths.tolist()]
         return [angle / grid.lens[3] for angle in angles]
     return [float(value) for value in lengths]
