@@ -34,7 +34,7 @@ _SPREAD = 0.3
 _ROUNDS = ((0.1, 1.5), (1.0, 1.0), (100.0, 0.8))
 # The correction fades out over this share of the canvas's width.
 _FADE = 0.12
-# All gains are shrunk towards 0 by this, at most a quarter of an 8-bit level, so that small ones are exactly 0.
+# All gains shrink towards 0 by this, at most a quarter of an 8-bit level, so that small ones are exactly 0.
 _NEGLIGIBLE = 1e-3
 # Of the residual, relative: the gains are then right to a level of 255, where layers differ to a quarter.
 _TOLERANCE, _ITERATIONS = 2e-4, 400
