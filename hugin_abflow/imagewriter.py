@@ -146,9 +146,12 @@ class ImageWriter:
         # through a link: replace what it points to, not the link
         self._final = self.path.resolve()
         self._part = self._final.with_name(f".abflow-{secrets.token_hex(6)}{self.path.suffix}")
-        if self._final.is_dir():
-            raise OutputError(f"{self.path} is a folder; name a file with -o")
         try:
+            if self._final.is_dir():
+                raise OutputError(f"{self.path} is a folder; name a file with -o")
+            # a device or a pipe, reached by a link: the rename would take its place
+            if self._final.exists() and not self._final.is_file():
+                raise OutputError(f"{self.path} is no ordinary file; name one with -o")
             # made here, not by OpenImageIO: a clear reason, and never somebody else's file
             os.close(os.open(self._part, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o666))
         except OSError as error:

@@ -298,6 +298,22 @@ def test_rows_of_another_kind_are_a_mistake_of_the_caller(tmp_path):
     assert not names_in(tmp_path)
 
 
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="needs named pipes")
+def test_pipe_behind_a_link_is_not_replaced(tmp_path):
+    os.mkfifo(tmp_path / "pipe")
+    (tmp_path / "a.tif").symlink_to(tmp_path / "pipe")
+    with pytest.raises(OutputError, match=r"a\.tif is no ordinary file"):
+        write_image(tmp_path / "a.tif", noise(np.uint8))
+    assert (tmp_path / "pipe").is_fifo()
+    assert {path.name for path in tmp_path.iterdir()} == {"pipe", "a.tif"}
+
+
+def test_name_that_is_too_long_is_an_output_error(tmp_path):
+    with pytest.raises(OutputError, match=r"\.tif cannot be written"):
+        write_image(tmp_path / f"{'a' * 300}.tif", noise(np.uint8))
+    assert not list(tmp_path.iterdir())
+
+
 def test_output_errors_name_the_file_and_what_to_do(tmp_path):
     pixels = noise(np.uint8)
     with pytest.raises(OutputError, match=r"a\.bmp: the ending must be one of \.tif, .*\.exr"):
