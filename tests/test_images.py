@@ -203,6 +203,15 @@ def test_unusable_files_are_named_with_the_reason(tmp_path, what):
     assert str(path) in str(error.value) and what in str(error.value)
 
 
+def test_missing_strips_are_told_once(tmp_path):
+    path = tmp_path / "a.tif"
+    tifffile.imwrite(path, noise(np.uint8, width=61, height=90), photometric="rgb", rowsperstrip=5)
+    path.write_bytes(path.read_bytes()[:9000])
+    with pytest.raises(ImageReadError) as error:
+        whole(read_layer(path))
+    assert "a.tif cannot be read (" in str(error.value) and "\n" not in str(error.value)
+
+
 def test_broken_pixels_are_an_error_each_time(tmp_path):
     path = tmp_path / "a.tif"
     write_image(path, noise(np.uint8, width=600, height=300))
