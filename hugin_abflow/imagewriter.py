@@ -263,7 +263,15 @@ def write_image(
     jpeg_quality: int | None = None,
     canvas_size: tuple[int, int] | None = None,
 ) -> None:
-    """Write pixels (height, width, 2 or 4), unassociated alpha last; see `ImageWriter`."""
+    """Write pixels (height, width, 2 or 4), unassociated alpha last; see `ImageWriter`.
+
+    Raises `OutputError` for pixels of another shape and for what `ImageWriter` cannot write.
+    """
+    if pixels.ndim != 3 or pixels.shape[2] not in (2, 4) or not pixels.size:
+        raise OutputError(
+            f"{path}: the pixels have the shape {pixels.shape}; give (height, width, 4), RGB and alpha, "
+            "or (height, width, 2), grey and alpha"
+        )
     height, width, samples = pixels.shape
     with ImageWriter(
         path,

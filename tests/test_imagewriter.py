@@ -308,6 +308,13 @@ def test_pipe_behind_a_link_is_not_replaced(tmp_path):
     assert {path.name for path in tmp_path.iterdir()} == {"pipe", "a.tif"}
 
 
+@pytest.mark.parametrize("shape", [(5, 7), (5, 7, 3), (5, 7, 1), (0, 7, 4)])
+def test_pixels_without_alpha_are_refused(tmp_path, shape):
+    with pytest.raises(OutputError, match=r"a\.tif: the pixels have the shape .*RGB and alpha"):
+        write_image(tmp_path / "a.tif", np.zeros(shape, np.uint8))
+    assert not list(tmp_path.iterdir())
+
+
 def test_name_that_is_too_long_is_an_output_error(tmp_path):
     with pytest.raises(OutputError, match=r"\.tif cannot be written"):
         write_image(tmp_path / f"{'a' * 300}.tif", noise(np.uint8))
