@@ -20,7 +20,7 @@ class FlowParameters:
 
     coarsest: int = 12  # px: the coarsest level's shorter side is at least this, less than twice this
     warps: tuple[int, ...] = (2, 5)  # linearisations per level, finest first; the last holds for all coarser
-    sweeps: tuple[int, ...] = (12, 12, 24, 48)  # red-black sweeps per linearisation, likewise
+    sweeps: tuple[int, ...] = (12, 12, 24, 24)  # red-black sweeps per linearisation, likewise
     relaxation: float = 1.85  # of successive over-relaxation
     brightness: float = 5.0  # weight of brightness constancy
     gradient: float = 10.0  # weight of gradient constancy
@@ -72,12 +72,8 @@ def _refine(
             parameters.smoothness, parameters.contrast, system_left, system_right,
         )  # fmt: skip
         half = ((size[0] + 1) // 2, size[1])
-        for _ in range(sweeps):
-            for colour in (0, 1):
-                device.run(
-                    "flow", "flow_relax", half, system_left, system_right, grid, colour,
-                    parameters.relaxation, flow,
-                )  # fmt: skip
+        calls = [(system_left, system_right, grid, colour, parameters.relaxation, flow) for colour in (0, 1)]
+        device.repeat("flow", "flow_relax", half, calls, sweeps)
         device.run("flow", "flow_median", size, flow, grid, base)
         flow, base = base, flow
     return flow

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -58,8 +59,7 @@ def merge_project(
             offset=(crop.left, crop.top), canvas_size=(plan.canvas.width, plan.canvas.height), icc=first.icc,
             compression=compression, jpeg_quality=jpeg_quality,
         ) as writer:  # fmt: skip
-            for rows in _bands(opened, plan.canvas, settings, progress):
-                writer.write_rows(rows)
+            _write(writer, _bands(opened, plan.canvas, settings, progress))
     return target
 
 
@@ -88,6 +88,18 @@ def _bands(
     device = Device(settings.device)
     method = {"joint": joint.merge, "sequential": sequential.merge}[settings.merge]
     yield from method(device, layers, canvas, settings, progress)
+
+
+def _write(writer: ImageWriter, bands: Iterator[npt.NDArray[Any]]) -> None:
+    """Write bands, encoding each while the next one is calculated."""
+    with ThreadPoolExecutor(max_workers=1) as encoder:
+        encoded: Future[None] | None = None
+        for rows in bands:
+            if encoded:
+                encoded.result()
+            encoded = encoder.submit(writer.write_rows, rows)
+        if encoded:
+            encoded.result()
 
 
 def _target(plan: Plan, layers: Sequence[Layer], output: Path | str | None) -> Path:

@@ -227,14 +227,35 @@ class Device:
             return
         kernel = self.kernel(module, name, options)
         kernel.set_args(*(_argument(a) for a in args))
-        rounded = tuple(-(-int(n) // g) * g for n, g in zip(size, _GROUP, strict=True))
         with _device_errors(f"running {name}"):
-            cl.enqueue_nd_range_kernel(self.queue, kernel, rounded, _GROUP)
+            cl.enqueue_nd_range_kernel(self.queue, kernel, _rounded(size), _GROUP)
+
+    def repeat(
+        self, module: str, name: str, size: Sequence[int], calls: Sequence[Sequence[object]], times: int
+    ) -> None:
+        """Run a kernel with each of the argument lists `calls` in turn, `times` over.
+
+        Arguments are set once: on small grids that is most of what a launch costs.
+        """
+        program = self.kernel(module, name).program
+        kernels = [cl.Kernel(program, name) for _ in calls]
+        for kernel, args in zip(kernels, calls, strict=True):
+            kernel.set_args(*(_argument(a) for a in args))
+        rounded = _rounded(size)
+        with _device_errors(f"running {name}"):
+            for _ in range(times):
+                for kernel in kernels:
+                    cl.enqueue_nd_range_kernel(self.queue, kernel, rounded, _GROUP)
 
     def finish(self) -> None:
         """Wait for all that was started; raises `DeviceError` if the device failed."""
         with _device_errors("finishing"):
             self.queue.finish()
+
+
+def _rounded(size: Sequence[int]) -> tuple[int, ...]:
+    """A run size in whole work-groups."""
+    return tuple(-(-int(n) // g) * g for n, g in zip(size, _GROUP, strict=True))
 
 
 def _argument(value: Any) -> Any:

@@ -36,6 +36,24 @@ static inline float4 blend_sample(__global const PIXEL *rows, int4 box, float2 q
     const int2 corner = convert_int2(base);
     const float4 wx = catmull_rom(t.x), wy = catmull_rom(t.y);
     const float ax[4] = {wx.x, wx.y, wx.z, wx.w}, ay[4] = {wy.x, wy.y, wy.z, wy.w};
+    const int2 first = corner - 1 - box.xy;
+    if (first.x >= 0 && first.y >= 0 && first.x + 3 < box.z && first.y + 3 < box.w) {
+        /* nearly all samples: every tap is stored, no border rule is needed */
+        float4 all = (float4)(0.0f);
+        float valid = 1.0f;
+        for (int j = 0; j < 4; ++j) {
+            const int at = (first.y + j) * box.z + first.x;
+            float4 row = (float4)(0.0f);
+            for (int i = 0; i < 4; ++i) {
+                const float4 c = blend_pixel(rows, at + i);
+                row += ax[i] * c;
+                valid *= c.w;
+            }
+            all += ay[j] * row;
+        }
+        if (valid != 0.0f)
+            return (float4)(all.xyz, 1.0f);
+    }
     float4 cubic = (float4)(0.0f), linear = (float4)(0.0f);
     int missing = 0;
     for (int j = 0; j < 4; ++j) {
@@ -71,6 +89,14 @@ static inline float4 blend_field(__global const float4 *field, int4 box, float2 
     return sum;
 }
 
+/* atan2 of a positive x; a few terms of the series do where the angle is small, as it nearly always is. */
+static inline float blend_angle(float y, float x) {
+    const float t = y / x, t2 = t * t;
+    if (x > 0.0f && t2 < 0.01f)
+        return t * (1.0f - t2 * (1.0f / 3.0f - t2 * (0.2f - t2 / 7.0f)));
+    return atan2(y, x);
+}
+
 /* Where layer k is sampled for the pixel at p: the field's displacement carried to full resolution. */
 static inline float2 blend_position(float2 p, float3 d, float2 ratio, float4 lens) {
     if (d.x == 0.0f && d.y == 0.0f && d.z == 0.0f)
@@ -79,16 +105,19 @@ static inline float2 blend_position(float2 p, float3 d, float2 ratio, float4 len
         return p + d.xy * ratio;
     /* in the frame of p (east, north, up) the change of longitude is small, hence exact in float32 */
     const float lon = lens.x + p.x * lens.y, lat = lens.z - p.y * lens.w;
-    const float sl = sin(lon), cl = cos(lon), sp = sin(lat), cp = cos(lat);
+    float cl, cp;
+    const float sl = sincos(lon, &cl), sp = sincos(lat, &cp);
     const float horizontal = sl * d.x + cl * d.y;
     const float east = cl * d.x - sl * d.y, out = cp + horizontal;
-    const float north = sp + d.z;
-    return (float2)(p.x + atan2(east, out) / lens.y,
-                    p.y + (lat - atan2(north, hypot(east, out))) / lens.w);
+    const float north = sp + d.z, level = sqrt(east * east + out * out);
+    return (float2)(p.x + blend_angle(east, out) / lens.y,
+                    p.y - blend_angle(north * cp - level * sp, level * cp + north * sp) / lens.w);
 }
 
 /* Smooth exposure correction of a colour in stored units. */
 static inline float3 blend_correct(float3 c, float3 gain) {
+    if (all(gain == 0.0f))
+        return c;
     const float3 corrected = exposure_shift(c / WHITE, gain, INTEGER) * WHITE;
     return select(corrected, c, gain == 0.0f);
 }
