@@ -20,7 +20,7 @@ class FlowParameters:
 
     coarsest: int = 12  # px: the coarsest level's shorter side is at least this, less than twice this
     warps: tuple[int, ...] = (2, 5)  # linearisations per level, finest first; the last holds for all coarser
-    sweeps: tuple[int, ...] = (12, 12, 24, 24)  # red-black sweeps per linearisation, likewise
+    sweeps: tuple[int, ...] = (8, 12, 24, 24)  # red-black sweeps per linearisation, likewise
     relaxation: float = 1.85  # of successive over-relaxation
     brightness: float = 5.0  # weight of brightness constancy
     gradient: float = 10.0  # weight of gradient constancy

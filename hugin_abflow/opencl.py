@@ -20,8 +20,8 @@ from hugin_abflow.errors import DeviceError
 
 _log = logging.getLogger(__name__)
 
-# Work-group: rows of 64 suit both a GPU's wavefronts and the CPU's vector units.
-_GROUP = (64, 1)
+# Work-group: rows suit both a GPU's wavefronts and the vector units of a CPU.
+_GROUP = (256, 1)
 
 _INSTALL = {
     "linux": "install a CPU runtime with `pip install 'pyopencl[pocl]'` (or Debian's pocl-opencl-icd), "
