@@ -8,6 +8,7 @@ import re
 import signal
 import subprocess
 import sys
+import time
 import textwrap
 from collections.abc import Callable
 from pathlib import Path
@@ -137,9 +138,12 @@ def test_bars_on_a_terminal_only_and_on_stderr(term: str, quiet: list[str], bars
 @pytest.mark.skipif(os.name == "nt", reason="Windows has no such signals")
 @pytest.mark.parametrize("name", ["SIGINT", "SIGTERM", "SIGHUP"])
 def test_signal_unwinds_and_ends_with_130(
-    replace: Replace, capsys: pytest.CaptureFixture[str], name: str
+    replace: Replace, capsys: pytest.CaptureFixture[str], request: pytest.FixtureRequest, name: str
 ) -> None:
     number = getattr(signal, name)
+    # under nohup, or in a shell's background, the tests themselves run with signals ignored
+    inherited = signal.signal(number, signal.default_int_handler if name == "SIGINT" else signal.SIG_DFL)
+    request.addfinalizer(lambda: signal.signal(number, inherited))
     before = signal.getsignal(number)
     unwound, merged = [], []
 
@@ -147,7 +151,7 @@ def test_signal_unwinds_and_ends_with_130(
         merged.append(path)
         try:
             os.kill(os.getpid(), number)
-            signal.pause()
+            time.sleep(30)  # cut short by the signal
         finally:
             os.kill(os.getpid(), number)  # an impatient user: the tidying up goes on
             unwound.append(True)
