@@ -8,8 +8,8 @@ import re
 import signal
 import subprocess
 import sys
-import time
 import textwrap
+import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
