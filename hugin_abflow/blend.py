@@ -27,7 +27,7 @@ class BlendLayer:
 
     field   displacement and colour weight on the layer's box of the working grid.
     reach   per row of that box, the largest vertical displacement, working px.
-    gain    log gain on the colour grid, float32 (height, width, 4); None: no correction.
+    gain    on the exposure scale and the colour grid, float32 (height, width, 4); None: no correction.
     """
 
     working: WorkingLayer

@@ -54,7 +54,7 @@ def _refine(
     grid, size = a.grid, a.grid[:2]
     shape = size[::-1]
     warped, tensor, left = (device.empty((*shape, 4)) for _ in range(3))
-    right, base = (device.empty((*shape, 2)) for _ in range(2))
+    right, median = (device.empty((*shape, 2)) for _ in range(2))
     system_left, system_right = (device.empty((*shape, 4)) for _ in range(2))
     window_right = device.empty((*shape, 2))
     warps, sweeps = (
@@ -74,8 +74,8 @@ def _refine(
         half = ((size[0] + 1) // 2, size[1])
         calls = [(system_left, system_right, grid, colour, parameters.relaxation, flow) for colour in (0, 1)]
         device.repeat("flow", "flow_relax", half, calls, sweeps)
-        device.run("flow", "flow_median", size, flow, grid, base)
-        flow, base = base, flow
+        device.run("flow", "flow_median", size, flow, grid, median)
+        flow, median = median, flow
     return flow
 
 

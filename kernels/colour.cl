@@ -23,8 +23,9 @@ static inline float2 colour_position(int2 p, float3 d, float4 lens) {
     return canvas_position(canvas_point(q, lens) + d, lens);
 }
 
-/* Mean difference a - b on the exposure scale over the cell's pixels that both layers show unclipped, and how far it can be trusted:
-   less where the pixels disagree among themselves, that is, where the layers do not show the same thing. */
+/* Mean difference a - b on the exposure scale over the pixels of a cell (every second one in x and y) that both
+   layers show unclipped, and how far it can be trusted: less where the pixels disagree among themselves, that
+   is, where the layers do not show the same thing. */
 __kernel void colour_difference(__global const float4 *layer_a, __global const float4 *field_a, int4 box_a,
                                 __global const float4 *layer_b, __global const float4 *field_b, int4 box_b,
                                 int4 border, float4 lens,   /* working grid */
