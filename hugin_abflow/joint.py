@@ -10,12 +10,13 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from hugin_abflow import blend, chart, coefficient, colour, flow, geometry, working
+from hugin_abflow import blend, chart, coefficient, colour, consistency, flow, geometry, seam, working
 from hugin_abflow.blend import BlendLayer
-from hugin_abflow.coefficient import Masks
+from hugin_abflow.coefficient import Coefficients, Masks
+from hugin_abflow.colour import Correction
 from hugin_abflow.geometry import PairFlow
 from hugin_abflow.layer import Canvas, Layer
-from hugin_abflow.opencl import Device, DeviceMemoryError
+from hugin_abflow.opencl import Buffer, Device, DeviceMemoryError
 from hugin_abflow.progress import Progress
 from hugin_abflow.settings import Settings
 from hugin_abflow.working import Grid, WorkingLayer
@@ -24,6 +25,8 @@ _log = logging.getLogger(__name__)
 
 # Overlaps of fewer working pixels than this have nothing to match.
 _LEAST_OVERLAP = 64
+# What only one layer shows first passes for exposure in part: its region grows to its size in a few rounds.
+_SEAM_ROUNDS = 2
 # Below this a working canvas is too small to be worth another attempt.
 _LEAST_WORKING_PIXELS = 20_000
 
@@ -82,14 +85,44 @@ def prepare(
     masks = masks.only(used)
     coefficients = coefficient.coefficients(device, reduced, masks, grid, settings)
     flows = _flows(device, reduced, masks, grid, progress)
-    fields = geometry.fields(device, reduced, coefficients, flows, grid, settings)
-    correction = colour.correction(device, reduced, fields, flows, grid, masks.host, settings)
+    fields, correction = _align(device, reduced, coefficients, flows, masks, grid, settings)
     final = [
         BlendLayer(layer, field, geometry.reach(device, layer, field, grid), gain)
         for layer, field, gain in zip(reduced, fields, correction.gains, strict=True)
     ]
     final += [_unblended(device, everything[i]) for i in range(len(everything)) if i not in used]
     return Prepared(tuple(final), full, grid, correction.grid)
+
+
+def _align(
+    device: Device,
+    layers: Sequence[WorkingLayer],
+    coefficients: Sequence[Coefficients],
+    flows: Sequence[PairFlow],
+    masks: Masks,
+    grid: Grid,
+    settings: Settings,
+) -> tuple[list[Buffer], Correction]:
+    """Geometry and colour that make the layers agree; where nothing does, one layer whole.
+
+    What flow cannot explain spoils flow and exposure around it, so both are found again without it.
+    """
+    regions: npt.NDArray[np.bool_] | None = None
+    rounds = _SEAM_ROUNDS if settings.seam else 0
+    while True:
+        pairs = [consistency.mend(device, pair, grid, regions) for pair in flows]
+        fields = geometry.fields(device, layers, coefficients, pairs, grid, settings)
+        correction = colour.correction(device, layers, fields, pairs, grid, masks.host, settings, regions)
+        if not rounds:
+            break
+        found = seam.regions(device, layers, fields, pairs, correction, grid)
+        grown = found if regions is None else found | regions
+        if not grown.any() or (regions is not None and np.array_equal(grown, regions)):
+            break
+        regions, rounds = grown, rounds - 1
+    if regions is not None:
+        seam.cut(device, layers, fields, coefficients, pairs, correction, regions, masks, grid)
+    return fields, correction
 
 
 def _read(device: Device, layers: Sequence[Layer], grid: Grid, progress: Progress) -> list[WorkingLayer]:

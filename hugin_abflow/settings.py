@@ -19,6 +19,7 @@ class Settings:
     softmax_sharpness   kSoftmaxSharpness of the paper (Code 1); 0..1000, no unit.
     flow_magnitude      kFlowMagCoef of the paper (Code 1); 0..10000, no unit.
     exposure            match exposure and colour of the layers where they overlap, and spread it smoothly.
+    seam                take from one layer, whole, what flow cannot explain (people who moved, occlusions).
     interpolation       how layers are sampled; "nearest" is for comparison with the paper's own code.
     working_pixels      upper bound of the pixels of the working canvas (flow, coefficients, colour).
     border_feather      width of the ramp that brings a layer's weight to 0 at its own border, in working
@@ -34,6 +35,7 @@ class Settings:
     softmax_sharpness: float = 10.0
     flow_magnitude: float = 100.0
     exposure: bool = True
+    seam: bool = True
     interpolation: Interpolation = "bicubic"
     working_pixels: int = 2_100_000
     border_feather: float = 6.0

@@ -1,28 +1,5 @@
 /* How two aligned layers differ in exposure and colour, per cell of a coarse colour grid. */
 
-static inline float4 colour_sample(__global const float4 *layer, int4 box, float2 q, int4 border) {
-    const float2 p = q - 0.5f, base = floor(p), t = p - base;
-    float4 sum = (float4)(0.0f);
-    for (int j = 0; j < 2; ++j)
-        for (int i = 0; i < 2; ++i) {
-            int2 c = convert_int2(base) + (int2)(i, j);
-            if (!grid_border(&c, border))
-                continue;
-            const int at = box_index(c, box);
-            if (at >= 0)
-                sum += (i ? t.x : 1.0f - t.x) * (j ? t.y : 1.0f - t.y) * layer[at];
-        }
-    return sum.w > 0.999f ? sum : (float4)(0.0f);
-}
-
-/* Where a layer is sampled for working pixel p. */
-static inline float2 colour_position(int2 p, float3 d, float4 lens) {
-    const float2 q = (float2)(p.x + 0.5f, p.y + 0.5f);
-    if (d.x == 0.0f && d.y == 0.0f && d.z == 0.0f)
-        return q;
-    return canvas_position(canvas_point(q, lens) + d, lens);
-}
-
 /* Mean difference a - b on the exposure scale over the pixels of a cell (every second one in x and y) that both
    layers show unclipped, and how far it can be trusted: less where the pixels disagree among themselves, that
    is, where the layers do not show the same thing. */
@@ -49,8 +26,8 @@ __kernel void colour_difference(__global const float4 *layer_a, __global const f
             const int at_a = box_index(p, box_a), at_b = box_index(p, box_b);
             if (at_a < 0 || at_b < 0 || layer_a[at_a].w == 0.0f || layer_b[at_b].w == 0.0f)
                 continue;
-            const float4 a = colour_sample(layer_a, box_a, colour_position(p, field_a[at_a].xyz, lens), border);
-            const float4 b = colour_sample(layer_b, box_b, colour_position(p, field_b[at_b].xyz, lens), border);
+            const float4 a = layer_sample(layer_a, box_a, layer_position(p, field_a[at_a].xyz, lens), border);
+            const float4 b = layer_sample(layer_b, box_b, layer_position(p, field_b[at_b].xyz, lens), border);
             if (a.w == 0.0f || b.w == 0.0f || any(a.xyz > clipped) || any(b.xyz > clipped))
                 continue;
             const float3 d = exposure_scale(a.xyz, integer) - exposure_scale(b.xyz, integer);

@@ -109,6 +109,30 @@ static inline float2 bilinear_flow(__global const float2 *values, float2 q, int4
     return weight > 1e-6f ? sum / weight : (float2)(0.0f);
 }
 
+/* A layer of the working grid at position q, bilinear; all 0 where a tap is missing. */
+static inline float4 layer_sample(__global const float4 *layer, int4 box, float2 q, int4 border) {
+    const float2 p = q - 0.5f, base = floor(p), t = p - base;
+    float4 sum = (float4)(0.0f);
+    for (int j = 0; j < 2; ++j)
+        for (int i = 0; i < 2; ++i) {
+            int2 c = convert_int2(base) + (int2)(i, j);
+            if (!grid_border(&c, border))
+                continue;
+            const int at = box_index(c, box);
+            if (at >= 0)
+                sum += (i ? t.x : 1.0f - t.x) * (j ? t.y : 1.0f - t.y) * layer[at];
+        }
+    return sum.w > 0.999f ? sum : (float4)(0.0f);
+}
+
+/* Where a layer is sampled for working pixel p. */
+static inline float2 layer_position(int2 p, float3 d, float4 lens) {
+    const float2 q = (float2)(p.x + 0.5f, p.y + 0.5f);
+    if (d.x == 0.0f && d.y == 0.0f && d.z == 0.0f)
+        return q;
+    return canvas_position(canvas_point(q, lens) + d, lens);
+}
+
 /* The scale on which exposure differences are smooth fields, c in 0..1 of full scale. Integer images: log odds,
    floats: log. The floor keeps dark noise, and what is nearly white, calm where differences are measured. */
 #define EXPOSURE_FLOOR 0.02f

@@ -1,0 +1,273 @@
+"""What flow cannot explain is taken from one layer, whole (kernels/seam.cl).
+
+Somebody who walked, or a near thing that hides another part of the scene for each camera, leaves aligned
+layers that differ although exposure is corrected. In each connected region of such cells every cell is given
+to one layer: the one that the blend coefficients favour, with cuts between layers, and at the layers' own
+borders, where they show least. This is a labelling of least energy,
+
+    sum_cells r (1 - w_k)  +  sum_neighbours c (r + r') / 2 [k != k']  +  sum_borders c r
+
+with r the residual, w_k the blend coefficient and c the price of a cut, found by graph cuts (alpha expansion:
+Boykov, Veksler, Zabih, "Fast approximate energy minimization via graph cuts", 2001). Regions keep to
+themselves: elsewhere the softmax stays as it is, and the transition lies where the layers agree.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+from scipy.sparse import csr_array
+from scipy.sparse.csgraph import breadth_first_order, maximum_flow
+
+from hugin_abflow import colour
+from hugin_abflow.coefficient import Coefficients, Masks
+from hugin_abflow.colour import Correction
+from hugin_abflow.geometry import PairFlow
+from hugin_abflow.opencl import Buffer, Device
+from hugin_abflow.working import Grid, WorkingLayer
+
+# Working pixels per cell of the seam grid.
+_CELL = 8
+# Cells over which differences are averaged: texture that is a little off is no reason to cut.
+_SIGMA = 1.0
+# Residual on the exposure scale that makes a region one layer's, and that of its outskirts.
+_STRONG, _WEAK = 0.8, 0.2
+# Strong cells, of the equator's size, that a region has at least: fewer are an edge that is a pixel off.
+_LEAST = 6.0
+# Price of a cut, in cells: what is cut off must be favoured by the coefficients over this depth.
+_CUT = 20.0
+# No layer is taken where it is not.
+_FORBIDDEN = 1e4
+# Capacities are integers; residuals are around 1.
+_UNIT = 1000
+
+
+def seam_grid(grid: Grid) -> Grid:
+    """The grid of the regions, over the working grid's region."""
+    return grid.resized(max(1, round(grid.width / _CELL)), max(1, round(grid.height / _CELL)))
+
+
+def regions(
+    device: Device,
+    layers: Sequence[WorkingLayer],
+    fields: Sequence[Buffer],
+    pairs: Sequence[PairFlow],
+    correction: Correction,
+    grid: Grid,
+) -> npt.NDArray[np.bool_]:
+    """Where aligned, corrected layers still differ: (height, width) on the seam grid."""
+    cells = seam_grid(grid)
+    found = _regions(_residual(device, layers, fields, pairs, correction, grid, cells), cells)
+    return np.logical_or.reduce(found) if found else np.zeros(cells.shape, bool)
+
+
+def cut(
+    device: Device,
+    layers: Sequence[WorkingLayer],
+    fields: Sequence[Buffer],
+    coefficients: Sequence[Coefficients],
+    pairs: Sequence[PairFlow],
+    correction: Correction,
+    whole: npt.NDArray[np.bool_],
+    masks: Masks,
+    grid: Grid,
+) -> None:
+    """Give each cell of the regions `whole` to one layer: the others lose their colour weight there
+    (fields[...].w, in place).
+    """
+    cells = seam_grid(grid)
+    residual = _residual(device, layers, fields, pairs, correction, grid, cells)
+    cover = _cells_whole(masks.host, cells)
+    shares = np.stack(
+        [_on_cells(c.blend.get(), k.box, grid, cells) for c, k in zip(coefficients, layers, strict=True)]
+    )
+    yields = np.zeros(cover.shape, np.float32)
+    for region in _connected(whole, cells.wraps):
+        rows, columns = np.nonzero(region)
+        winner = label(rows, columns, residual, shares, cover, cells.wraps)
+        yields[:, rows, columns] = winner[None] != np.arange(len(layers))[:, None]
+    for layer, field, one in zip(layers, fields, yields, strict=True):
+        if one.any():
+            soft = device.upload(_soften(one, cells.wraps))
+            device.run("seam", "seam_yield", layer.box[2:], field, layer.box, grid.border, soft, cells.border)
+
+
+def _residual(
+    device: Device,
+    layers: Sequence[WorkingLayer],
+    fields: Sequence[Buffer],
+    pairs: Sequence[PairFlow],
+    correction: Correction,
+    grid: Grid,
+    cells: Grid,
+) -> npt.NDArray[np.float64]:
+    """How far low frequencies differ: per cell the largest of any pair and channel, 0 where no two lie."""
+    largest = np.zeros(cells.shape)
+    for pair in pairs:
+        difference = colour.difference(device, layers, fields, pair, grid, cells)
+        left = difference[..., :3] + _gain(correction, pair.a, cells) - _gain(correction, pair.b, cells)
+        mean = _smooth(np.dstack([left * difference[..., 3:], difference[..., 3]]), cells.wraps)
+        known = difference[..., 3] > 0
+        mean = np.abs(mean[..., :3]).max(-1) / np.where(known, mean[..., 3], 1)
+        largest = np.maximum(largest, mean * known)
+    return largest
+
+
+def _gain(correction: Correction, index: int, cells: Grid) -> npt.NDArray[np.float32]:
+    """A layer's correction on the seam grid: nearest, it is smooth."""
+    gain = correction.gains[index]
+    if gain is None:
+        return np.zeros((*cells.shape, 3), np.float32)
+    rows = np.arange(cells.height) * correction.grid.height // cells.height
+    columns = np.arange(cells.width) * correction.grid.width // cells.width
+    return gain.get()[rows][:, columns, :3]
+
+
+def _smooth(values: npt.NDArray[np.float64], wraps: bool) -> npt.NDArray[np.float64]:
+    """A Gaussian of _SIGMA cells, not normalised at the borders."""
+    by = math.ceil(3 * _SIGMA)
+    blurred = cv2.GaussianBlur(_padded(values, by, wraps), (2 * by + 1, 2 * by + 1), _SIGMA)
+    return np.asarray(blurred[by:-by, by:-by])
+
+
+def _padded(values: npt.NDArray[Any], by: int, wraps: bool) -> npt.NDArray[Any]:
+    """Cells around: 0, or from the other side where columns wrap."""
+    beyond = [(0, 0)] * (values.ndim - 2)
+    values = np.pad(values, ((by, by), (0, 0), *beyond))
+    return np.pad(values, ((0, 0), (by, by), *beyond), mode="wrap" if wraps else "constant")
+
+
+def _regions(residual: npt.NDArray[np.float64], cells: Grid) -> list[npt.NDArray[np.bool_]]:
+    """Connected cells of weak residual that hold enough of strong residual, grown by a cell."""
+    weak = _padded((residual > _WEAK).astype(np.uint8), 1, cells.wraps)
+    grown = np.asarray(cv2.dilate(weak, np.ones((3, 3), np.uint8)))[1:-1, 1:-1] > 0
+    latitude = cells.lens[2] - (np.arange(cells.height) + 0.5) * cells.lens[3]
+    area = np.cos(latitude)[:, None] if cells.lens[1] else 1.0
+    strong = (residual > _STRONG) * area
+    return [region for region in _connected(grown, cells.wraps) if strong[region].sum() >= _LEAST]
+
+
+def _connected(mask: npt.NDArray[np.bool_], wraps: bool) -> list[npt.NDArray[np.bool_]]:
+    """The connected parts of a mask."""
+    count, found = cv2.connectedComponents(mask.astype(np.uint8), connectivity=8)
+    labels = np.asarray(found)
+    if wraps:  # parts that meet across the border are one
+        for first, last in zip(labels[:, 0], labels[:, -1], strict=True):
+            if first and last and first != last:
+                labels[labels == last] = first
+    return [labels == k for k in np.unique(labels[mask])] if count > 1 else []
+
+
+def label(
+    rows: npt.NDArray[np.intp],
+    columns: npt.NDArray[np.intp],
+    residual: npt.NDArray[np.float64],
+    shares: npt.NDArray[np.float64],
+    cover: npt.NDArray[np.bool_],
+    wraps: bool,
+) -> npt.NDArray[np.intp]:
+    """Which layer each cell (rows, columns) of a region is taken from: the least energy found.
+
+    residual: (height, width). shares, cover: blend coefficients and coverage (layers, height, width).
+    """
+    candidates = np.flatnonzero(cover[:, rows, columns].any(1))
+    if candidates.size < 2:
+        return np.full(rows.size, candidates[0] if candidates.size else 0)
+    weight = residual[rows, columns]
+    present = cover[candidates][:, rows, columns]
+    price = np.where(present, weight * (1 - shares[candidates][:, rows, columns]), _FORBIDDEN)
+    number = np.full(residual.shape, -1)
+    number[rows, columns] = np.arange(rows.size)
+    links = []
+    for down, right in ((0, 1), (1, 0), (0, -1), (-1, 0)):
+        inside, there = _neighbours(rows + down, columns + right, residual.shape, wraps)
+        # a layer's own border is a cut as well, where the union goes on
+        price += _CUT * weight * (inside & cover[:, *there].any(0) & ~cover[candidates][:, *there])
+        if down + right > 0:
+            linked = np.flatnonzero(inside & (number[there] >= 0))
+            links.append(np.stack([linked, number[there][linked]]))
+    first, second = np.concatenate(links, 1)
+    between = _CUT * (weight[first] + weight[second]) / 2
+    current = np.full(rows.size, np.argmin(price.sum(1)))
+    for _ in range(1 if candidates.size == 2 else 2):
+        for alpha in range(candidates.size):
+            current = _expand(current, alpha, price, first, second, between)
+    return candidates[current]
+
+
+def _neighbours(
+    rows: npt.NDArray[np.intp], columns: npt.NDArray[np.intp], shape: tuple[int, int], wraps: bool
+) -> tuple[npt.NDArray[np.bool_], tuple[npt.NDArray[np.intp], npt.NDArray[np.intp]]]:
+    """Which places lie on the grid, and rows and columns that can be read for all of them."""
+    inside = (rows >= 0) & (rows < shape[0])
+    if not wraps:
+        inside &= (columns >= 0) & (columns < shape[1])
+    return inside, (np.clip(rows, 0, shape[0] - 1), columns % shape[1])
+
+
+def _expand(
+    current: npt.NDArray[np.intp],
+    alpha: int,
+    price: npt.NDArray[np.float64],
+    first: npt.NDArray[np.intp],
+    second: npt.NDArray[np.intp],
+    between: npt.NDArray[np.float64],
+) -> npt.NDArray[np.intp]:
+    """The best of all labellings in which each cell keeps its label or takes `alpha`: a minimal cut."""
+    count = current.size
+    if (current == alpha).all():
+        return current
+    each = np.arange(count)
+    take = price[alpha] - price[current, each]  # cost of x = 1, "takes alpha", over x = 0
+    now = between * (current[first] != current[second])
+    only_second = between * (current[first] != alpha)  # first keeps, second takes alpha
+    only_first = between * (current[second] != alpha)
+    np.add.at(take, first, only_first - now)
+    np.add.at(take, second, -only_first)
+    edge = only_second + only_first - now
+    source, sink = count, count + 1
+    starts = np.concatenate([first, np.full(count, source), each])
+    ends = np.concatenate([second, each, np.full(count, sink)])
+    capacities = np.concatenate([edge, np.maximum(take, 0), np.maximum(-take, 0)])
+    whole = np.minimum(np.rint(capacities * _UNIT), 2**30 - 1).astype(np.int32)
+    graph = csr_array((whole, (starts, ends)), shape=(count + 2, count + 2))
+    left = graph - maximum_flow(graph, source, sink).flow
+    left.data = np.maximum(left.data, 0)
+    left.eliminate_zeros()
+    keeps = breadth_first_order(left, source, return_predecessors=False)
+    takes = np.ones(count + 2, bool)
+    takes[keeps] = False
+    return np.where(takes[:count], alpha, current)
+
+
+def _cells_whole(covered: npt.NDArray[np.bool_], cells: Grid) -> npt.NDArray[np.bool_]:
+    """Which cells a layer covers whole; `covered` is (layers, height, width) on any finer grid."""
+    for axis, count in ((1, cells.height), (2, cells.width)):
+        starts = np.arange(count) * covered.shape[axis] // count
+        covered = np.logical_and.reduceat(covered, starts, axis)
+    return covered
+
+
+def _on_cells(
+    blend: npt.NDArray[np.float32], box: tuple[int, int, int, int], grid: Grid, cells: Grid
+) -> npt.NDArray[np.float64]:
+    """Blend coefficients at the cells' centres; 0 outside the layer's box."""
+    left, top, width, height = box
+    rows = ((np.arange(cells.height) + 0.5) * grid.height / cells.height).astype(int) - top
+    columns = ((np.arange(cells.width) + 0.5) * grid.width / cells.width).astype(int) - left
+    row_inside, column_inside = (rows >= 0) & (rows < height), (columns >= 0) & (columns < width)
+    result = np.zeros(cells.shape)
+    result[np.ix_(row_inside, column_inside)] = blend[np.ix_(rows[row_inside], columns[column_inside])]
+    return result
+
+
+def _soften(mask: npt.NDArray[np.float32], wraps: bool) -> npt.NDArray[np.float32]:
+    """Blur a mask's outline over a cell to each side."""
+    padded = np.pad(mask, ((1, 1), (0, 0)), mode="edge")  # nothing yields less at a pole
+    padded = np.pad(padded, ((0, 0), (1, 1)), mode="wrap" if wraps else "edge")
+    return np.ascontiguousarray(cv2.blur(padded, (3, 3))[1:-1, 1:-1])
