@@ -48,12 +48,7 @@ def fields(
     """Per layer, on its box: float32 (height, width, 4), the displacement of x_k as a difference of points
     (sphere: of unit vectors; plane: working px) and the colour weight s_k, not yet normalised.
     """
-    result = []
-    for index in range(len(layers)):
-        field = _displacement(device, index, layers, coefficients, flows, grid, None)
-        for _ in range(settings.fixed_point_steps):
-            field = _displacement(device, index, layers, coefficients, flows, grid, field)
-        result.append(field)
+    result = displacements(device, layers, coefficients, flows, grid, settings)
     highest = device.zeros(grid.shape)
     furthest = _PLAUSIBLE * grid.circumference
     for layer, field, coefficient in zip(layers, result, coefficients, strict=True):
@@ -68,6 +63,24 @@ def fields(
             "geometry", "geometry_softmax", layer.box[2:], field, coefficient.blend, coefficient.rim,
             layer.box, grid.border, highest,
         )  # fmt: skip
+    return result
+
+
+def displacements(
+    device: Device,
+    layers: Sequence[WorkingLayer],
+    coefficients: Sequence[Coefficients],
+    flows: Sequence[PairFlow],
+    grid: Grid,
+    settings: Settings,
+) -> list[Buffer]:
+    """The displacement alone, as in `fields`; the fourth component is 0."""
+    result = []
+    for index in range(len(layers)):
+        field = _displacement(device, index, layers, coefficients, flows, grid, None)
+        for _ in range(settings.fixed_point_steps):
+            field = _displacement(device, index, layers, coefficients, flows, grid, field)
+        result.append(field)
     return result
 
 

@@ -10,7 +10,18 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from hugin_abflow import blend, chart, coefficient, colour, consistency, flow, geometry, seam, working
+from hugin_abflow import (
+    blend,
+    chart,
+    coefficient,
+    colour,
+    consistency,
+    flow,
+    geometry,
+    seam,
+    transition,
+    working,
+)
 from hugin_abflow.blend import BlendLayer
 from hugin_abflow.coefficient import Coefficients, Masks
 from hugin_abflow.colour import Correction
@@ -109,8 +120,9 @@ def _align(
     """
     regions: npt.NDArray[np.bool_] | None = None
     rounds = _SEAM_ROUNDS if settings.seam else 0
+    pairs = [consistency.mend(device, pair, grid) for pair in flows]
+    coefficients = transition.narrow(device, layers, coefficients, pairs, grid, settings)
     while True:
-        pairs = [consistency.mend(device, pair, grid, regions) for pair in flows]
         fields = geometry.fields(device, layers, coefficients, pairs, grid, settings)
         correction = colour.correction(device, layers, fields, pairs, grid, masks.host, settings, regions)
         if not rounds:
@@ -120,6 +132,7 @@ def _align(
         if not grown.any() or (regions is not None and np.array_equal(grown, regions)):
             break
         regions, rounds = grown, rounds - 1
+        pairs = [consistency.mend(device, pair, grid, regions) for pair in flows]
     if regions is not None:
         seam.cut(device, layers, fields, coefficients, pairs, correction, regions, masks, grid)
     return fields, correction

@@ -20,6 +20,8 @@ class Settings:
     flow_magnitude      kFlowMagCoef of the paper (Code 1); 0..10000, no unit.
     exposure            match exposure and colour of the layers where they overlap, and spread it smoothly.
     seam                take from one layer, whole, what flow cannot explain (people who moved, occlusions).
+    transition_strain   how much changing over from one layer's geometry to the next may stretch it, where
+                        the overlap is wider than that takes; 0..1, 0: the whole overlap, as published.
     interpolation       how layers are sampled; "nearest" is for comparison with the paper's own code.
     working_pixels      upper bound of the pixels of the working canvas (flow, coefficients, colour).
     border_feather      width of the ramp that brings a layer's weight to 0 at its own border, in working
@@ -36,6 +38,7 @@ class Settings:
     flow_magnitude: float = 100.0
     exposure: bool = True
     seam: bool = True
+    transition_strain: float = 0.06
     interpolation: Interpolation = "bicubic"
     working_pixels: int = 2_100_000
     border_feather: float = 6.0
@@ -48,6 +51,7 @@ class Settings:
             ("softmax_sharpness", 0, 1000),
             ("flow_magnitude", 0, 10_000),
             ("working_pixels", 1024, 1 << 28),
+            ("transition_strain", 0, 1),
             ("border_feather", 0, 1000),
             ("fixed_point_steps", 0, 20),
             ("band_rows", 0, 1 << 20),

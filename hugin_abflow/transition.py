@@ -1,0 +1,88 @@
+"""How quickly the geometry changes over from one layer to the next (kernels/transition.cl).
+
+The published coefficient changes over the whole overlap. That is as slow as it can be, which parallax needs:
+across a transition of width t, flow of length F stretches or squeezes the picture by F / t, its strain. Where
+there is little parallax and much overlap it is slower than anybody can see, and everything in the overlap is
+shown between its places in the photos, as sharp as the flow is right. So the coefficients are sharpened,
+
+    w_k <- w_k^n / sum_j w_j^n,    n = wanted strain / strain, from 1 to a limit
+
+with a smooth n: most of an overlap comes from one photo as it is, and no transition is steeper than wanted.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from hugin_abflow import geometry
+from hugin_abflow.coefficient import Coefficients
+from hugin_abflow.geometry import PairFlow
+from hugin_abflow.opencl import Device
+from hugin_abflow.settings import Settings
+from hugin_abflow.working import Grid, WorkingLayer
+
+# Working pixels per cell of the transition grid.
+_CELL = 16
+# Cells over which the strain is averaged (by its fourth power), and the exponent again.
+_SIGMA = 3.0
+# A transition is at least this part of the published one.
+_STEEPEST = 12.0
+
+
+def narrow(
+    device: Device,
+    layers: Sequence[WorkingLayer],
+    coefficients: Sequence[Coefficients],
+    flows: Sequence[PairFlow],
+    grid: Grid,
+    settings: Settings,
+) -> Sequence[Coefficients]:
+    """Coefficients as steep as `settings.transition_strain` allows; as they are where that is 0."""
+    if settings.transition_strain == 0 or not flows:
+        return coefficients
+    cells = grid.resized(max(1, round(grid.width / _CELL)), max(1, round(grid.height / _CELL)))
+    strain = device.zeros((*cells.shape, 2))
+    displacements = geometry.displacements(device, layers, coefficients, flows, grid, settings)
+    for layer, coefficient, displacement in zip(layers, coefficients, displacements, strict=True):
+        device.run(
+            "transition", "transition_strain", cells.border[:2], displacement, coefficient.blend,
+            layer.pixels, layer.box, grid.border, grid.lens, cells.border, strain,
+        )  # fmt: skip
+    power = device.upload(exponent(strain.get().astype(np.float64), settings.transition_strain, cells.wraps))
+    total = device.zeros(grid.shape)
+    result = []
+    for layer, coefficient in zip(layers, coefficients, strict=True):
+        blend = device.upload(coefficient.blend.get())
+        device.run(
+            "transition", "transition_sharpen", layer.box[2:], blend, layer.box, grid.border, power,
+            cells.border, total,
+        )  # fmt: skip
+        result.append(replace(coefficient, blend=blend))
+    for layer, coefficient in zip(layers, result, strict=True):
+        device.run(
+            "transition", "transition_ratio", layer.box[2:], coefficient.blend, layer.box, grid.border, total
+        )
+    return result
+
+
+def exponent(strain: npt.NDArray[np.float64], wanted: float, wraps: bool) -> npt.NDArray[np.float32]:
+    """n on the transition grid, (height, width), from sums (height, width, 2) of transition_strain."""
+    smooth = _smooth(strain, wraps)
+    mean = (smooth[..., 0] / np.maximum(smooth[..., 1], 1e-6)) ** 0.25
+    power = np.clip(wanted / np.maximum(mean, 1e-6), 1, _STEEPEST)
+    weighed = _smooth(np.dstack([power, np.ones_like(power)]), wraps)
+    return np.ascontiguousarray(weighed[..., 0] / weighed[..., 1], np.float32)
+
+
+def _smooth(values: npt.NDArray[np.float64], wraps: bool) -> npt.NDArray[np.float64]:
+    """A Gaussian of _SIGMA cells, not normalised at the borders."""
+    by = math.ceil(4 * _SIGMA)
+    values = np.pad(values, ((by, by), (0, 0), (0, 0)))
+    values = np.pad(values, ((0, 0), (by, by), (0, 0)), mode="wrap" if wraps else "constant")
+    return np.asarray(cv2.GaussianBlur(values, (2 * by + 1, 2 * by + 1), _SIGMA)[by:-by, by:-by])
