@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import os
 import sys
 import warnings
 from collections.abc import Iterator, Sequence
@@ -29,6 +30,10 @@ _INSTALL = {
     "win32": "install your graphics card's driver, or Intel's CPU runtime for OpenCL",
     "darwin": "use a macOS with Apple's OpenCL, or install pocl from conda-forge",
 }
+
+
+# Where the ICD loader looks for drivers, and which devices PoCL offers: a wrong one hides them all.
+_HIDING = ("OCL_ICD_VENDORS", "POCL_DEVICES")
 
 
 @dataclass(frozen=True)
@@ -77,8 +82,14 @@ def _devices() -> list[cl.Device]:
             _log.debug("%s: %s", platform.name, error)
     if not found:
         remedy = _INSTALL.get(sys.platform, _INSTALL["linux"])
-        raise DeviceError(f"no OpenCL device found; {remedy}")
+        raise DeviceError(f"no OpenCL device found; {_hidden()}{remedy}")
     return found
+
+
+def _hidden() -> str:
+    """What the environment says that may hide devices, with what to do about it; empty: nothing."""
+    found = [f"{name} is {os.environ[name]!r}" for name in _HIDING if name in os.environ]
+    return f"in the environment {' and '.join(found)}: if that is wrong, unset it; else " if found else ""
 
 
 def _speed(device: cl.Device) -> tuple[bool, int]:

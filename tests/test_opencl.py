@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import importlib
+import os
 import re
+import subprocess
 import sys
 from itertools import product
 from pathlib import Path
@@ -105,6 +107,36 @@ def shelf(monkeypatch: pytest.MonkeyPatch) -> list[SimpleNamespace]:
     ]
     monkeypatch.setattr(cl, "get_platforms", lambda: platforms)
     return devices
+
+
+@pytest.mark.parametrize("names", [[], ["POCL_DEVICES"], ["OCL_ICD_VENDORS", "POCL_DEVICES"]])
+def test_environment_that_may_hide_devices_is_named(
+    monkeypatch: pytest.MonkeyPatch, names: list[str]
+) -> None:
+    """Those variables that are set, with their values, beside what to install."""
+    monkeypatch.setattr(cl, "get_platforms", lambda: [])
+    for name in ("OCL_ICD_VENDORS", "POCL_DEVICES"):
+        monkeypatch.delenv(name, raising=False)
+    for name in names:
+        monkeypatch.setenv(name, f"/wrong/{name.lower()}")
+    with pytest.raises(DeviceError, match=r"no OpenCL device found; .*(pocl|driver)") as caught:
+        list_devices()
+    found = re.findall(r"(\w+) is '/wrong/(\w+)'", str(caught.value))
+    assert found == [(name, name.lower()) for name in names]
+    assert ("unset it" in str(caught.value)) == bool(names)
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="other systems have other loaders")
+@pytest.mark.parametrize("name", ["OCL_ICD_VENDORS", "POCL_DEVICES"])
+def test_environment_that_hides_devices_is_named_by_the_program(name: str) -> None:
+    """These variables really do what the message says; they are read when OpenCL is loaded."""
+    if "Portable" not in Device().device.platform.name:
+        pytest.skip("another driver may take no notice")
+    command = [sys.executable, "-m", "hugin_abflow", "--list-devices"]
+    environment = os.environ | {name: "/nowhere"}
+    done = subprocess.run(command, capture_output=True, text=True, env=environment, check=False)
+    assert done.returncode == ExitCode.DEVICE
+    assert f"{name} is '/nowhere'" in done.stderr and done.stdout == ""
 
 
 def test_default_is_the_fastest_gpu(shelf: list[SimpleNamespace]) -> None:
