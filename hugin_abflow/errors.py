@@ -100,6 +100,6 @@ class DeviceError(AbflowError):
 
 
 class SettingsError(AbflowError):
-    """A setting is out of its range."""
+    """A setting is out of its range or of a wrong type."""
 
     exit_code = ExitCode.USAGE

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
+from numbers import Integral, Real
+from typing import Literal, get_args
 
 from hugin_abflow.errors import SettingsError
 
@@ -13,7 +14,7 @@ Interpolation = Literal["bicubic", "nearest"]
 
 @dataclass(frozen=True)
 class Settings:
-    """Frozen set of engine settings. Raises `SettingsError` for a value out of range.
+    """Frozen set of engine settings. Raises `SettingsError` for a value out of range or of a wrong type.
 
     merge               "joint": all layers at once; "sequential": the paper's iteration, two at a time.
     softmax_sharpness   kSoftmaxSharpness of the paper (Code 1); 0..1000, no unit.
@@ -57,9 +58,21 @@ class Settings:
             ("band_rows", 0, 1 << 20),
         ):
             value = getattr(self, name)
-            if not low <= value <= high:
+            whole = type(getattr(type(self), name)) is int
+            fits: bool = isinstance(value, Integral if whole else Real) and not isinstance(value, bool)
+            if not fits:
+                kind = "whole number" if whole else "number"
+                raise SettingsError(f"{name} is {value!r}; choose a {kind} from {low} to {high}")
+            if not low <= value <= high:  # NaN neither
                 raise SettingsError(f"{name} is {value}; choose a value from {low} to {high}")
-        if self.merge not in ("joint", "sequential"):
-            raise SettingsError(f"merge is {self.merge!r}; choose 'joint' or 'sequential'")
-        if self.interpolation not in ("bicubic", "nearest"):
-            raise SettingsError(f"interpolation is {self.interpolation!r}; choose 'bicubic' or 'nearest'")
+        for name, choices in (("merge", get_args(MergeMode)), ("interpolation", get_args(Interpolation))):
+            value = getattr(self, name)
+            if not isinstance(value, str) or value not in choices:
+                expected = " or ".join(map(repr, choices))
+                raise SettingsError(f"{name} is {value!r}; choose {expected}")
+        if not isinstance(self.exposure, bool):
+            raise SettingsError(f"exposure is {self.exposure!r}; choose True or False")
+        if self.device is not None and not isinstance(self.device, str):
+            raise SettingsError(
+                f"device is {self.device!r}; choose an index or a part of a name, as text, or None"
+            )

@@ -204,6 +204,37 @@ def test_layers_that_do_not_belong_together(other, message):
 @pytest.mark.parametrize(
     "values",
     [
+        {"softmax_sharpness": "10"},
+        {"softmax_sharpness": True},
+        {"softmax_sharpness": None},
+        {"softmax_sharpness": float("nan")},
+        {"softmax_sharpness": np.ones(2)},
+        {"flow_magnitude": 1j},
+        {"flow_magnitude": float("inf")},
+        {"working_pixels": 2e6},
+        {"fixed_point_steps": "1"},
+        {"band_rows": False},
+        {"merge": ["joint"]},
+        {"merge": np.array(["joint", "joint"])},
+        {"interpolation": None},
+        {"exposure": 1},
+        {"exposure": "auto"},
+        {"device": 0},
+    ],
+)
+def test_settings_of_a_wrong_type(values):
+    with pytest.raises(SettingsError, match=next(iter(values))):
+        Settings(**values)
+
+
+def test_numbers_of_numpy_are_settings():
+    settings = Settings(softmax_sharpness=np.float32(3), flow_magnitude=7, working_pixels=np.int64(5000))
+    assert (settings.softmax_sharpness, settings.flow_magnitude, settings.working_pixels) == (3, 7, 5000)
+
+
+@pytest.mark.parametrize(
+    "values",
+    [
         {"softmax_sharpness": -1},
         {"flow_magnitude": 1e5},
         {"working_pixels": 1},
