@@ -232,8 +232,21 @@ def _layers_by_prefix(plan: Plan, prefix: str | Path) -> _Found:
     first = layer_name(prefix, plan.images[0].index, ".tif")
     raise LayersMissingError(
         f"no layer {first} (nor .exr, nor of another active image) here or in {plan.folder}; "
-        "check --prefix, or leave it out to have nona make the layers"
+        f"{_better_prefix(plan, prefix)}"
     )
+
+
+def _better_prefix(plan: Plan, prefix: str) -> str:
+    """What to do about a prefix that no layer has: it may be the name of one."""
+    places = [Path(prefix), plan.folder / prefix]
+    for pattern in (r"\d{4}(\.\w+)?$", r"\.\w+$"):
+        shorter = re.sub(pattern, "", prefix)
+        candidates = [shorter, os.path.join(plan.folder, shorter)]  # noqa: PTH118
+        if shorter not in ("", prefix) and any(_find_under(plan, place) for place in candidates):
+            return f"the prefix is what comes before the numbers: --prefix {shorter}"
+    if any(place.is_file() for place in places):
+        return f"{prefix} is a file: name all layers with --layers, or what comes before their numbers"
+    return "check --prefix, or leave it out to have nona make the layers"
 
 
 def _named_files(layers: Sequence[str | Path]) -> list[Path]:

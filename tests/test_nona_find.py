@@ -239,6 +239,30 @@ def test_prefix_without_layers(make_project):
         pass
 
 
+@pytest.mark.parametrize(
+    ("prefix", "hint"),
+    [
+        ("l0000.tif", "--prefix l$"),
+        ("l0002", "--prefix l$"),
+        ("l.tif", "--prefix l$"),
+        ("sub/0001.tif", "--prefix sub/$"),
+        ("m0000.tif", r"m0000\.tif is a file: name all layers with --layers"),
+        ("m.tif", "check --prefix"),
+        ("0000.tif", "check --prefix"),
+    ],
+)
+@pytest.mark.parametrize("here", [True, False])
+def test_name_of_a_layer_as_prefix(make_project, monkeypatch, tmp_path, prefix, hint, here):
+    """The message names the prefix that would do; m0000.tif is no file that could be a layer's."""
+    plan = read_plan(make_project(disabled=(0,)))
+    (plan.folder / "sub").mkdir()
+    for name in ("l0000.tif", "l0001.tif", "l0002.tif", "sub/0001.tif", "m0000.tif"):
+        (plan.folder / name).write_bytes(b"not opened")
+    monkeypatch.chdir(plan.folder if here else tmp_path)
+    with pytest.raises(LayersMissingError, match=hint), open_layers(plan, prefix=prefix):
+        pass
+
+
 def test_named_files_are_taken_in_the_order_given(make_project, nona):
     plan = read_plan(make_project())
     remap(plan, "x")
