@@ -14,6 +14,7 @@ from typing import Any, get_args
 import click
 
 from hugin_abflow.errors import AbflowError, ExitCode
+from hugin_abflow.images import COMPRESSIONS
 from hugin_abflow.merge import merge_project
 from hugin_abflow.nona import Remap
 from hugin_abflow.opencl import list_devices
@@ -128,6 +129,11 @@ def _print_devices(context: click.Context, parameter: click.Parameter, wanted: b
     context.exit(ExitCode.OK)
 
 
+def _names_of_compressions() -> str:
+    """``TIFF: none, lzw ...; EXR: ...``."""
+    return "; ".join(f"{kind}: {', '.join(names)}" for kind, names in COMPRESSIONS.items())
+
+
 _file = click.Path(path_type=Path)
 _layers = partial(click.option, cls=_Option, group="Layers")
 _blending = partial(click.option, cls=_Option, group="Blending", show_default=True)
@@ -148,7 +154,7 @@ _information = partial(click.option, cls=_Option, group="Information")
 @_result(
     "--compression",
     metavar="NAME",
-    help="Compression of the file. TIFF: none, packbits, lzw, deflate; EXR: none, rle, zips, zip, piz. "
+    help=f"Compression of the file. {_names_of_compressions()}. "
     "[default: the project's; TIFF: else lzw; EXR: else zip]",
 )
 @_result(
@@ -196,16 +202,18 @@ _information = partial(click.option, cls=_Option, group="Information")
     metavar="NUMBER",
     type=float,
     default=_DEFAULTS.softmax_sharpness,
-    show_default=f"{_DEFAULTS.softmax_sharpness:g}",
-    help="How suddenly one layer takes over from the next, 0 (average) to 1000 (cut).",
+    show_default=False,  # click would write 10.0
+    help="How suddenly one layer takes over from the next, 0 (average) to 1000 (cut). "
+    f"[default: {_DEFAULTS.softmax_sharpness:g}]",
 )
 @_blending(
     "--flow-magnitude",
     metavar="NUMBER",
     type=float,
     default=_DEFAULTS.flow_magnitude,
-    show_default=f"{_DEFAULTS.flow_magnitude:g}",
-    help="How much a layer in which near things shift is preferred, 0 (not) to 10000.",
+    show_default=False,
+    help="How much a layer in which near things shift is preferred, 0 (not) to 10000. "
+    f"[default: {_DEFAULTS.flow_magnitude:g}]",
 )
 @_blending(
     "--device",

@@ -16,10 +16,10 @@ import OpenImageIO as oiio  # noqa: N813
 
 from hugin_abflow import tifftags
 from hugin_abflow.errors import ImageReadError
-from hugin_abflow.imagewriter import ENDINGS, ImageWriter, write_image
+from hugin_abflow.imagewriter import COMPRESSIONS, ENDINGS, ImageWriter, write_image
 from hugin_abflow.layer import Box, Layer, full_scale
 
-__all__ = ["ENDINGS", "ImageWriter", "read_layer", "read_layers", "write_image"]
+__all__ = ["COMPRESSIONS", "ENDINGS", "ImageWriter", "read_layer", "read_layers", "write_image"]
 
 Pixels = npt.NDArray[Any]
 

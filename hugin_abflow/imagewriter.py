@@ -42,6 +42,11 @@ ENDINGS = {
     ".png": "png",
     ".exr": "openexr",
 }
+# What the documentation names; more is understood, since projects and other programs say it.
+COMPRESSIONS = {
+    "TIFF": ("none", "packbits", "lzw", "deflate"),
+    "EXR": ("none", "rle", "zips", "zip", "piz"),
+}
 _TIFF_COMPRESSIONS = {
     "none": "none",
     "lzw": "lzw",
@@ -321,7 +326,8 @@ def _compression(
     known = _TIFF_COMPRESSIONS if format_name == "tiff" else _EXR_COMPRESSIONS
     wanted = (name or ("lzw" if format_name == "tiff" else "zip")).lower()
     if wanted.partition(":")[0] not in known:
-        raise OutputError(f"{path}: compression {name!r}; choose one of {', '.join(known)}")
+        offered = ", ".join(COMPRESSIONS["TIFF" if format_name == "tiff" else "EXR"])
+        raise OutputError(f"{path}: compression {name!r}; choose one of {offered}")
     option = known[wanted.partition(":")[0]]
     used = "deflate" if format_name == "tiff" and option == "zip" else option
     if used != wanted and wanted != "zip":

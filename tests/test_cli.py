@@ -269,6 +269,14 @@ def test_help_is_grouped_and_complete(capsys: pytest.CaptureFixture[str]) -> Non
     assert max(map(len, text.splitlines())) <= 80
 
 
+def test_defaults_in_help_are_bare(capsys: pytest.CaptureFixture[str]) -> None:
+    cli.main(["--help"])
+    text = " ".join(capsys.readouterr().out.split())
+    for default in ("10", "100", "joint", "auto"):
+        assert f"[default: {default}]" in text
+    assert "[default: (" not in text
+
+
 def test_examples_in_help_are_valid(calls: Calls) -> None:
     for example, _ in cli.EXAMPLES:
         program, *arguments = example.split()

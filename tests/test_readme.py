@@ -8,9 +8,12 @@ from pathlib import Path
 from typing import Any
 
 import click
+import numpy as np
 import pytest
 
 from hugin_abflow import cli
+from hugin_abflow.errors import OutputError
+from hugin_abflow.images import write_image
 
 ROOT = Path(__file__).resolve().parent.parent
 README = (ROOT / "README.md").read_text("utf-8")
@@ -43,6 +46,22 @@ def test_option_is_documented(option: click.Option) -> None:
         assert f"{option.type.min} to {option.type.max}" in text
     if option.metavar:
         assert row.endswith(f" {option.metavar}`")
+
+
+def test_compressions_are_those_of_help_and_error(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    text, _ = OPTIONS["`--compression NAME`"]
+    documented = re.findall(r"(TIFF|EXR): ([`\w, ]+)", text)
+    assert [kind for kind, _ in documented] == ["TIFF", "EXR"]
+    cli.main(["--help"])
+    shown = " ".join(capsys.readouterr().out.split())
+    for kind, names in documented:
+        names = names.replace("`", "").strip()
+        assert f"{kind}: {names}{';' if kind == 'TIFF' else '.'}" in shown
+        suffix, dtype = (".tif", np.uint8) if kind == "TIFF" else (".exr", np.float32)
+        with pytest.raises(OutputError, match=f"choose one of {names}$"):
+            write_image(tmp_path / f"x{suffix}", np.ones((1, 1, 4), dtype), compression="best")
+        for name in names.split(", "):
+            write_image(tmp_path / f"x{suffix}", np.ones((1, 1, 4), dtype), compression=name)
 
 
 def test_no_other_option_is_documented() -> None:
