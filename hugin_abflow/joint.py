@@ -151,8 +151,10 @@ def _redundant(index: int, layers: Sequence[WorkingLayer], masks: Masks) -> bool
     for other, mask in enumerate(masks.host):
         if other != index and not (own & ~mask).any() and (mask & ~own).any():
             _log.info(
-                "%s lies wholly inside %s: not used", layers[index].layer.name, layers[other].layer.name
-            )
+                "%s is not used: it lies wholly inside %s, so nothing is its own; where it shall show, "
+                "mask the other photos in Hugin",
+                layers[index].layer.name, layers[other].layer.name,
+            )  # fmt: skip
             return True
     return False
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
@@ -19,6 +20,8 @@ from hugin_abflow.opencl import Device
 from hugin_abflow.progress import Progress, silent
 from hugin_abflow.project import Plan, read_plan
 from hugin_abflow.settings import Settings
+
+_log = logging.getLogger(__name__)
 
 
 def merge_project(
@@ -87,7 +90,15 @@ def _bands(
     """The panorama's rows from top to bottom."""
     device = Device(settings.device)
     method = {"joint": joint.merge, "sequential": sequential.merge}[settings.merge]
-    yield from method(device, layers, canvas, settings, progress)
+    visible = False
+    for rows in method(device, layers, canvas, settings, progress):
+        visible = visible or bool(rows[..., -1].any())
+        yield rows
+    if not visible:
+        _log.warning(
+            "the panorama is wholly transparent: no layer shows anything inside the crop; "
+            "check crop and masks in Hugin"
+        )
 
 
 def _write(writer: ImageWriter, bands: Iterator[npt.NDArray[Any]]) -> None:

@@ -86,7 +86,8 @@ def test_layer_inside_another_takes_no_part(exposure, caplog):
         result = merged([inner, *layers], canvas, exposure=exposure)
     np.testing.assert_array_equal(result, without)
     assert [r.message for r in caplog.records if "wholly inside" in r.message] == [
-        "patch lies wholly inside layer 0: not used"
+        "patch is not used: it lies wholly inside layer 0, so nothing is its own; where it shall show, "
+        "mask the other photos in Hugin"
     ]
 
 
@@ -101,7 +102,7 @@ def test_layer_inside_another_but_for_a_column_still_shows_there(caplog):
     layers = [masked(p, mask, f"layer {k}") for k, (p, mask) in enumerate(zip(pictures, masks, strict=True))]
     with caplog.at_level(logging.INFO, "hugin_abflow"):
         result = merged(layers, canvas, working_pixels=9_000, exposure=False)
-    assert "layer 1 lies wholly inside layer 0: not used" in caplog.messages
+    assert "layer 1 is not used: it lies wholly inside layer 0" in caplog.text
     expected = expected_picture(pictures[0], masks[0])
     expected[masks[1] & ~masks[0]] = pictures[1][masks[1] & ~masks[0]]
     np.testing.assert_array_equal(result[40:], expected[40:])
@@ -143,6 +144,29 @@ def test_crop_beyond_the_layers_is_transparent(mode):
     ]:
         result = merged(layers, cropped(canvas, left, top, right, bottom), merge=mode)
         np.testing.assert_array_equal(result, expected[top:bottom, left:right])
+
+
+@shared_device
+@pytest.mark.parametrize("mode", ["joint", "sequential"])
+def test_wholly_transparent_panorama_is_warned_of(mode, caplog):
+    """By its crop or by its masks; once, and not if a single pixel shows, in the last band."""
+    canvas = Canvas.plane(101, 57)
+    layers = [Layer.from_array(name, noise(20, 30, seed=k), 11 * k, 0) for k, name in enumerate("ab")]
+    masked_out = [Layer.from_array("a", np.zeros((57, 101, 4), np.uint8))]
+    for shown, crop in (
+        (layers, (60, 0, 101, 57)),
+        (layers, (0, 20, 101, 57)),
+        (masked_out, (0, 0, 101, 57)),
+    ):
+        caplog.clear()
+        result = merged(shown, cropped(canvas, *crop), merge=mode, band_rows=16)
+        assert not result.any()
+        assert [r.levelname for r in caplog.records] == ["WARNING"]
+        assert "wholly transparent" in caplog.text and "crop" in caplog.text
+    caplog.clear()
+    speck = [Layer.from_array("a", noise(1, 1), 100, 56)]
+    assert merged(speck, canvas, merge=mode, band_rows=16)[..., 3].sum() == 255
+    assert not caplog.records
 
 
 @shared_device
