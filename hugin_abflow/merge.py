@@ -62,6 +62,7 @@ def merge_project(
             offset=(crop.left, crop.top), canvas_size=(plan.canvas.width, plan.canvas.height), icc=first.icc,
             compression=compression, jpeg_quality=jpeg_quality,
         ) as writer:  # fmt: skip
+            _report(plan, opened, writer)
             _write(writer, _bands(opened, plan.canvas, settings, progress))
     return target
 
@@ -111,6 +112,22 @@ def _write(writer: ImageWriter, bands: Iterator[npt.NDArray[Any]]) -> None:
             encoded = encoder.submit(writer.write_rows, rows)
         if encoded:
             encoded.result()
+
+
+def _report(plan: Plan, layers: Sequence[Layer], writer: ImageWriter) -> None:
+    """Say what is merged, and into what."""
+    canvas, crop = plan.canvas, plan.canvas.crop
+    _log.info(
+        "canvas: %d x %d, %s, %g degrees; crop: %d x %d at (%d, %d)",
+        canvas.width, canvas.height, plan.projection, canvas.hfov,
+        crop.width, crop.height, crop.left, crop.top,
+    )  # fmt: skip
+    kind = {1: "grey", 3: "RGB"}[layers[0].channels]
+    _log.info("layers: %d, %s, %s", len(layers), kind, layers[0].dtype)
+    for layer in layers:
+        name, box = layer.file.with_name(layer.name) if layer.file else layer.name, layer.box
+        _log.info("  %s: %d x %d at (%d, %d)", name, box.width, box.height, box.left, box.top)
+    _log.info("output: %s, %s, %s, %s", writer.path, writer.format, writer.compression, writer.stored)
 
 
 def _target(plan: Plan, layers: Sequence[Layer], output: Path | str | None) -> Path:

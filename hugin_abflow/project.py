@@ -20,6 +20,14 @@ EQUIRECTANGULAR, SINUSOIDAL = 2, 7
 # the others none that meet. Hugin passes -w to enblend for all of them.
 WRAPPING = frozenset({1, 2, 5, 8, 11, 13})
 
+# libpano's names of output projections, by the p-line's f.
+_PROJECTIONS = (
+    "rectilinear", "cylindrical", "equirectangular", "full-frame fisheye", "stereographic", "Mercator",
+    "transverse Mercator", "sinusoidal", "Lambert cylindrical equal-area", "Lambert azimuthal equal-area",
+    "Albers conic equal-area", "Miller cylindrical", "Panini", "architectural", "orthographic", "equisolid",
+    "equirectangular Panini", "biplane", "triplane", "general Panini", "Thoby", "Hammer-Aitoff",
+)  # fmt: skip
+
 _ENDINGS = {"tif": ".tif", "tiff": ".tif", "jpg": ".jpg", "jpeg": ".jpg", "png": ".png", "exr": ".exr"}
 _COMPRESSIONS = ("none", "lzw", "packbits", "deflate")
 _JPEG_QUALITY = 90  # Hugin's default
@@ -59,6 +67,7 @@ class Plan:
 
     file            the project file, absolute.
     canvas          the panorama's pixel grid; its crop is what is output.
+    projection      of the canvas, in words.
     images          active images in the project's order.
     output          type of the panorama's file.
     hdr             layers are scene-linear EXR (nona ``-r hdr``) instead of TIFF in the photos' depth.
@@ -67,6 +76,7 @@ class Plan:
 
     file: Path
     canvas: Canvas
+    projection: str
     images: tuple[PlannedImage, ...]
     output: Output
     hdr: bool
@@ -117,6 +127,7 @@ def read_plan(path: Path | str) -> Plan:
     return Plan(
         file=file,
         canvas=_canvas(file, project.panorama),
+        projection=_projection(project.panorama.projection),
         images=images,
         output=_output(project, hdr),
         hdr=hdr,
@@ -159,6 +170,10 @@ def _canvas(file: Path, panorama: pto.Panorama) -> Canvas:
     wrapping = projection in WRAPPING
     hfov = min(panorama.hfov, 360.0) if wrapping else panorama.hfov  # as Hugin does
     return Canvas(width, height, crop, wrapping and hfov == 360.0, projection == EQUIRECTANGULAR, hfov)
+
+
+def _projection(number: int) -> str:
+    return _PROJECTIONS[number] if 0 <= number < len(_PROJECTIONS) else f"projection {number}"
 
 
 def _is_hdr(project: pto.Project) -> bool:

@@ -262,6 +262,24 @@ def test_module_runs_as_a_program_and_keeps_stdout_clean(folder: Path) -> None:
     assert "blend: " in messages
 
 
+def test_verbose_says_what_is_merged(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Canvas, projection, crop, layers with their files and depth, output, device; before the work begins."""
+    project = folder / "tiny.pto"
+    project.write_text(PROJECT.replace(" E0 R0", " E0 R0 S10,240,5,120"))
+    assert run(folder, "-v", "-o", str(folder / "out.png")) == 0
+    lines = capsys.readouterr().err.splitlines()
+    expected = [
+        "canvas: 250 x 125, equirectangular, 360 degrees; crop: 230 x 115 at (10, 5)",
+        "layers: 2, RGB, uint8",
+        f"  {folder / 'tiny0000.tif'}: 250 x 125 at (0, 0)",
+        f"  {folder / 'tiny0001.tif'}: 250 x 125 at (0, 0)",
+        f"output: {folder / 'out.png'}, png, deflate, uint8",
+    ]
+    assert lines[: len(expected)] == expected
+    assert lines[len(expected)].startswith("device: ")
+    assert lines[len(expected) + 1] == "read ..."
+
+
 @pytest.mark.skipif(os.name == "nt", reason="Windows has no such signals")
 @pytest.mark.parametrize(("number", "line"), [(signal.SIGINT, 1), (signal.SIGTERM, 8)])
 def test_interruption_leaves_nothing(folder: Path, number: signal.Signals, line: int) -> None:

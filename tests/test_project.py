@@ -28,6 +28,14 @@ def test_a_plain_project(make_project):
     assert plan.file.is_absolute() and plan.folder == plan.file.parent and plan.stem == "pano"
 
 
+@pytest.mark.parametrize(
+    ("number", "name"),
+    [(0, "rectilinear"), (2, "equirectangular"), (21, "Hammer-Aitoff"), (99, "projection 99")],
+)
+def test_projection_in_words(make_project, number, name):
+    assert read_plan(make_project(panorama=f"f{number} w802 h401 v100")).projection == name
+
+
 def test_disabled_images_leave_gaps(make_project):
     plan = read_plan(make_project(disabled=(0, 2), yaws=(0, 40, 80, 120)))
     assert [image.index for image in plan.images] == [1, 3]
