@@ -219,8 +219,7 @@ def _find(plan: Plan) -> _Found | None:
 def _layers_by_prefix(plan: Plan, prefix: str | Path) -> _Found:
     """Layers that the user named by their prefix."""
     prefix = os.fspath(prefix)
-    # joined as text: pathlib drops a slash at the end
-    for place in (prefix, os.path.join(plan.folder, prefix)):  # noqa: PTH118
+    for place in _places(plan, prefix):
         found = _find_under(plan, place)
         if found:
             for image in found.missing(plan):
@@ -236,16 +235,19 @@ def _layers_by_prefix(plan: Plan, prefix: str | Path) -> _Found:
     )
 
 
+def _places(plan: Plan, name: str) -> tuple[str, str]:
+    """Where a name may lie. Joined as text: pathlib drops a slash at the end."""
+    return name, os.path.join(plan.folder, name)  # noqa: PTH118
+
+
 def _better_prefix(plan: Plan, prefix: str) -> str:
     """What to do about a prefix that no layer has: it may be the name of one."""
-    places = [Path(prefix), plan.folder / prefix]
     for pattern in (r"\d{4}(\.\w+)?$", r"\.\w+$"):
         shorter = re.sub(pattern, "", prefix)
-        candidates = [shorter, os.path.join(plan.folder, shorter)]  # noqa: PTH118
-        if shorter not in ("", prefix) and any(_find_under(plan, place) for place in candidates):
+        if shorter not in ("", prefix) and any(_find_under(plan, p) for p in _places(plan, shorter)):
             return f"the prefix is what comes before the numbers: --prefix {shorter}"
-    if any(place.is_file() for place in places):
-        return f"{prefix} is a file: name all layers with --layers, or what comes before their numbers"
+    if any(Path(place).is_file() for place in _places(plan, prefix)):
+        return f"{prefix} is a file: name all layers with --layers"
     return "check --prefix, or leave it out to have nona make the layers"
 
 
