@@ -81,7 +81,7 @@ def open_layers(
             files = _layers_by_prefix(plan, prefix).in_order()
         else:
             files = _find_or_make(plan, folder, remap, keep_layers, progress).in_order()
-        opened = _open_all(files)
+        opened = [layer for file in files for layer in read_layers(file)]
         check_layers(plan.canvas, opened)
         yield opened
 
@@ -136,10 +136,6 @@ def _work_folder() -> Iterator[Path]:
         prefix="hugin-abflow-", dir=root if Path(root).is_dir() and root else None, ignore_cleanup_errors=True
     ) as folder:
         yield Path(folder)
-
-
-def _open_all(files: Sequence[Path]) -> list[Layer]:
-    return [layer for file in files for layer in read_layers(file)]
 
 
 # ------------------------------------------------------------------------------------- finding
@@ -210,8 +206,7 @@ def _is_multilayer(path: Path) -> bool:
 def _find(plan: Plan) -> _Found | None:
     """Layers under the project's stem or Hugin's default prefix; complete and fresh ones first."""
     names = [plan.stem, plan.hugin_prefix]
-    if plan.hdr:
-        names = [*(f"{name}_hdr_" for name in names), *names]  # what hugin_executor calls them
+    names = [f"{name}_hdr_" for name in names if plan.hdr] + names  # what hugin_executor calls them
     found = [layers for name in names if (layers := _find_under(plan, str(plan.folder / name)))]
     return min(found, key=lambda f: (bool(f.missing(plan)), bool(f.stale(plan))), default=None)
 
