@@ -119,5 +119,6 @@ def _band(
     samples = layers[0].working.layer.channels + 1
     dtype = np.float32 if layers[0].working.layer.dtype == np.float16 else layers[0].working.layer.dtype
     out = device.empty((*shape, samples), dtype)
-    device.run("blend", "blend_finish", size, reference, total, band, out, options=options)
+    origin = (region.left, region.top)
+    device.run("blend", "blend_finish", size, reference, total, band, origin, out, options=options)
     return out.get()

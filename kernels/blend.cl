@@ -131,7 +131,7 @@ __kernel void blend_add(__global const PIXEL *rows, /* (box.w, box.z, SAMPLES) *
                         int corrected,                                 /* 0: gain is not read */
                         int nearest,                                   /* 1: nearest-neighbour sampling */
                         __global const uchar *count,                   /* (band.w, band.z) */
-                        __global float4 *reference,                    /* (band.w, band.z) colour, 1 if set */
+                        __global float4 *reference, /* (band.w, band.z) colour; 1 if set, 2 if corrected */
                         __global float4 *sum)                          /* (band.w, band.z) weighted, weight */
 {
     const int x = get_global_id(0), y = get_global_id(1);
@@ -152,9 +152,10 @@ __kernel void blend_add(__global const PIXEL *rows, /* (box.w, box.z, SAMPLES) *
         const float2 q = p * (float2)((float)gain_border.x / border.x, (float)gain_border.y / border.y);
         g = blend_field(gain, (int4)(0, 0, gain_border.x, gain_border.y), q, gain_border).xyz;
     }
+    const float state = any(g != 0.0f) ? 2.0f : 1.0f;
     float4 first = reference[at];
     if (first.w == 0.0f) {
-        first = (float4)(blend_correct(own.xyz, g), 1.0f);
+        first = (float4)(blend_correct(own.xyz, g), state);
         reference[at] = first;
     }
     if (count[at] < 2)
@@ -165,13 +166,37 @@ __kernel void blend_add(__global const PIXEL *rows, /* (box.w, box.z, SAMPLES) *
     const float4 c = blend_sample(rows, box, blend_position(p, f.xyz, scale, lens), border, nearest);
     /* a sample that falls outside its layer counts smoothly less */
     const float w = f.w * c.w * c.w;
-    if (w > 0.0f)
+    if (w > 0.0f) {
         sum[at] += (float4)((blend_correct(c.xyz, g) - first.xyz) * w, w);
+        if (state > first.w)
+            reference[at] = (float4)(first.xyz, state);
+    }
 }
 
+/* The fraction above which a value is rounded up at canvas pixel (x, y): uniform in 0..1, so that the mean of
+   many rounded pixels is right. Steps of the golden ratio spread it evenly along a row, which halves the noise
+   that is coarse enough to be seen; where rows begin is mixed from all bits of y and channel. */
+static inline float blend_threshold(int x, int y, int channel) {
+    uint h = (uint)y * 4u + (uint)channel;
+    h = (h ^ (h >> 16)) * 0x85ebca6bu;
+    h = (h ^ (h >> 13)) * 0xc2b2ae35u;
+    h ^= h >> 16;
+    return ((float)((h + (uint)x * 0x9e3779b9u) >> 16) + 0.5f) / 65536.0f;
+}
+
+/* A whole number by dither. What is whole but for the rounding of float32 stays as it is. */
+static inline float blend_dither(float v, float threshold) {
+    const float whole = rint(v), below = floor(v);
+    if (fabs(v - whole) <= 2e-7f * WHITE)
+        return whole;
+    return v - below > threshold ? below + 1.0f : below;
+}
+
+/* Round once. Corrected pixels are dithered: a smooth gain on a smooth sky would show as bands. */
 __kernel void blend_finish(__global const float4 *reference, /* (band.w, band.z) */
                            __global const float4 *sum,       /* (band.w, band.z) */
                            int4 band,                        /* run size */
+                           int2 origin,                      /* the region's place on the canvas */
                            __global PIXEL *out)              /* (band.w, band.z, SAMPLES) */
 {
     const int x = get_global_id(0), y = get_global_id(1);
@@ -180,7 +205,15 @@ __kernel void blend_finish(__global const float4 *reference, /* (band.w, band.z)
     const int at = y * band.z + x;
     const float4 s = sum[at], r = reference[at];
     const float3 c = r.xyz + (s.w > 1e-30f ? s.xyz / s.w : (float3)(0.0f));
-    const float v[4] = {c.x, SAMPLES > 2 ? c.y : r.w * WHITE, c.z, r.w * WHITE};
-    for (int k = 0; k < SAMPLES; ++k)
-        out[(size_t)at * SAMPLES + k] = INTEGER ? (PIXEL)clamp(rint(v[k]), 0.0f, (float)WHITE) : (PIXEL)v[k];
+    const float alpha = fmin(r.w, 1.0f) * WHITE;
+    const float v[4] = {c.x, SAMPLES > 2 ? c.y : alpha, c.z, alpha};
+    const int dithered = INTEGER && r.w > 1.0f;
+    for (int k = 0; k < SAMPLES; ++k) {
+        float value = v[k];
+        if (dithered)
+            value = blend_dither(value, blend_threshold(x + band.x + origin.x, y + band.y + origin.y, k));
+        else if (INTEGER)
+            value = rint(value);
+        out[(size_t)at * SAMPLES + k] = (PIXEL)(INTEGER ? clamp(value, 0.0f, (float)WHITE) : value);
+    }
 }

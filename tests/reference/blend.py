@@ -115,7 +115,8 @@ def blend_add(
     if gain is not None:
         place = x * gain_border[0] / border[0], y * gain_border[1] / border[1]
         exposure = read_field(gain, (0, 0, *gain_border[:2]), *place, gain_border)[..., :3]
-    first = np.concatenate([correct(own[..., :3], exposure, white), np.ones((*x.shape, 1))], -1)
+    state = np.where((exposure != 0).any(-1), 2.0, 1.0)
+    first = np.concatenate([correct(own[..., :3], exposure, white), state[..., None]], -1)
     fresh = covered & (reference[..., 3] == 0)
     reference = np.where(fresh[..., None], first, reference)
     scale = border[0] / field_border[0], border[1] / field_border[1]
@@ -123,14 +124,44 @@ def blend_add(
     colour = sample(stored, box, *position(x, y, f[..., :3], scale, lens), border, nearest)
     weight = np.where(covered & (count >= 2), np.maximum(f[..., 3], 0) * colour[..., 3] ** 2, 0.0)
     difference = correct(colour[..., :3], exposure, white) - reference[..., :3]
+    state = np.where(weight > 0, np.maximum(state, reference[..., 3]), reference[..., 3])
+    reference = np.concatenate([reference[..., :3], state[..., None]], -1)
     return reference, total + np.concatenate([difference * weight[..., None], weight[..., None]], -1)
 
 
-def blend_finish(reference: Array, total: Array, samples: int, white: float, integer: int) -> Array:
+def threshold(x: Array, y: Array, channel: int) -> Array:
+    """The fraction above which a value is rounded up, per canvas pixel; the same bits as the kernel's."""
+    h = (y.astype(np.uint32) * np.uint32(4)) + np.uint32(channel)
+    h = (h ^ (h >> np.uint32(16))) * np.uint32(0x85EBCA6B)
+    h = (h ^ (h >> np.uint32(13))) * np.uint32(0xC2B2AE35)
+    h = (h ^ (h >> np.uint32(16))) + x.astype(np.uint32) * np.uint32(0x9E3779B9)
+    return ((h >> np.uint32(16)) + 0.5) / 65536
+
+
+def dither(values: Array, thresholds: Array, white: float) -> Array:
+    """Whole numbers; those that are whole but for float32's rounding stay."""
+    whole, below = np.rint(values), np.floor(values)
+    up = below + (values - below > thresholds)
+    return np.where(np.abs(values - whole) <= 2e-7 * white, whole, up)
+
+
+def blend_finish(
+    reference: Array,
+    total: Array,
+    band: Sequence[int],
+    origin: Sequence[int],
+    samples: int,
+    white: float,
+    integer: int,
+) -> Array:
     """Samples of the band, float64 but rounded and within 0..white for integer layers."""
     weight = total[..., 3:]
     known = weight > 1e-12
     colour = reference[..., :3] + np.where(known, total[..., :3] / np.where(known, weight, 1), 0.0)
-    alpha = reference[..., 3:] * white
+    alpha = np.minimum(reference[..., 3:], 1) * white
     out = np.concatenate([colour if samples == 4 else colour[..., :1], alpha], -1)
-    return np.clip(np.rint(out), 0, white) if integer else out
+    if not integer:
+        return out
+    x, y = pixels(band[2], band[3], band[0] + origin[0], band[1] + origin[1])
+    dithered = np.stack([dither(out[..., k], threshold(x, y, k), white) for k in range(samples)], -1)
+    return np.clip(np.where(reference[..., 3:] > 1, dithered, np.rint(out)), 0, white)
