@@ -253,7 +253,8 @@ def load_charts(folder: Path, picture: Pixels) -> tuple[list[Chart], int]:
     """Charts of a result (height, width, 4; the whole canvas) with the true views, and the search reach."""
     with np.load(folder / "views.npz") as stored:
         width, reach = int(stored["width"]), int(stored["reach"])
-        grey = (picture[..., :3] @ np.array([0.299, 0.587, 0.114])).astype(np.float32)
+        grey = _grey(picture)
+        layers = [read_canvas(path, width) for path in sorted(folder.glob("layer[0-9]*.tif"))]
         charts = []
         for number, chart in enumerate(chart_maps(width, MARGIN + reach)):
             judged = stored[f"judged{number}"]
@@ -270,5 +271,17 @@ def load_charts(folder: Path, picture: Pixels) -> tuple[list[Chart], int]:
                 views.append(View(whole, known))
                 index += 1
             opaque = chart.take(picture[..., 3], cv2.INTER_NEAREST) > 127
-            charts.append(Chart(chart.take(grey, cv2.INTER_CUBIC), opaque, judged, views))
+            own = [_seen_on(chart, layer) for layer in layers]
+            charts.append(Chart(chart.take(grey, cv2.INTER_CUBIC), opaque, judged, views, own))
     return charts, reach
+
+
+def _grey(picture: Pixels) -> npt.NDArray[np.float32]:
+    return (picture[..., :3] @ np.array([0.299, 0.587, 0.114])).astype(np.float32)
+
+
+def _seen_on(chart: ChartMap, layer: Pixels) -> View:
+    """A layer on a chart, known where no tap of the interpolation is outside it."""
+    known = chart.take((layer[..., 3] > 127).astype(np.float32), cv2.INTER_LINEAR)
+    core = cv2.erode((known > 0.999).astype(np.uint8), np.ones((5, 5), np.uint8))
+    return View(chart.take(_grey(layer), cv2.INTER_CUBIC), np.asarray(core > 0))

@@ -9,7 +9,9 @@ break   two patches side by side that are both true, but not of the same picture
         are found, they lie at different displacements. A line that runs through both is broken by that many
         pixels. Displacements are sets (everything that correlates almost as well as the best), so a patch
         on a straight edge, which may slide along it, breaks nothing.
-sharp   gradient energy of true patches, as a share of that of the views they show.
+sharp   gradient energy of true patches that two layers or more cover, as a share of that of the layer they
+        are most alike, at the same brightness: what is lost by sampling again and by averaging. On layers
+        without noise: averaging noise away is no loss.
 
 All of it happens on charts: pictures with the same scale everywhere (a band around the equator, and an
 azimuthal view of each pole), given by the caller.
@@ -45,12 +47,15 @@ class View:
 
 @dataclass(frozen=True)
 class Chart:
-    """A picture to judge: (height, width) grey 0..255, where it is opaque, where it counts, the truth."""
+    """A picture to judge: (height, width) grey 0..255, where it is opaque, where it counts, the truth, and
+    the layers that it was made of (without them there is no `Score.sharpness`).
+    """
 
     grey: Grey
     opaque: Mask
     judged: Mask
     views: Sequence[View]
+    layers: Sequence[View] = ()
 
 
 @dataclass
@@ -62,7 +67,7 @@ class Score:
     neighbours: int = 0
     broken: int = 0
     energy: float = 0.0
-    true_energy: float = 0.0
+    own_energy: float = 0.0
     breaks: list[tuple[float, int, float, float]] = field(default_factory=list)  # px, chart, x, y
     wrong_places: list[tuple[int, float, float]] = field(default_factory=list)  # chart, x, y
 
@@ -78,8 +83,8 @@ class Score:
 
     @property
     def sharpness(self) -> float:
-        """Gradient energy of the true patches, 1.0 = that of the views."""
-        return self.energy / max(1e-9, self.true_energy)
+        """Gradient energy of the true patches of overlaps, 1.0 = that of the layers; NaN: there are none."""
+        return self.energy / self.own_energy if self.own_energy else float("nan")
 
     def worst_break(self, places: int = 5, apart: float = 60.0) -> float:
         """Mean break in px at the worst places that are at least `apart` px from each other.
@@ -105,9 +110,7 @@ class Score:
 class _Match:
     """A patch found in one view: all displacements that are possible; its centre is no displacement."""
 
-    best: float
     possible: Mask
-    energy_ratio: tuple[float, float]
 
 
 def score(charts: Sequence[Chart], patch: int = 20, reach: int = 24, break_px: float = BREAK) -> Score:
@@ -121,15 +124,14 @@ def score(charts: Sequence[Chart], patch: int = 20, reach: int = 24, break_px: f
 def _score_chart(total: Score, number: int, chart: Chart, patch: int, reach: int, break_px: float) -> None:
     step = patch // 2
     height, width = chart.grey.shape
-    slopes = [_slope_energy(view.grey) for view in chart.views]
-    own_slope = _slope_energy(chart.grey)
+    slope, slopes = _slope_energy(chart.grey), [_slope_energy(layer.grey) for layer in chart.layers]
     found: dict[tuple[int, int], dict[int, _Match]] = {}
     for row, top in enumerate(range(reach, height - patch - reach, step)):
         for column, left in enumerate(range(reach, width - patch - reach, step)):
             here = (slice(top, top + patch), slice(left, left + patch))
             if not chart.judged[here].all():
                 continue
-            matches, textured = _look_up(chart, slopes, own_slope, top, left, patch, reach)
+            matches, textured = _look_up(chart, top, left, patch, reach)
             if not textured:
                 continue
             total.textured += 1
@@ -138,9 +140,9 @@ def _score_chart(total: Score, number: int, chart: Chart, patch: int, reach: int
                 total.wrong_places.append((number, left + patch / 2, top + patch / 2))
                 continue
             found[row, column] = matches
-            best = max(matches.values(), key=lambda match: match.best)
-            total.energy += best.energy_ratio[0]
-            total.true_energy += best.energy_ratio[1]
+            energies = _energies(chart, slope, slopes, top, left, patch, reach)
+            total.energy += energies[0]
+            total.own_energy += energies[1]
     for (row, column), matches in found.items():
         for other in ((row + 2, column), (row, column + 2)):  # patches overlap by half: these two touch
             if other not in found:
@@ -155,15 +157,7 @@ def _score_chart(total: Score, number: int, chart: Chart, patch: int, reach: int
             total.breaks.append((jump, number, x, y))
 
 
-def _look_up(
-    chart: Chart,
-    slopes: Sequence[Grey],
-    own_slope: Grey,
-    top: int,
-    left: int,
-    patch: int,
-    reach: int,
-) -> tuple[dict[int, _Match], bool]:
+def _look_up(chart: Chart, top: int, left: int, patch: int, reach: int) -> tuple[dict[int, _Match], bool]:
     """The views in which a patch is found, and whether there is texture to compare at all."""
     here = (slice(top, top + patch), slice(left, left + patch))
     around = (slice(top - reach, top + patch + reach), slice(left - reach, left + patch + reach))
@@ -179,11 +173,34 @@ def _look_up(
         best = float(likeness.max())
         if best < TRUE_ENOUGH:
             continue
+        matches[index] = _Match(likeness >= max(best - NEARLY_BEST, TRUE_ENOUGH))
+    return matches, True
+
+
+def _energies(
+    chart: Chart, slope: Grey, slopes: Sequence[Grey], top: int, left: int, patch: int, reach: int
+) -> tuple[float, float]:
+    """Gradient energy of a patch, and of the layer that it is most alike, made as bright; zeros where fewer
+    than two layers are, or none is alike.
+    """
+    here = (slice(top, top + patch), slice(left, left + patch))
+    around = (slice(top - reach, top + patch + reach), slice(left - reach, left + patch + reach))
+    covering = [index for index, layer in enumerate(chart.layers) if layer.known[here].all()]
+    if len(covering) < 2:
+        return 0.0, 0.0
+    found: list[tuple[float, float]] = []
+    for index in covering:
+        layer = chart.layers[index]
+        likeness = cv2.matchTemplate(layer.grey[around], chart.grey[here], cv2.TM_CCOEFF_NORMED)
         dy, dx = np.unravel_index(int(likeness.argmax()), likeness.shape)
         y, x = top - reach + int(dy), left - reach + int(dx)
-        energies = float(own_slope[here].sum()), float(slopes[index][y : y + patch, x : x + patch].sum())
-        matches[index] = _Match(best, likeness >= max(best - NEARLY_BEST, TRUE_ENOUGH), energies)
-    return matches, True
+        there = (slice(y, y + patch), slice(x, x + patch))
+        if not layer.known[there].all():
+            continue
+        brighter = float(chart.grey[here].mean()) / max(1.0, float(layer.grey[there].mean()))
+        found.append((float(likeness.max()), float(slopes[index][there].sum()) * brighter**2))
+    likeness_of_best, energy = max(found, default=(0.0, 0.0))
+    return (float(slope[here].sum()), energy) if likeness_of_best >= TRUE_ENOUGH else (0.0, 0.0)
 
 
 def _jump(one: dict[int, _Match], two: dict[int, _Match]) -> float | None:

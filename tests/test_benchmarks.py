@@ -48,7 +48,8 @@ def views() -> list[np.ndarray]:
 def judge(picture: np.ndarray, views: list[np.ndarray], opaque: np.ndarray | None = None) -> Score:
     everywhere = np.ones(picture.shape, bool)
     shown = [View(view, everywhere) for view in views]
-    return score([Chart(picture, everywhere if opaque is None else opaque, everywhere, shown)], reach=20)
+    opaque = everywhere if opaque is None else opaque
+    return score([Chart(picture, opaque, everywhere, shown, [shown[0], shown[-1]])], reach=20)
 
 
 @pytest.mark.parametrize("which", [0, 2, 4])
@@ -57,12 +58,15 @@ def test_true_view_is_perfect(which: int, views: list[np.ndarray]) -> None:
     assert result.textured > 100 and result.neighbours > 100
     assert result.false_share == 0 and result.broken_share == 0
     assert result.worst_break() == 0
-    assert result.sharpness == pytest.approx(1, abs=1e-6)
+    # between the layers' views the board is resampled, by parts of a pixel
+    assert result.sharpness == pytest.approx(1, abs=1e-6 if which in (0, 4) else 0.02)
 
 
 def test_exposure_does_not_matter(views: list[np.ndarray]) -> None:
-    result = judge((0.8 * views[2] + 12).astype(np.float32), views)
+    result = judge((0.8 * views[0] + 12).astype(np.float32), views)
     assert result.false_share == 0 and result.worst_break() == 0
+    darker = judge(0.8 * views[0], views)
+    assert darker.sharpness == pytest.approx(1, abs=1e-4)
 
 
 def test_hard_paste_breaks_the_near_half_only(views: list[np.ndarray]) -> None:
@@ -106,6 +110,47 @@ def test_blur_shows_in_sharpness(views: list[np.ndarray]) -> None:
     result = judge(cv2.GaussianBlur(views[2], (0, 0), 1.2), views)
     assert result.false_share < 5
     assert result.sharpness < 0.8
+
+
+def test_average_of_layers_that_are_not_on_each_other_shows_in_sharpness(views: list[np.ndarray]) -> None:
+    """By a pixel: still true, but soft."""
+    moved = np.roll(views[0], 1, 1)
+    result = judge((views[0] + moved) / 2, views)
+    assert result.false_share < 5
+    assert 0.5 < result.sharpness < 0.95
+
+
+def test_sharpness_is_that_of_overlaps(views: list[np.ndarray]) -> None:
+    """Where one layer is alone nothing was blended; without layers there is no figure."""
+    everywhere = np.ones(views[0].shape, bool)
+    left = everywhere.copy()
+    left[:, WIDTH // 2 :] = False
+    picture = views[0].copy()
+    picture[:, WIDTH // 2 + 20 :] = cv2.GaussianBlur(picture, (0, 0), 1.2)[:, WIDTH // 2 + 20 :]
+    shown = [View(view, everywhere) for view in views]
+    layers = [shown[0], View(views[0], left)]
+    result = score([Chart(picture, everywhere, everywhere, shown, layers)], reach=20)
+    assert result.sharpness == pytest.approx(1, abs=1e-6)
+    alone = score([Chart(picture, everywhere, everywhere, shown, layers[:1])], reach=20)
+    assert np.isnan(alone.sharpness) and alone.textured == result.textured
+
+
+def test_layers_are_on_their_charts(tmp_path: Path) -> None:
+    """Grey where they are known, and known only where they are."""
+    width = 240
+    rng = np.random.default_rng(5)
+    layer = np.full((60, 90, 4), 255, np.uint8)
+    layer[..., :3] = rng.integers(60, 200, (60, 90, 1), dtype=np.uint8)
+    write_layer(tmp_path / "layer0000.tif", layer, 70, 30, width)
+    canvas = read_canvas(tmp_path / "layer0000.tif", width)
+    shares = []
+    for chart in rigs.chart_maps(width, 6):
+        seen = rigs._seen_on(chart, canvas)
+        opaque = chart.take(canvas[..., 3], cv2.INTER_NEAREST) > 127
+        assert not (seen.known & ~opaque).any()
+        assert (seen.grey[seen.known] > 20).all()
+        shares.append(seen.known.sum() / max(1, opaque.sum()))
+    assert shares[0] > 0.85
 
 
 def test_holes_are_false_and_flat_patches_do_not_count(views: list[np.ndarray]) -> None:
