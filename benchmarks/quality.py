@@ -53,6 +53,8 @@ def verdandi(folder: Path, layers: list[Path], width: int, out: Path) -> list[st
 
 BLENDERS: dict[str, Command | None] = {
     "abflow": abflow(),
+    "abflow fast": abflow("--flow-quality", "fast"),
+    "abflow best": abflow("--flow-quality", "best"),
     "abflow sequential": abflow("--merge", "sequential"),
     "enblend -w": enblend,
     "verdandi -w": verdandi,

@@ -18,7 +18,7 @@ from hugin_abflow.images import COMPRESSIONS
 from hugin_abflow.merge import merge_project
 from hugin_abflow.nona import Remap
 from hugin_abflow.opencl import list_devices
-from hugin_abflow.settings import MergeMode, Settings
+from hugin_abflow.settings import FlowQuality, MergeMode, Settings
 from hugin_abflow.terminal import (
     PROGRAM,
     complain,
@@ -216,6 +216,13 @@ _information = partial(click.option, cls=_Option, group="Information")
     f"[default: {_DEFAULTS.flow_magnitude:g}]",
 )
 @_blending(
+    "--flow-quality",
+    type=click.Choice(get_args(FlowQuality)),
+    default=_DEFAULTS.flow_quality,
+    help="Time against quality of the optical flow. fast: coarser, in less than half the flow's time. "
+    "best: finer on panoramas above 2 megapixels, in up to three times of it.",
+)
+@_blending(
     "--device",
     metavar="DEVICE",
     show_default=False,
@@ -249,6 +256,7 @@ def command(
     exposure: str,
     softmax_sharpness: float,
     flow_magnitude: float,
+    flow_quality: FlowQuality,
     device: str | None,
     quiet: bool,
     verbose: bool,
@@ -272,6 +280,7 @@ def command(
         merge=merge,
         softmax_sharpness=softmax_sharpness,
         flow_magnitude=flow_magnitude,
+        flow_quality=flow_quality,
         exposure=exposure == "auto",
         device=device,
     )

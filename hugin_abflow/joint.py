@@ -18,6 +18,7 @@ from hugin_abflow import (
     consistency,
     flow,
     geometry,
+    quality,
     seam,
     transition,
     working,
@@ -25,6 +26,7 @@ from hugin_abflow import (
 from hugin_abflow.blend import BlendLayer
 from hugin_abflow.coefficient import Coefficients, Masks
 from hugin_abflow.colour import Correction
+from hugin_abflow.flow import FlowParameters
 from hugin_abflow.geometry import PairFlow
 from hugin_abflow.layer import Canvas, Layer
 from hugin_abflow.opencl import Buffer, Device, DeviceMemoryError
@@ -76,7 +78,7 @@ def _prepare_in_memory(
         try:
             return prepare(device, layers, canvas, settings, progress)
         except DeviceMemoryError:
-            fewer = min(settings.working_pixels, region.width * region.height) // 2
+            fewer = min(settings.working_limit, region.width * region.height) // 2
             if fewer < _LEAST_WORKING_PIXELS:
                 raise
             _log.warning("the device's memory is too small; trying again at a lower working resolution")
@@ -95,7 +97,8 @@ def prepare(
     reduced = [everything[i] for i in used]
     masks = masks.only(used)
     coefficients = coefficient.coefficients(device, reduced, masks, grid, settings)
-    flows = _flows(device, reduced, masks, grid, progress)
+    parameters = quality.flow_parameters(settings.flow_quality)
+    flows = _flows(device, reduced, masks, grid, progress, parameters)
     fields, correction = _align(device, reduced, coefficients, flows, masks, grid, settings)
     final = [
         BlendLayer(layer, field, geometry.reach(device, layer, field, grid), gain)
@@ -167,7 +170,12 @@ def _unblended(device: Device, layer: WorkingLayer) -> BlendLayer:
 
 
 def _flows(
-    device: Device, layers: Sequence[WorkingLayer], masks: Masks, grid: Grid, progress: Progress
+    device: Device,
+    layers: Sequence[WorkingLayer],
+    masks: Masks,
+    grid: Grid,
+    progress: Progress,
+    parameters: FlowParameters,
 ) -> list[PairFlow]:
     """Flow of every pair of layers that overlap, on the pair's own chart."""
     overlaps = [
@@ -182,6 +190,7 @@ def _flows(
             if not working.same_where_both(device, *pair):
                 its_chart = chart.pair_chart(overlap, masks.grid, grid)
                 image_a, image_b = (chart.sample(device, layer, grid, its_chart) for layer in pair)
-                result.append(PairFlow(a, b, its_chart, *flow.pair_flow(device, image_a, image_b)))
+                both = flow.pair_flow(device, image_a, image_b, parameters)
+                result.append(PairFlow(a, b, its_chart, *both))
             advance(1)
     return result

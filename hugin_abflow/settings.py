@@ -10,6 +10,10 @@ from hugin_abflow.errors import SettingsError
 
 MergeMode = Literal["joint", "sequential"]
 Interpolation = Literal["bicubic", "nearest"]
+FlowQuality = Literal["fast", "normal", "best"]
+
+_WORKING_PIXELS: dict[FlowQuality, int] = {"fast": 500_000, "normal": 2_100_000, "best": 6_300_000}
+_LEAST_WORKING_PIXELS = 1024
 
 
 @dataclass(frozen=True)
@@ -19,12 +23,14 @@ class Settings:
     merge               "joint": all layers at once; "sequential": the paper's iteration, two at a time.
     softmax_sharpness   kSoftmaxSharpness of the paper (Code 1); 0..1000, no unit.
     flow_magnitude      kFlowMagCoef of the paper (Code 1); 0..10000, no unit.
+    flow_quality        how much time the flow may take: "fast", "normal" or "best".
     exposure            match exposure and colour of the layers where they overlap, and spread it smoothly.
     seam                take from one layer, whole, what flow cannot explain (people who moved, occlusions).
     transition_strain   how much changing over from one layer's geometry to the next may stretch it, where
                         the overlap is wider than that takes; 0..1, 0: the whole overlap, as published.
     interpolation       how layers are sampled; "nearest" is for comparison with the paper's own code.
-    working_pixels      upper bound of the pixels of the working canvas (flow, coefficients, colour).
+    working_pixels      upper bound of the pixels of the working canvas (flow, coefficients, colour), at least
+                        1024; 0: chosen by flow_quality.
     border_feather      width of the ramp that brings a layer's weight to 0 at its own border, in working
                         pixels; 0: none, as published.
     fixed_point_steps   times that x_k <- p - sum_j w_j F_kj(x_k) is iterated; 0: flow is read at p,
@@ -37,11 +43,12 @@ class Settings:
     merge: MergeMode = "joint"
     softmax_sharpness: float = 10.0
     flow_magnitude: float = 100.0
+    flow_quality: FlowQuality = "normal"
     exposure: bool = True
     seam: bool = True
     transition_strain: float = 0.06
     interpolation: Interpolation = "bicubic"
-    working_pixels: int = 2_100_000
+    working_pixels: int = 0
     border_feather: float = 6.0
     fixed_point_steps: int = 0
     band_rows: int = 0
@@ -51,7 +58,7 @@ class Settings:
         for name, low, high in (
             ("softmax_sharpness", 0, 1000),
             ("flow_magnitude", 0, 10_000),
-            ("working_pixels", 1024, 1 << 28),
+            ("working_pixels", _LEAST_WORKING_PIXELS if self.working_pixels else 0, 1 << 28),
             ("transition_strain", 0, 1),
             ("border_feather", 0, 1000),
             ("fixed_point_steps", 0, 20),
@@ -65,8 +72,12 @@ class Settings:
                 raise SettingsError(f"{name} is {value!r}; choose a {kind} from {low} to {high}")
             if not low <= value <= high:  # NaN neither
                 raise SettingsError(f"{name} is {value}; choose a value from {low} to {high}")
-        for name, choices in (("merge", get_args(MergeMode)), ("interpolation", get_args(Interpolation))):
-            value = getattr(self, name)
+        for name, kinds in (
+            ("merge", MergeMode),
+            ("interpolation", Interpolation),
+            ("flow_quality", FlowQuality),
+        ):
+            value, choices = getattr(self, name), get_args(kinds)
             if not isinstance(value, str) or value not in choices:
                 expected = " or ".join(map(repr, choices))
                 raise SettingsError(f"{name} is {value!r}; choose {expected}")
@@ -76,3 +87,8 @@ class Settings:
             raise SettingsError(
                 f"device is {self.device!r}; choose an index or a part of a name, as text, or None"
             )
+
+    @property
+    def working_limit(self) -> int:
+        """`working_pixels`, or what `flow_quality` chooses."""
+        return self.working_pixels or _WORKING_PIXELS[self.flow_quality]

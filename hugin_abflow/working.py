@@ -111,7 +111,7 @@ def working_grid(full: Grid, settings: Settings) -> Grid:
     """The grid on which flow, coefficients and colour are calculated."""
     # kernels multiply a grid's width by its region's in 32 bits, and pack rows of the mask grid into 15
     longest = max(full.width, full.height) ** 2 / _LARGEST_PRODUCT
-    pixels = math.sqrt(full.width * full.height / settings.working_pixels)
+    pixels = math.sqrt(full.width * full.height / settings.working_limit)
     ratio = max(1.0, pixels, longest, full.height / _MOST_ROWS)
     width, height = max(2, round(full.width / ratio)), max(1, round(full.height / ratio))
     if ratio > 1 and full.wraps:

@@ -241,6 +241,7 @@ def test_layers_that_do_not_belong_together(other, message):
         {"merge": ["joint"]},
         {"merge": np.array(["joint", "joint"])},
         {"interpolation": None},
+        {"flow_quality": 2},
         {"exposure": 1},
         {"exposure": "auto"},
         {"device": 0},
@@ -266,6 +267,7 @@ def test_numbers_of_numpy_are_settings():
         {"band_rows": -1},
         {"merge": "average"},
         {"interpolation": "sinc"},
+        {"flow_quality": "better"},
     ],
 )
 def test_settings_out_of_range(values):

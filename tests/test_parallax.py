@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from typing import get_args
+
 import numpy as np
 import pytest
 from pictures import masked, merged, one_device, pixel_places, texture
 from scipy import ndimage
 
 from hugin_abflow.layer import Canvas, Layer
+from hugin_abflow.settings import FlowQuality
 
 pytestmark = pytest.mark.usefixtures(one_device.__name__)
 
@@ -58,6 +61,12 @@ def test_geometry_moves_over_with_the_coefficient(motion, steps):
 def test_also_at_a_lower_working_resolution(working_pixels):
     """Flow scales by the ratios of width and height, which differ."""
     result = merged(pair(6.0, -2.0), PLANE, working_pixels=working_pixels)
+    check(result, blended(6.0, -2.0))
+
+
+@pytest.mark.parametrize("quality", get_args(FlowQuality))
+def test_in_every_quality(quality):
+    result = merged(pair(6.0, -2.0), PLANE, flow_quality=quality)
     check(result, blended(6.0, -2.0))
 
 
