@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import contextmanager
 from typing import get_args
 
 import numpy as np
@@ -82,6 +83,24 @@ def test_fast_is_less_than_half_the_work(device: Device, monkeypatch: pytest.Mon
     limits = {name: Settings(flow_quality=name).working_limit for name in QUALITIES}
     assert done["fast"] * limits["fast"] < 0.5 * done["normal"] * limits["normal"]
     assert done["best"] * limits["best"] <= 3 * done["normal"] * limits["normal"]
+
+
+def test_time_of_the_flow_is_told_as_the_flows(device: Device, monkeypatch: pytest.MonkeyPatch) -> None:
+    """When its phase ends nothing of it is still to be done; kernels are queued, not awaited."""
+    happened = []
+
+    @contextmanager
+    def progress(phase, total):
+        yield lambda units: None
+        happened.append(f"end of {phase}")
+
+    finish, repeat = device.finish, device.repeat
+    monkeypatch.setattr(device, "finish", lambda: (happened.append("finish"), finish())[1])
+    monkeypatch.setattr(device, "repeat", lambda *a: (happened.append("flow"), repeat(*a))[1])
+    canvas = Canvas.plane(157, 131)
+    joint.prepare(device, pair(canvas), canvas, Settings(), progress)
+    end = happened.index("end of flow")
+    assert "flow" in happened[:end] and happened[end - 1] == "finish"
 
 
 def test_working_resolution_falls_from_what_the_quality_chose(
