@@ -81,8 +81,9 @@ class Settings:
             if not isinstance(value, str) or value not in choices:
                 expected = " or ".join(map(repr, choices))
                 raise SettingsError(f"{name} is {value!r}; choose {expected}")
-        if not isinstance(self.exposure, bool):
-            raise SettingsError(f"exposure is {self.exposure!r}; choose True or False")
+        for name in ("exposure", "seam"):
+            if not isinstance(getattr(self, name), bool):
+                raise SettingsError(f"{name} is {getattr(self, name)!r}; choose True or False")
         if self.device is not None and not isinstance(self.device, str):
             raise SettingsError(
                 f"device is {self.device!r}; choose an index or a part of a name, as text, or None"
