@@ -35,6 +35,23 @@ class Chart:
     height: int
     wraps: bool
 
+    def around(self, grid: Grid) -> float:
+        """The width of the canvas of `grid` in px of the chart."""
+        return grid.circumference * float(self.transform[9])
+
+    def positions(self, points: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+        """Chart positions (n, 2) of points (n, 3) in the scene; on the host what kernels do on the device."""
+        t = self.transform.astype(np.float64)
+        if t[13]:
+            x, y, z = t[:9].reshape(3, 3) @ points.T
+            return np.stack(
+                [np.arctan2(x, y) * t[9] + t[11], t[12] - np.arctan2(z, np.hypot(x, y)) * t[10]], 1
+            )
+        places = points[:, :2] * t[9:11] + t[11:13]
+        if t[14]:  # the copy that lies on the chart
+            places[:, 0] %= t[14] * t[9]
+        return places
+
 
 def _gap(columns: npt.NDArray[np.bool_]) -> tuple[int, int]:
     """The longest periodic run of False: (first column after it, its length)."""

@@ -198,6 +198,12 @@ _information = partial(click.option, cls=_Option, group="Information")
     help="Match brightness and colour of the layers. off: leave them as nona made them.",
 )
 @_blending(
+    "--guides",
+    type=click.Choice(["auto", "off"]),
+    default="auto" if _DEFAULTS.guides else "off",
+    help="Let the project's control points lead the flow where it goes astray. off: leave them aside.",
+)
+@_blending(
     "--softmax-sharpness",
     metavar="NUMBER",
     type=float,
@@ -254,6 +260,7 @@ def command(
     keep_layers: bool,
     merge: MergeMode,
     exposure: str,
+    guides: str,
     softmax_sharpness: float,
     flow_magnitude: float,
     flow_quality: FlowQuality,
@@ -282,6 +289,7 @@ def command(
         flow_magnitude=flow_magnitude,
         flow_quality=flow_quality,
         exposure=exposure == "auto",
+        guides=guides == "auto",
         device=device,
     )
     merge_one = partial(

@@ -7,6 +7,7 @@ brightness and gradient, and a smoothness term spreads it over untextured pixels
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 from hugin_abflow import pyramid
@@ -30,6 +31,19 @@ class FlowParameters:
     mean_sigma: float = 6.0  # px: h is log brightness less its Gaussian mean of this sigma
 
 
+# Changes a level's linear system, (level, left side, right side) of kernel flow_system, before it is solved.
+Pull = Callable[[int, Buffer, Buffer], None]
+
+
+@dataclass(frozen=True)
+class Start:
+    """A solution to start from: `flows` (both ways) on `level`; coarser levels are left out."""
+
+    level: int
+    flows: tuple[Buffer, Buffer]
+    pulls: tuple[Pull | None, Pull | None] = (None, None)
+
+
 @dataclass(frozen=True)
 class _Features:
     feature: Buffer
@@ -48,7 +62,13 @@ def _features(device: Device, level: Level, coarser: Level, parameters: FlowPara
 
 
 def _refine(
-    device: Device, a: _Features, b: _Features, flow: Buffer, level: int, parameters: FlowParameters
+    device: Device,
+    a: _Features,
+    b: _Features,
+    flow: Buffer,
+    level: int,
+    parameters: FlowParameters,
+    pull: Pull | None = None,
 ) -> Buffer:
     """Improve `flow` from a to b on one level."""
     grid, size = a.grid, a.grid[:2]
@@ -71,6 +91,8 @@ def _refine(
             "flow", "flow_system", size, left, window_right, flow, flow, a.feature, grid,
             parameters.smoothness, parameters.contrast, system_left, system_right,
         )  # fmt: skip
+        if pull:
+            pull(level, system_left, system_right)
         half = ((size[0] + 1) // 2, size[1])
         calls = [(system_left, system_right, grid, colour, parameters.relaxation, flow) for colour in (0, 1)]
         device.repeat("flow", "flow_relax", half, calls, sweeps)
@@ -79,28 +101,53 @@ def _refine(
     return flow
 
 
+def levels(image: Level, parameters: FlowParameters) -> int:
+    """How many levels the flow of an image has."""
+    shorter, count = min(image.grid[:2]), 1
+    while shorter >= 2 * parameters.coarsest:
+        shorter, count = shorter // 2, count + 1
+    return count
+
+
+def finest_features(device: Device, image: Level, parameters: FlowParameters) -> Buffer:
+    """What the solver sees of an image on its finest level: float32 (height, width, 4), see flow.cl."""
+    return _features(device, image, pyramid.reduce(device, image), parameters).feature
+
+
 def pair_flow(
-    device: Device, a: Level, b: Level, parameters: FlowParameters | None = None
+    device: Device,
+    a: Level,
+    b: Level,
+    parameters: FlowParameters | None = None,
+    start: Start | None = None,
 ) -> tuple[Buffer, Buffer]:
     """Flow from a to b and from b to a: two float32 (height, width, 2) in px of the grid.
 
-    a, b: log brightness with masks, 0 outside them.
+    a, b: log brightness with masks, 0 outside them. start: its flows are worked on, not copied.
     """
     parameters = parameters or FlowParameters()
-    shorter, levels = min(a.grid[:2]), 1
-    while shorter >= 2 * parameters.coarsest:
-        shorter, levels = shorter // 2, levels + 1
-    pyramids = [pyramid.build(device, image, levels + 1) for image in (a, b)]
+    count = start.level + 1 if start else levels(a, parameters)
+    pyramids = [pyramid.build(device, image, count + 1) for image in (a, b)]
     flows: list[Buffer] | None = None
-    for level in reversed(range(levels)):
+    for level in reversed(range(count)):
         features = [_features(device, p[level], p[level + 1], parameters) for p in pyramids]
         grid = features[0].grid
-        if flows is None:
+        if flows is None and start:
+            flows = list(start.flows)
+        elif flows is None:
             flows = [device.zeros((grid[1], grid[0], 2)) for _ in range(2)]
         else:
             flows = [_expand(device, flow, grid) for flow in flows]
         flows = [
-            _refine(device, features[i], features[1 - i], flow, level, parameters)
+            _refine(
+                device,
+                features[i],
+                features[1 - i],
+                flow,
+                level,
+                parameters,
+                start.pulls[i] if start else None,
+            )
             for i, flow in enumerate(flows)
         ]
     assert flows is not None

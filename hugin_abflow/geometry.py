@@ -9,6 +9,9 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import numpy as np
+import numpy.typing as npt
+
 from hugin_abflow.chart import Chart
 from hugin_abflow.coefficient import Coefficients
 from hugin_abflow.opencl import Buffer, Device
@@ -17,6 +20,7 @@ from hugin_abflow.working import Grid, WorkingLayer
 
 # Flow longer than this share of the canvas's width is implausible; it does not sharpen the softmax further.
 _PLAUSIBLE = 0.1
+_FOLLOWING_STEPS = 8
 
 
 @dataclass(frozen=True)
@@ -107,6 +111,27 @@ def _displacement(
             int(guess is not None), guess or field, field,
         )  # fmt: skip
     return field
+
+
+def shown_at(
+    layer: WorkingLayer, field: Buffer, grid: Grid, places: npt.NDArray[np.float64]
+) -> npt.NDArray[np.float64]:
+    """Where the panorama shows what the layer has at `places`: both float64 (n, 2), canvas px.
+
+    x_k(p) = q, solved for p by a fixed point, which is good where displacements are smooth.
+    """
+    displacements = field.get()[..., :3].astype(np.float64)
+    left, top, width, height = layer.box
+    points = grid.points(places)
+    scale = np.array([grid.width / grid.region.width, grid.height / grid.region.height])
+    shown = places
+    for _ in range(_FOLLOWING_STEPS):
+        column, row = np.floor((shown - (grid.region.left, grid.region.top)) * scale).astype(int).T
+        column = column % grid.width if grid.wraps else column
+        inside = (column >= left) & (column < left + width) & (row >= top) & (row < top + height)
+        moved = displacements[np.where(inside, row - top, 0), np.where(inside, column - left, 0)]
+        shown = grid.places(points - np.where(inside[:, None], moved, 0.0))
+    return shown
 
 
 def reach(device: Device, layer: WorkingLayer, field: Buffer, grid: Grid) -> list[float]:

@@ -18,6 +18,7 @@ from hugin_abflow import (
     consistency,
     flow,
     geometry,
+    guidance,
     quality,
     seam,
     transition,
@@ -28,6 +29,7 @@ from hugin_abflow.coefficient import Coefficients, Masks
 from hugin_abflow.colour import Correction
 from hugin_abflow.flow import FlowParameters
 from hugin_abflow.geometry import PairFlow
+from hugin_abflow.guides import Guide
 from hugin_abflow.layer import Canvas, Layer
 from hugin_abflow.opencl import Buffer, Device, DeviceMemoryError
 from hugin_abflow.progress import Progress
@@ -55,13 +57,25 @@ class Prepared:
 
 
 def merge(
-    device: Device, layers: Sequence[Layer], canvas: Canvas, settings: Settings, progress: Progress
+    device: Device,
+    layers: Sequence[Layer],
+    canvas: Canvas,
+    settings: Settings,
+    progress: Progress,
+    guides: Sequence[Guide] = (),
 ) -> Iterator[npt.NDArray[Any]]:
     """Bands of the panorama's crop from top to bottom, as `blend.bands` gives them.
 
-    The result does not depend on the order of `layers`.
+    The result does not depend on the order of `layers`, which `guides` are about.
     """
-    prepared = _prepare_in_memory(device, layers, canvas, settings, progress)
+    prepared = prepare_in_memory(device, layers, canvas, settings, progress, guides)
+    yield from bands(device, prepared, canvas, settings, progress)
+
+
+def bands(
+    device: Device, prepared: Prepared, canvas: Canvas, settings: Settings, progress: Progress
+) -> Iterator[npt.NDArray[Any]]:
+    """The full-resolution pass."""
     with progress("blend", canvas.crop.height) as advance:
         yield from blend.bands(
             device, prepared.layers, prepared.full, prepared.grid, prepared.gain_grid,
@@ -69,14 +83,19 @@ def merge(
         )  # fmt: skip
 
 
-def _prepare_in_memory(
-    device: Device, layers: Sequence[Layer], canvas: Canvas, settings: Settings, progress: Progress
+def prepare_in_memory(
+    device: Device,
+    layers: Sequence[Layer],
+    canvas: Canvas,
+    settings: Settings,
+    progress: Progress,
+    guides: Sequence[Guide] = (),
 ) -> Prepared:
     """`prepare`, on a smaller working canvas where the device's memory does not hold the wanted one."""
     region = working.full_grid(canvas, layers).region
     while True:
         try:
-            return prepare(device, layers, canvas, settings, progress)
+            return prepare(device, layers, canvas, settings, progress, guides)
         except DeviceMemoryError:
             fewer = min(settings.working_limit, region.width * region.height) // 2
             if fewer < _LEAST_WORKING_PIXELS:
@@ -86,7 +105,12 @@ def _prepare_in_memory(
 
 
 def prepare(
-    device: Device, layers: Sequence[Layer], canvas: Canvas, settings: Settings, progress: Progress
+    device: Device,
+    layers: Sequence[Layer],
+    canvas: Canvas,
+    settings: Settings,
+    progress: Progress,
+    guides: Sequence[Guide] = (),
 ) -> Prepared:
     """Everything that sees far, at working resolution: flow, coefficients, geometry, colour."""
     full = working.full_grid(canvas, layers)
@@ -97,8 +121,11 @@ def prepare(
     reduced = [everything[i] for i in used]
     masks = masks.only(used)
     coefficients = coefficient.coefficients(device, reduced, masks, grid, settings)
+    order = {id(layer): index for index, layer in enumerate(layers)}
+    numbers = [order[id(one.layer)] for one in reduced]
     parameters = quality.flow_parameters(settings.flow_quality)
-    flows = _flows(device, reduced, masks, grid, progress, parameters)
+    used_guides = guides if settings.guides else ()
+    flows = _flows(device, reduced, masks, grid, progress, parameters, used_guides, numbers)
     fields, correction = _align(device, reduced, coefficients, flows, masks, grid, settings)
     final = [
         BlendLayer(layer, field, geometry.reach(device, layer, field, grid), gain)
@@ -176,8 +203,13 @@ def _flows(
     grid: Grid,
     progress: Progress,
     parameters: FlowParameters,
+    guides: Sequence[Guide],
+    numbers: Sequence[int],
 ) -> list[PairFlow]:
-    """Flow of every pair of layers that overlap, on the pair's own chart."""
+    """Flow of every pair of layers that overlap, on the pair's own chart.
+
+    numbers: what guides call each of `layers`.
+    """
     overlaps = [
         (a, b, masks.host[a] & masks.host[b]) for a in range(len(layers)) for b in range(a + 1, len(layers))
     ]
@@ -190,8 +222,11 @@ def _flows(
             if not working.same_where_both(device, *pair):
                 its_chart = chart.pair_chart(overlap, masks.grid, grid)
                 image_a, image_b = (chart.sample(device, layer, grid, its_chart) for layer in pair)
-                both = flow.pair_flow(device, image_a, image_b, parameters)
-                result.append(PairFlow(a, b, its_chart, *both))
+                found = flow.pair_flow(device, image_a, image_b, parameters)
+                placed = guidance.on_chart(guides, numbers[a], numbers[b], its_chart, grid)
+                if placed:
+                    found = guidance.lead(device, (image_a, image_b), found, placed, its_chart.around(grid))
+                result.append(PairFlow(a, b, its_chart, *found))
             advance(1)
         device.finish()  # kernels are only queued: the last pair's time would be told as that of what follows
     return result

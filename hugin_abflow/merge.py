@@ -13,10 +13,12 @@ import numpy.typing as npt
 
 from hugin_abflow import joint, sequential
 from hugin_abflow.errors import LayersMissingError, OutputError
+from hugin_abflow.guides import Guide
 from hugin_abflow.images import ENDINGS, ImageWriter
 from hugin_abflow.layer import Canvas, Layer
 from hugin_abflow.nona import Remap, check_layers, open_layers
 from hugin_abflow.opencl import Device
+from hugin_abflow.pano_trafo import read_guides
 from hugin_abflow.progress import Progress, silent
 from hugin_abflow.project import Plan, read_plan
 from hugin_abflow.settings import Settings
@@ -63,7 +65,7 @@ def merge_project(
             compression=compression, jpeg_quality=jpeg_quality,
         ) as writer:  # fmt: skip
             _report(plan, opened, writer)
-            _write(writer, _bands(opened, plan.canvas, settings, progress))
+            _write(writer, _bands(opened, plan.canvas, settings, progress, _guides(plan, opened, settings)))
     return target
 
 
@@ -72,9 +74,12 @@ def merge_layers(
     canvas: Canvas,
     settings: Settings | None = None,
     *,
+    guides: Sequence[Guide] = (),
     progress: Progress = silent,
 ) -> npt.NDArray[Any]:
     """Merge layers in memory: the canvas's crop, (height, width, channels + 1) in the layers' dtype.
+
+    guides          places that two of `layers` have in common; they lead the flow where it goes astray.
 
     Alpha is last and unassociated. Raises `LayersMissingError` without layers, `LayersMismatchError` if
     they do not fit the canvas or each other, `DeviceError`.
@@ -82,17 +87,21 @@ def merge_layers(
     if not layers:
         raise LayersMissingError("there are no layers to merge; give at least one")
     check_layers(canvas, layers)
-    return np.concatenate(list(_bands(layers, canvas, settings or Settings(), progress)))
+    return np.concatenate(list(_bands(layers, canvas, settings or Settings(), progress, guides)))
 
 
 def _bands(
-    layers: Sequence[Layer], canvas: Canvas, settings: Settings, progress: Progress
+    layers: Sequence[Layer],
+    canvas: Canvas,
+    settings: Settings,
+    progress: Progress,
+    guides: Sequence[Guide],
 ) -> Iterator[npt.NDArray[Any]]:
     """The panorama's rows from top to bottom."""
     device = Device(settings.device)
     method = {"joint": joint.merge, "sequential": sequential.merge}[settings.merge]
     visible = False
-    for rows in method(device, layers, canvas, settings, progress):
+    for rows in method(device, layers, canvas, settings, progress, guides):
         visible = visible or bool(rows[..., -1].any())
         yield rows
     if not visible:
@@ -100,6 +109,12 @@ def _bands(
             "the panorama is wholly transparent: no layer shows anything inside the crop; "
             "check crop and masks in Hugin"
         )
+
+
+def _guides(plan: Plan, layers: Sequence[Layer], settings: Settings) -> list[Guide]:
+    """The project's control points between the layers."""
+    places = {layer.image: index for index, layer in enumerate(layers) if layer.image is not None}
+    return read_guides(plan, places) if settings.guides and len(places) > 1 else []
 
 
 def _write(writer: ImageWriter, bands: Iterator[npt.NDArray[Any]]) -> None:

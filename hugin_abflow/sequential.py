@@ -13,7 +13,9 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from hugin_abflow import coefficient, joint, working
+from hugin_abflow import coefficient, geometry, joint, working
+from hugin_abflow.guides import Guide
+from hugin_abflow.joint import Prepared
 from hugin_abflow.layer import Canvas, Layer
 from hugin_abflow.opencl import Device
 from hugin_abflow.progress import Progress, silent
@@ -21,17 +23,27 @@ from hugin_abflow.settings import Settings
 
 
 def merge(
-    device: Device, layers: Sequence[Layer], canvas: Canvas, settings: Settings, progress: Progress
+    device: Device,
+    layers: Sequence[Layer],
+    canvas: Canvas,
+    settings: Settings,
+    progress: Progress,
+    guides: Sequence[Guide] = (),
 ) -> Iterator[npt.NDArray[Any]]:
     """The panorama's crop, in bands as `joint.merge` gives them."""
     order = _order(device, layers, canvas, settings)
     mosaic = layers[order[0]]
+    guides = list(guides) if settings.guides else []
     with progress("merge", len(order) - 1) as advance:
-        for index in order[1:-1]:
-            mosaic = _merge_two(device, mosaic, layers[index], canvas, settings)
+        for step in range(1, len(order) - 1):
+            inside, index = order[:step], order[step]
+            mosaic, guides = _merge_two(
+                device, mosaic, layers[index], canvas, settings, guides, inside, index
+            )
             advance(1)
     last = [mosaic] if len(order) == 1 else [mosaic, layers[order[-1]]]
-    yield from joint.merge(device, last, canvas, settings, progress)
+    between = _between(guides, order[:-1], order[-1])
+    yield from joint.merge(device, last, canvas, settings, progress, between)
 
 
 def _order(device: Device, layers: Sequence[Layer], canvas: Canvas, settings: Settings) -> list[int]:
@@ -52,9 +64,49 @@ def _order(device: Device, layers: Sequence[Layer], canvas: Canvas, settings: Se
     return order
 
 
-def _merge_two(device: Device, mosaic: Layer, layer: Layer, canvas: Canvas, settings: Settings) -> Layer:
-    """Two layers as one, over their common bounding box."""
+def _between(guides: Sequence[Guide], inside: Sequence[int], index: int) -> list[Guide]:
+    """Guides between the layers of the mosaic and layer `index`, as those of layers 0 and 1."""
+    turned = [replace(g, a=g.b, b=g.a, at_a=g.at_b, at_b=g.at_a) if g.a == index else g for g in guides]
+    return [replace(g, a=0, b=1) for g in turned if g.a in inside and g.b == index]
+
+
+def _merge_two(
+    device: Device,
+    mosaic: Layer,
+    layer: Layer,
+    canvas: Canvas,
+    settings: Settings,
+    guides: Sequence[Guide],
+    inside: Sequence[int],
+    index: int,
+) -> tuple[Layer, list[Guide]]:
+    """Two layers as one, over their common bounding box; and the guides, moved with what they are on.
+
+    inside, index   numbers of the layers in the mosaic, and of the other, as guides have them.
+    """
     region = working.full_grid(canvas, [mosaic, layer]).region
     whole = replace(canvas, crop=region)
-    pixels = np.concatenate(list(joint.merge(device, [mosaic, layer], whole, settings, silent)))
-    return Layer.from_array(f"{mosaic.name}+{layer.name}", pixels, region.left, region.top, mosaic.icc)
+    between = _between(guides, inside, index)
+    prepared = joint.prepare_in_memory(device, [mosaic, layer], whole, settings, silent, between)
+    pixels = np.concatenate(list(joint.bands(device, prepared, whole, settings, silent)))
+    merged = Layer.from_array(f"{mosaic.name}+{layer.name}", pixels, region.left, region.top, mosaic.icc)
+    for numbers, one in ((inside, mosaic), ([index], layer)):
+        guides = _moved(guides, numbers, one, prepared)
+    return merged, list(guides)
+
+
+def _moved(guides: Sequence[Guide], numbers: Sequence[int], layer: Layer, prepared: Prepared) -> list[Guide]:
+    """The guides, with the ends on `layer` (one of `numbers`) where the mosaic shows them."""
+    (placed,) = (one for one in prepared.layers if one.working.layer is layer)
+    ends = [end for g in guides for end, number in ((g.at_a, g.a), (g.at_b, g.b)) if number in numbers]
+    if not ends:
+        return list(guides)
+    shown = iter(geometry.shown_at(placed.working, placed.field, prepared.grid, np.array(ends)).tolist())
+    return [
+        replace(
+            g,
+            at_a=tuple(next(shown)) if g.a in numbers else g.at_a,
+            at_b=tuple(next(shown)) if g.b in numbers else g.at_b,
+        )
+        for g in guides
+    ]

@@ -28,6 +28,7 @@ class Settings:
     seam                take from one layer, whole, what flow cannot explain (people who moved, occlusions).
     transition_strain   how much changing over from one layer's geometry to the next may stretch it, where
                         the overlap is wider than that takes; 0..1, 0: the whole overlap, as published.
+    guides              let control points lead the flow where it goes astray.
     interpolation       how layers are sampled; "nearest" is for comparison with the paper's own code.
     working_pixels      upper bound of the pixels of the working canvas (flow, coefficients, colour), at least
                         1024; 0: chosen by flow_quality.
@@ -47,6 +48,7 @@ class Settings:
     exposure: bool = True
     seam: bool = True
     transition_strain: float = 0.06
+    guides: bool = True
     interpolation: Interpolation = "bicubic"
     working_pixels: int = 0
     border_feather: float = 6.0

@@ -14,6 +14,7 @@ from dataclasses import dataclass, replace
 from zlib import crc32
 
 import numpy as np
+import numpy.typing as npt
 
 from hugin_abflow.layer import Box, Canvas, Layer
 from hugin_abflow.opencl import Buffer, Device
@@ -68,6 +69,27 @@ class Grid:
             return 2 * math.pi
         share = self.canvas_width / self.region.width if self.canvas_width else 1.0
         return share * self.width * (self.lens[1] or 1.0)
+
+    def points(self, places: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+        """Points (n, 3) in the scene (kernels/common.cl) of canvas positions (n, 2), full-resolution px."""
+        x, y = ((places - (self.region.left, self.region.top)) * self._ratios).T
+        if not self.lens[1]:
+            return np.stack([x, y, np.zeros_like(x)], 1)
+        lon, lat = self.lens[0] + x * self.lens[1], self.lens[2] - y * self.lens[3]
+        return np.stack([np.cos(lat) * np.sin(lon), np.cos(lat) * np.cos(lon), np.sin(lat)], 1)
+
+    def places(self, points: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+        """The inverse of `points`; points on a sphere may have any length but 0."""
+        x, y, z = points.T
+        if self.lens[1]:
+            lon, lat = np.arctan2(x, y), np.arctan2(z, np.hypot(x, y))
+            x, y = (lon - self.lens[0]) / self.lens[1], (self.lens[2] - lat) / self.lens[3]
+        return np.stack([x, y], 1) / self._ratios + (self.region.left, self.region.top)
+
+    @property
+    def _ratios(self) -> tuple[float, float]:
+        """Pixels of the grid per full-resolution pixel."""
+        return self.width / self.region.width, self.height / self.region.height
 
     def resized(self, width: int, height: int) -> Grid:
         """The same region on another number of pixels."""

@@ -1,0 +1,293 @@
+"""Flow that guides lead where it cannot find its way alone (kernels/guidance.cl).
+
+The flow is found without them first; guides that agree with it change nothing. Around the others the flow
+starts once more, on a coarse level, from where they send it, held there by a spring that slackens from level
+to level and is gone on the finest. Then each pixel keeps the flow that explains the images better: guides
+decide only where the images do not.
+"""
+
+from __future__ import annotations
+
+import logging
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from hugin_abflow import flow
+from hugin_abflow.chart import Chart
+from hugin_abflow.flow import FlowParameters, Start
+from hugin_abflow.guides import Guide, Points, doubts
+from hugin_abflow.opencl import Buffer, Device
+from hugin_abflow.pyramid import Level
+from hugin_abflow.working import Grid
+
+_log = logging.getLogger(__name__)
+
+# Guides are on one thing if their moves differ by less than this share of what the flow lacks.
+_ALIKE = 0.3
+
+
+@dataclass(frozen=True)
+class GuidanceParameters:
+    """How guides lead."""
+
+    agreement: float = 3.0  # chart px: a guide so near to the flow changes nothing
+    radius: float = 0.08  # of the canvas's width: how far neighbours vouch for each other
+    pulls: tuple[float, ...] = (0.0, 2.0, 8.0)  # strength of the spring per level, finest first
+    least_sigma: float = 32.0  # chart px around a guide that it leads: its distance from the flow, because
+    most_sigma: float = 128.0  # smaller things are found alone, or a share of the way to one that moves alike
+    spacing: float = 0.6
+    evidence: float = 20.0  # weight of a difference in cost beside a link of neighbours
+    trust: float = 20.0  # weight of a guide's own place beside a link of neighbours
+    contrast: float = 0.05  # step of h that parts neighbours
+    sweeps: int = 200  # of the vote
+    witness: float = 6.0  # px: sigma of the window around a guide in which the images are heard about it
+    gain: float = 0.75  # of the old cost there: the images confirm a guide that brings it below, ...
+    misfit: float = 1.25  # of the images' contrast there, if it is not worse than none, ...
+    fit: float = 0.5  # or below this share, however well the old flow fits, ...
+    blank: float = 0.06  # or if there is less contrast than this: nobody but the guide knows
+
+
+@dataclass(frozen=True)
+class ChartGuides:
+    """The guides of one pair: at_a, at_b float64 (n, 2), their ends on its chart, px."""
+
+    at_a: Points
+    at_b: Points
+    names: tuple[str, ...]
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+    def only(self, chosen: npt.NDArray[np.bool_]) -> ChartGuides:
+        """The chosen ones, a mask (n,)."""
+        names = tuple(name for name, used in zip(self.names, chosen, strict=True) if used)
+        return ChartGuides(self.at_a[chosen], self.at_b[chosen], names)
+
+
+def on_chart(guides: Sequence[Guide], a: int, b: int, chart: Chart, grid: Grid) -> ChartGuides:
+    """The guides between layers a and b on the pair's chart; `grid` is the working grid."""
+    ends: list[list[tuple[float, float]]] = [[], []]
+    names = []
+    for guide in guides:
+        if (guide.a, guide.b) in ((a, b), (b, a)):
+            for end, place in zip(ends, (guide.at_a, guide.at_b), strict=True):
+                end.append(place)
+            if guide.a == b:
+                ends[0][-1], ends[1][-1] = ends[1][-1], ends[0][-1]
+            names.append(guide.name)
+    at_a, at_b = (chart.positions(grid.points(np.array(end, float).reshape(-1, 2))) for end in ends)
+    return ChartGuides(at_a, at_b, tuple(names))
+
+
+def lead(
+    device: Device,
+    images: tuple[Level, Level],
+    flows: tuple[Buffer, Buffer],
+    guides: ChartGuides,
+    circumference: float,
+    parameters: GuidanceParameters | None = None,
+) -> tuple[Buffer, Buffer]:
+    """Better flows of a pair where guides contradict them; the same buffers where none does.
+
+    images          a and b as `flow.pair_flow` takes them; flows: what it found.
+    circumference   of the canvas in px of the chart.
+    """
+    parameters, count = parameters or GuidanceParameters(), len(guides)
+    ways = list(_ways(images[0], flows, guides))
+    wrong = np.any([np.linalg.norm(way.residuals, axis=1) > parameters.agreement for way in ways], axis=0)
+    if not wrong.any():
+        return flows
+    reasons = doubts(guides.at_a, ways[0].moves, parameters.radius * circumference)
+    for name, reason, counts in zip(guides.names, reasons, wrong, strict=True):
+        if reason and counts:
+            _log.info("%s is ignored: %s", name, reason)
+    leading = wrong & np.array([not reason for reason in reasons])
+    if not leading.any():
+        return flows
+    guides, ways = guides.only(leading), [way.only(leading) for way in ways]
+    solved = FlowParameters()
+    level = min(len(parameters.pulls), flow.levels(images[0], solved)) - 1
+    found = [device.upload(one.get()) for one in flows]  # a start is worked on
+    springs = [_Springs(device, images[0], *pair, parameters) for pair in zip(found, ways, strict=True)]
+    start = Start(
+        level, (springs[0].start(level), springs[1].start(level)), (springs[0].pull, springs[1].pull)
+    )
+    new = flow.pair_flow(device, *images, solved, start)
+    features = [flow.finest_features(device, image, solved) for image in images]
+    rivals = [
+        _Rivals.of(device, features[i], features[1 - i], images[i].grid, found[i], new[i]) for i in (0, 1)
+    ]
+    reasons = _refusals(rivals, ways, parameters)
+    for name, reason in zip(guides.names, reasons, strict=True):
+        if reason:
+            _log.info("%s is ignored: %s", name, reason)
+    kept = np.array([not reason for reason in reasons])
+    if not kept.any():
+        return found[0], found[1]
+    _log.info("%d of %d control points of a pair lead its flow", np.count_nonzero(kept), count)
+    for rival, way in zip(rivals, ways, strict=True):
+        _choose(device, rival, _Springs(device, images[0], rival.old, way.only(kept), parameters), parameters)
+    return flow.pair_flow(device, *images, solved, Start(0, (found[0], found[1])))
+
+
+@dataclass(frozen=True)
+class _Way:
+    """The guides in one direction: places, moves and what the flow there lacks to them, (n, 2) px.
+
+    A residual is 0 where the place is not on the chart.
+    """
+
+    places: Points
+    moves: Points
+    residuals: Points
+
+    def only(self, chosen: npt.NDArray[np.bool_]) -> _Way:
+        return _Way(self.places[chosen], self.moves[chosen], self.residuals[chosen])
+
+
+def _ways(image: Level, flows: Sequence[Buffer], guides: ChartGuides) -> tuple[_Way, _Way]:
+    width, height, wraps, _ = image.grid
+    moves = guides.at_b - guides.at_a
+    if wraps:
+        moves[:, 0] -= width * np.rint(moves[:, 0] / width)
+    ways = []
+    for field, places, way in zip(flows, (guides.at_a, guides.at_b), (moves, -moves), strict=True):
+        values = field.get()
+        column, row = np.floor(places).astype(int).T
+        column = column % width if wraps else column
+        inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
+        found = values[np.where(inside, row, 0), np.where(inside, column, 0)]
+        ways.append(_Way(places, way, np.where(inside[:, None], way - found, 0.0)))
+    return ways[0], ways[1]
+
+
+class _Springs:
+    """Start and springs of one direction, on any level."""
+
+    def __init__(
+        self, device: Device, image: Level, found: Buffer, way: _Way, parameters: GuidanceParameters
+    ) -> None:
+        self._device, self._image, self._found, self._parameters = device, image, found, parameters
+        way = way.only(way.residuals.any(1))  # the others are not on the chart
+        table = np.concatenate([way.places, way.residuals], 1)
+        self._guides = device.upload(table, np.float32)
+        self._sigmas = device.upload(_sigmas(way, parameters), np.float32)
+
+    def at(self, level: int) -> tuple[Buffer, Buffer]:
+        """Start (height, width, 2) and nearness (height, width) on a level."""
+        width, height = self._image.grid[:2]
+        for _ in range(level):
+            width, height = (width + 1) // 2, (height + 1) // 2
+        start, near = self._device.empty((height, width, 2)), self._device.empty((height, width))
+        self._device.run(
+            "guidance", "guidance_start", (width, height), self._found, self._image.grid, self._guides,
+            self._sigmas, self._sigmas.shape[0], float(1 << level), start, near, (width, height),
+        )  # fmt: skip
+        return start, near
+
+    def start(self, level: int) -> Buffer:
+        return self.at(level)[0]
+
+    def pull(self, level: int, left_side: Buffer, right_side: Buffer) -> None:
+        strength = self._parameters.pulls[level]
+        if not strength:
+            return
+        start, near = self.at(level)
+        grid = (start.shape[1], start.shape[0], self._image.grid[2], 0)
+        self._device.run(
+            "guidance", "guidance_pull", grid[:2], start, near, grid, strength, left_side, right_side
+        )
+
+
+def _sigmas(way: _Way, parameters: GuidanceParameters) -> npt.NDArray[np.float64]:
+    """How far each guide leads, px."""
+    apart = np.linalg.norm(way.places[:, None] - way.places, axis=-1)
+    differ = np.linalg.norm(way.moves[:, None] - way.moves, axis=-1)
+    lengths = np.linalg.norm(way.residuals, axis=1)
+    alike = (differ < _ALIKE * lengths) & ~np.eye(len(lengths), dtype=bool)
+    to_next = np.where(alike, apart, np.inf).min(1, initial=np.inf)
+    sigmas = np.maximum(lengths, np.where(np.isfinite(to_next), parameters.spacing * to_next, 0.0))
+    return np.clip(sigmas, parameters.least_sigma, parameters.most_sigma)
+
+
+@dataclass(frozen=True)
+class _Rivals:
+    """Two flows of one direction, and what of the other image each brings to the pixels of this one.
+
+    feature, brought    float32 (height, width, 4), see kernels/flow.cl.
+    """
+
+    grid: tuple[int, int, int, int]
+    feature: Buffer
+    old: Buffer
+    new: Buffer
+    brought: tuple[Buffer, Buffer]
+
+    @classmethod
+    def of(
+        cls, device: Device, feature: Buffer, other: Buffer, grid: tuple[int, int, int, int],
+        old: Buffer, new: Buffer,
+    ) -> _Rivals:  # fmt: skip
+        brought = device.empty(feature.shape), device.empty(feature.shape)
+        for field, target in zip((old, new), brought, strict=True):
+            device.run("flow", "flow_warp", grid[:2], other, field, grid, target)
+        return cls(grid, feature, old, new, brought)
+
+
+def _refusals(rivals: Sequence[_Rivals], ways: Sequence[_Way], parameters: GuidanceParameters) -> list[str]:
+    """Why guides are ignored after all, "" where they are not: what the images say around each of them."""
+    radius = math.ceil(2 * parameters.witness)
+    steps = np.arange(-radius, radius + 1)
+    weights = np.exp(-0.5 * (steps / parameters.witness) ** 2)
+    window = weights[:, None] * weights
+    count = len(ways[0].places)
+    costs, contrast, moved = np.zeros((count, 2)), np.zeros(count), np.zeros(count)
+    for rival, way in zip(rivals, ways, strict=True):
+        feature, *brought = (buffer.get() for buffer in (rival.feature, *rival.brought))
+        shift = np.linalg.norm(rival.new.get() - rival.old.get(), axis=-1)
+        width, height, wraps, _ = rival.grid
+        for i in np.flatnonzero(way.residuals.any(1)):
+            column, row = np.floor(way.places[i]).astype(int)
+            columns, rows = column + steps, row + steps
+            inside = (rows[:, None] >= 0) & (rows[:, None] < height)
+            inside = inside & (bool(wraps) | ((columns >= 0) & (columns < width)))
+            at = np.ix_(np.clip(rows, 0, height - 1), columns % width)
+            seen = inside & (feature[at][..., 3] * brought[0][at][..., 3] * brought[1][at][..., 3] > 0)
+            share = window * seen
+            contrast[i] += (share * _cost(feature[at], 0 * feature[at])).sum() / max(share.sum(), 1.0)
+            for k in (0, 1):
+                costs[i, k] += (share * _cost(feature[at], brought[k][at])).sum() / max(share.sum(), 1.0)
+            moved[i] = max(moved[i], shift[row, column % width])
+    old, new = costs.T
+    better = (new < parameters.gain * old) & (new < parameters.misfit * contrast)
+    fits = (new < parameters.fit * contrast) | (contrast < parameters.blank)
+    return [
+        "the images lead back" if back else "" if good else "the images do not confirm it"
+        for back, good in zip(moved < parameters.agreement, better | fits, strict=True)
+    ]
+
+
+def _cost(a: npt.NDArray[np.float32], b: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
+    """How badly features fit, as `guidance_cost` of the kernel."""
+    off = np.abs(a - b)
+    return np.minimum(off[..., 0] + 2 * (off[..., 1] + off[..., 2]), 0.5)
+
+
+def _choose(device: Device, rivals: _Rivals, springs: _Springs, parameters: GuidanceParameters) -> None:
+    """Put the new flow into the old one where it explains the images better."""
+    grid, size = rivals.grid, rivals.grid[:2]
+    _, near = springs.at(0)
+    left_side, right_side = (device.empty(rivals.feature.shape) for _ in range(2))
+    device.run(
+        "guidance", "guidance_vote", size, rivals.feature, *rivals.brought, near, grid,
+        parameters.evidence, parameters.trust, parameters.contrast, left_side, right_side,
+    )  # fmt: skip
+    vote = device.zeros(rivals.old.shape)
+    half = ((size[0] + 1) // 2, size[1])
+    calls = [(left_side, right_side, grid, colour, 1.9, vote) for colour in (0, 1)]
+    device.repeat("flow", "flow_relax", half, calls, parameters.sweeps)
+    device.run("guidance", "guidance_choose", size, vote, rivals.new, grid, rivals.old)
