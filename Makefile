@@ -19,7 +19,7 @@ CURRENT := $(shell $(PY) -P -c "import importlib.util, os, sys; \
 
 # Debian's packages that the tests need, and the programs of theirs that are called.
 PACKAGES := hugin-tools enblend libimage-exiftool-perl
-PROGRAMS := nona enblend exiftool
+PROGRAMS := nona pano_trafo enblend exiftool
 
 .PHONY: sample test lint clean programs FORCE
 

@@ -5,6 +5,7 @@ The public names; everything else may change. `hugin_abflow.pto` reads and write
 
 from hugin_abflow import pto
 from hugin_abflow.errors import AbflowError, ExitCode
+from hugin_abflow.guides import Guide
 from hugin_abflow.images import read_layer, read_layers, write_image
 from hugin_abflow.layer import Box, Canvas, Layer
 from hugin_abflow.merge import merge_layers, merge_project
@@ -15,6 +16,7 @@ __all__ = [
     "Box",
     "Canvas",
     "ExitCode",
+    "Guide",
     "Layer",
     "Settings",
     "merge_layers",

@@ -91,7 +91,7 @@ def lead(
     circumference: float,
     parameters: GuidanceParameters | None = None,
 ) -> tuple[Buffer, Buffer]:
-    """Better flows of a pair where guides contradict them; the same buffers where none does.
+    """The flows of a pair, made better in place where guides contradict them.
 
     images          a and b as `flow.pair_flow` takes them; flows: what it found.
     circumference   of the canvas in px of the chart.
@@ -127,11 +127,20 @@ def lead(
             _log.info("%s is ignored: %s", name, reason)
     kept = np.array([not reason for reason in reasons])
     if not kept.any():
-        return found[0], found[1]
+        return flows
     _log.info("%d of %d control points of a pair lead its flow", np.count_nonzero(kept), count)
-    for rival, way in zip(rivals, ways, strict=True):
-        _choose(device, rival, _Springs(device, images[0], rival.old, way.only(kept), parameters), parameters)
-    return flow.pair_flow(device, *images, solved, Start(0, (found[0], found[1])))
+    springs = [
+        _Springs(device, images[0], rival.old, way.only(kept), parameters)
+        for rival, way in zip(rivals, ways, strict=True)
+    ]
+    nearness = [spring.at(0)[1] for spring in springs]
+    for rival, near in zip(rivals, nearness, strict=True):
+        _choose(device, rival, near, parameters)
+    settled = flow.pair_flow(device, *images, solved, Start(0, (found[0], found[1])))
+    for one, near, result in zip(settled, nearness, flows, strict=True):
+        grid = images[0].grid
+        device.run("guidance", "guidance_settle", grid[:2], one, near, grid, result)
+    return flows
 
 
 @dataclass(frozen=True)
@@ -277,10 +286,9 @@ def _cost(a: npt.NDArray[np.float32], b: npt.NDArray[np.float32]) -> npt.NDArray
     return np.minimum(off[..., 0] + 2 * (off[..., 1] + off[..., 2]), 0.5)
 
 
-def _choose(device: Device, rivals: _Rivals, springs: _Springs, parameters: GuidanceParameters) -> None:
+def _choose(device: Device, rivals: _Rivals, near: Buffer, parameters: GuidanceParameters) -> None:
     """Put the new flow into the old one where it explains the images better."""
     grid, size = rivals.grid, rivals.grid[:2]
-    _, near = springs.at(0)
     left_side, right_side = (device.empty(rivals.feature.shape) for _ in range(2))
     device.run(
         "guidance", "guidance_vote", size, rivals.feature, *rivals.brought, near, grid,

@@ -6,7 +6,7 @@
 
 /* How much of the flow around guides is theirs: all of it up to 1.2 sigma, nothing beyond 4. */
 static inline float guidance_share(float near) {
-    return near > 3.4e-4f ? fmin(2.0f * near, 1.0f) : 0.0f;
+    return clamp(2.0f * near - 1e-3f, 0.0f, 1.0f);
 }
 
 /* The flow on a coarser level, displaced by an interpolation of the guides' residuals. */
@@ -111,4 +111,19 @@ __kernel void guidance_choose(__global const float2 *vote, /* (grid.y, grid.x) -
     const int at = y * grid.x + x;
     if (vote[at].x > 0.0f)
         flow[at] = new[at];
+}
+
+/* The settled flow around guides, the flow found without them elsewhere, to the bit. */
+__kernel void guidance_settle(__global const float2 *settled, /* (grid.y, grid.x) */
+                              __global const float *near,     /* (grid.y, grid.x) */
+                              int4 grid,                      /* run size */
+                              __global float2 *flow)          /* (grid.y, grid.x) in place */
+{
+    const int x = get_global_id(0), y = get_global_id(1);
+    if (x >= grid.x || y >= grid.y)
+        return;
+    const int at = y * grid.x + x;
+    const float w = fmin(10.0f * guidance_share(near[at]), 1.0f); /* the new flow wins nowhere where w < 1 */
+    if (w > 0.0f)
+        flow[at] += w * (settled[at] - flow[at]);
 }

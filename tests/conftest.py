@@ -38,6 +38,12 @@ def nona() -> str:
 
 
 @pytest.fixture
+def pano_trafo() -> str:
+    """Hugin's pano_trafo, really installed."""
+    return require_program("pano_trafo")
+
+
+@pytest.fixture
 def exiftool() -> str:
     """exiftool, really installed."""
     return require_program("exiftool")

@@ -52,8 +52,8 @@ def flows(monkeypatch):
     seen = []
     original = joint._flows
 
-    def remember(device, layers, masks, grid, *more):
-        found = original(device, layers, masks, grid, *more)
+    def remember(device, layers, masks, grid, *rest):
+        found = original(device, layers, masks, grid, *rest)
         (pair,) = found
         assert (pair.a, pair.b) == (0, 1)
         seen.append((layers[0].layer, layers[1].layer, pair, grid))
