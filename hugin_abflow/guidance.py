@@ -26,6 +26,8 @@ from hugin_abflow.working import Grid
 
 _log = logging.getLogger(__name__)
 
+Values = npt.NDArray[np.float64]
+
 # Guides are on one thing if their moves differ by less than this share of what the flow lacks.
 _ALIKE = 0.3
 
@@ -181,7 +183,7 @@ class _Springs:
         self, device: Device, image: Level, found: Buffer, way: _Way, parameters: GuidanceParameters
     ) -> None:
         self._device, self._image, self._found, self._parameters = device, image, found, parameters
-        way = way.only(way.residuals.any(1))  # the others are not on the chart
+        way = way.only(np.any(way.residuals, axis=1))  # the others are not on the chart
         table = np.concatenate([way.places, way.residuals], 1)
         self._guides = device.upload(table, np.float32)
         self._sigmas = device.upload(_sigmas(way, parameters), np.float32)
@@ -212,7 +214,7 @@ class _Springs:
         )
 
 
-def _sigmas(way: _Way, parameters: GuidanceParameters) -> npt.NDArray[np.float64]:
+def _sigmas(way: _Way, parameters: GuidanceParameters) -> Values:
     """How far each guide leads, px."""
     apart = np.linalg.norm(way.places[:, None] - way.places, axis=-1)
     differ = np.linalg.norm(way.moves[:, None] - way.moves, axis=-1)
@@ -220,7 +222,8 @@ def _sigmas(way: _Way, parameters: GuidanceParameters) -> npt.NDArray[np.float64
     alike = (differ < _ALIKE * lengths) & ~np.eye(len(lengths), dtype=bool)
     to_next = np.where(alike, apart, np.inf).min(1, initial=np.inf)
     sigmas = np.maximum(lengths, np.where(np.isfinite(to_next), parameters.spacing * to_next, 0.0))
-    return np.clip(sigmas, parameters.least_sigma, parameters.most_sigma)
+    clipped: Values = np.clip(sigmas, parameters.least_sigma, parameters.most_sigma)
+    return clipped
 
 
 @dataclass(frozen=True)
@@ -283,7 +286,8 @@ def _refusals(rivals: Sequence[_Rivals], ways: Sequence[_Way], parameters: Guida
 def _cost(a: npt.NDArray[np.float32], b: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
     """How badly features fit, as `guidance_cost` of the kernel."""
     off = np.abs(a - b)
-    return np.minimum(off[..., 0] + 2 * (off[..., 1] + off[..., 2]), 0.5)
+    cost: npt.NDArray[np.float32] = np.minimum(off[..., 0] + 2 * (off[..., 1] + off[..., 2]), 0.5)
+    return cost
 
 
 def _choose(device: Device, rivals: _Rivals, near: Buffer, parameters: GuidanceParameters) -> None:

@@ -96,7 +96,6 @@ class Layer:
     icc         the ICC profile, if any.
     canvas_size (width, height) of the canvas that the layer was made for, if its file tells it.
     file        the file that `read` decodes; None for pixels in memory.
-    image       index in the project of the image that the layer shows, if it is known.
     """
 
     name: str
@@ -107,7 +106,6 @@ class Layer:
     icc: bytes | None = field(default=None, repr=False)
     canvas_size: tuple[int, int] | None = None
     file: Path | None = None
-    image: int | None = None
 
     @classmethod
     def from_array(

@@ -18,7 +18,7 @@ from hugin_abflow.images import ENDINGS, ImageWriter
 from hugin_abflow.layer import Canvas, Layer
 from hugin_abflow.nona import Remap, check_layers, open_layers
 from hugin_abflow.opencl import Device
-from hugin_abflow.pano_trafo import read_guides
+from hugin_abflow.pano_trafo import images_of, read_guides
 from hugin_abflow.progress import Progress, silent
 from hugin_abflow.project import Plan, read_plan
 from hugin_abflow.settings import Settings
@@ -113,8 +113,10 @@ def _bands(
 
 def _guides(plan: Plan, layers: Sequence[Layer], settings: Settings) -> list[Guide]:
     """The project's control points between the layers."""
-    places = {layer.image: index for index, layer in enumerate(layers) if layer.image is not None}
-    return read_guides(plan, places) if settings.guides and len(places) > 1 else []
+    if not settings.guides or len(layers) < 2:
+        return []
+    images = images_of(plan, layers)
+    return read_guides(plan, {image: index for index, image in enumerate(images) if image is not None})
 
 
 def _write(writer: ImageWriter, bands: Iterator[npt.NDArray[Any]]) -> None:

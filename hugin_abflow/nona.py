@@ -11,7 +11,7 @@ import tempfile
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal, get_args
 
@@ -81,7 +81,7 @@ def open_layers(
             files = _layers_by_prefix(plan, prefix).in_order()
         else:
             files = _find_or_make(plan, folder, remap, keep_layers, progress).in_order()
-        opened = _number([layer for file in files for layer in read_layers(file)], plan)
+        opened = [layer for file in files for layer in read_layers(file)]
         check_layers(plan.canvas, opened)
         yield opened
 
@@ -138,16 +138,6 @@ def _work_folder() -> Iterator[Path]:
         yield Path(folder)
 
 
-def _number(layers: list[Layer], plan: Plan) -> list[Layer]:
-    """The layers with their image indices: those in the files' names, or all active ones in order."""
-    active = {image.index for image in plan.images}
-    ends = [re.search(r"(\d{4})$", layer.file.stem) if layer.file else None for layer in layers]
-    named = [int(end[1]) for end in ends if end]
-    if len(set(named)) == len(layers) and active.issuperset(named):
-        return [replace(layer, image=index) for layer, index in zip(layers, named, strict=True)]
-    if len(layers) == len(active):
-        return [replace(layer, image=index) for layer, index in zip(layers, sorted(active), strict=True)]
-    return layers
 
 
 # ------------------------------------------------------------------------------------- finding

@@ -5,12 +5,13 @@ from __future__ import annotations
 import logging
 import math
 import os
+import re
 import subprocess
 from collections.abc import Mapping, Sequence
 
 from hugin_abflow import pto
 from hugin_abflow.guides import Guide
-from hugin_abflow.layer import Canvas
+from hugin_abflow.layer import Canvas, Layer
 from hugin_abflow.project import Plan
 
 _log = logging.getLogger(__name__)
@@ -18,6 +19,20 @@ _log = logging.getLogger(__name__)
 _TIMEOUT = 60.0  # s; it maps 50,000 points in a quarter of a second
 # What it prints of a point that no place of the canvas shows.
 _NOWHERE = (-1.0, -1.0)
+
+
+def images_of(plan: Plan, layers: Sequence[Layer]) -> list[int | None]:
+    """The index of each layer's image in the project: the number at the end of its file's name.
+
+    Where these are not the numbers of different active images (pages of one file, other names): the active
+    images in order, if there are as many; else None.
+    """
+    active = [image.index for image in plan.images]
+    ends = [re.search(r"(\d{4})$", layer.file.stem) if layer.file else None for layer in layers]
+    named = [int(end[1]) for end in ends if end]
+    if len(set(named)) == len(layers) and set(active).issuperset(named):
+        return list(named)
+    return list(active) if len(active) == len(layers) else [None] * len(layers)
 
 
 def read_guides(plan: Plan, places: Mapping[int, int]) -> list[Guide]:
