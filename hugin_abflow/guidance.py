@@ -70,19 +70,15 @@ class ChartGuides:
         return ChartGuides(self.at_a[chosen], self.at_b[chosen], names)
 
 
-def on_chart(guides: Sequence[Guide], a: int, b: int, chart: Chart, grid: Grid) -> ChartGuides:
-    """The guides between layers a and b on the pair's chart; `grid` is the working grid."""
-    ends: list[list[tuple[float, float]]] = [[], []]
-    names = []
-    for guide in guides:
-        if (guide.a, guide.b) in ((a, b), (b, a)):
-            for end, place in zip(ends, (guide.at_a, guide.at_b), strict=True):
-                end.append(place)
-            if guide.a == b:
-                ends[0][-1], ends[1][-1] = ends[1][-1], ends[0][-1]
-            names.append(guide.name)
-    at_a, at_b = (chart.positions(grid.points(np.array(end, float).reshape(-1, 2))) for end in ends)
-    return ChartGuides(at_a, at_b, tuple(names))
+def on_chart(guides: Sequence[Guide], start: int, chart: Chart, grid: Grid) -> ChartGuides:
+    """The guides of one pair of layers on its chart, from layer `start` to the other.
+
+    grid    the working grid.
+    """
+    ends = [(g.at_a, g.at_b) if g.a == start else (g.at_b, g.at_a) for g in guides]
+    places = np.array(ends, np.float64).reshape(-1, 2, 2)
+    at_a, at_b = (chart.positions(grid.points(places[:, end])) for end in (0, 1))
+    return ChartGuides(at_a, at_b, tuple(guide.name for guide in guides))
 
 
 def lead(
@@ -216,12 +212,14 @@ class _Springs:
 
 def _sigmas(way: _Way, parameters: GuidanceParameters) -> Values:
     """How far each guide leads, px."""
-    apart = np.linalg.norm(way.places[:, None] - way.places, axis=-1)
-    differ = np.linalg.norm(way.moves[:, None] - way.moves, axis=-1)
     lengths = np.linalg.norm(way.residuals, axis=1)
-    alike = (differ < _ALIKE * lengths) & ~np.eye(len(lengths), dtype=bool)
-    to_next = np.where(alike, apart, np.inf).min(1, initial=np.inf)
-    sigmas = np.maximum(lengths, np.where(np.isfinite(to_next), parameters.spacing * to_next, 0.0))
+    sigmas = lengths.copy()
+    for i in range(len(lengths)):
+        alike = np.linalg.norm(way.moves - way.moves[i], axis=1) < _ALIKE * lengths[i]
+        alike[i] = False
+        to_next = np.linalg.norm(way.places[alike] - way.places[i], axis=1).min(initial=np.inf)
+        if np.isfinite(to_next):
+            sigmas[i] = max(sigmas[i], parameters.spacing * to_next)
     clipped: Values = np.clip(sigmas, parameters.least_sigma, parameters.most_sigma)
     return clipped
 

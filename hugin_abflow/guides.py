@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -50,20 +51,38 @@ def doubts(places: Points, moves: Points, radius: float) -> list[str]:
     two points on a near thing vouch for each other. One without neighbours is trusted.
     """
     reasons = [""] * len(places)
-    apart = np.linalg.norm(places[:, None] - places, axis=-1)
-    differ = np.linalg.norm(moves[:, None] - moves, axis=-1)
-    for i, j in zip(*np.nonzero(np.triu((apart < _SAME_PLACE) & (differ < _SAME_PLACE), 1)), strict=True):
-        if not reasons[i]:
-            reasons[j] = "it repeats another"
-    counted = [i for i, reason in enumerate(reasons) if not reason]
-    for i in counted:
-        others = [j for j in counted if j != i and apart[i, j] < radius]
-        others = sorted(others, key=lambda j: float(apart[i, j]))[:_MOST_NEIGHBOURS]
-        if any(apart[i, j] < _SAME_PLACE and differ[i, j] > _LEAST_DEVIATION for j in others):
+    for i in range(len(places)):  # row by row: a project may have ten thousand points
+        again = (_distances(places, i) < _SAME_PLACE) & (_distances(moves, i) < _SAME_PLACE)
+        for j in np.flatnonzero(again[i + 1 :]) if not reasons[i] else ():
+            reasons[i + 1 + j] = "it repeats another"
+    counted = np.array([not reason for reason in reasons], bool)
+    for i in map(int, np.flatnonzero(counted)):
+        apart = np.where(counted, _distances(places, i), np.inf)
+        apart[i] = np.inf
+        others = np.argsort(apart, kind="stable")[:_MOST_NEIGHBOURS]
+        others = others[apart[others] < radius]
+        differ = np.linalg.norm(moves[others] - moves[i], axis=1)
+        if ((apart[others] < _SAME_PLACE) & (differ > _LEAST_DEVIATION)).any():
             reasons[i] = "another sends the same place elsewhere"
         elif len(others) >= _LEAST_NEIGHBOURS and _stands_alone(moves[i], moves[others]):
             reasons[i] = "its neighbours move otherwise; a second point beside it would confirm it"
     return reasons
+
+
+def by_pair(guides: Iterable[Guide]) -> dict[tuple[int, int], list[Guide]]:
+    """The guides of each two layers a < b, turned where they are named the other way round."""
+    pairs: dict[tuple[int, int], list[Guide]] = {}
+    for guide in guides:
+        turned = replace(guide, a=guide.b, b=guide.a, at_a=guide.at_b, at_b=guide.at_a)
+        chosen = guide if guide.a < guide.b else turned
+        pairs.setdefault((chosen.a, chosen.b), []).append(chosen)
+    return pairs
+
+
+def _distances(points: Points, index: int) -> npt.NDArray[np.float64]:
+    """From one of the points to each of them."""
+    distances: npt.NDArray[np.float64] = np.linalg.norm(points - points[index], axis=1)
+    return distances
 
 
 def _stands_alone(move: npt.NDArray[np.float64], others: Points) -> bool:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -29,7 +29,7 @@ from hugin_abflow.coefficient import Coefficients, Masks
 from hugin_abflow.colour import Correction
 from hugin_abflow.flow import FlowParameters
 from hugin_abflow.geometry import PairFlow
-from hugin_abflow.guides import Guide
+from hugin_abflow.guides import Guide, by_pair
 from hugin_abflow.layer import Canvas, Layer
 from hugin_abflow.opencl import Buffer, Device, DeviceMemoryError
 from hugin_abflow.progress import Progress
@@ -124,8 +124,8 @@ def prepare(
     order = {id(layer): index for index, layer in enumerate(layers)}
     numbers = [order[id(one.layer)] for one in reduced]
     parameters = quality.flow_parameters(settings.flow_quality)
-    used_guides = guides if settings.guides else ()
-    flows = _flows(device, reduced, masks, grid, progress, parameters, used_guides, numbers)
+    its_guides = by_pair(guides if settings.guides else ())
+    flows = _flows(device, reduced, masks, grid, progress, parameters, its_guides, numbers)
     fields, correction = _align(device, reduced, coefficients, flows, masks, grid, settings)
     final = [
         BlendLayer(layer, field, geometry.reach(device, layer, field, grid), gain)
@@ -203,12 +203,12 @@ def _flows(
     grid: Grid,
     progress: Progress,
     parameters: FlowParameters,
-    guides: Sequence[Guide],
+    guides: Mapping[tuple[int, int], Sequence[Guide]],
     numbers: Sequence[int],
 ) -> list[PairFlow]:
     """Flow of every pair of layers that overlap, on the pair's own chart.
 
-    numbers: what guides call each of `layers`.
+    guides      of each two layers, by their numbers; numbers: what guides call each of `layers`.
     """
     overlaps = [
         (a, b, masks.host[a] & masks.host[b]) for a in range(len(layers)) for b in range(a + 1, len(layers))
@@ -223,8 +223,9 @@ def _flows(
                 its_chart = chart.pair_chart(overlap, masks.grid, grid)
                 image_a, image_b = (chart.sample(device, layer, grid, its_chart) for layer in pair)
                 found = flow.pair_flow(device, image_a, image_b, parameters)
-                placed = guidance.on_chart(guides, numbers[a], numbers[b], its_chart, grid)
-                if placed:
+                its_guides = guides.get((min(numbers[a], numbers[b]), max(numbers[a], numbers[b])))
+                if its_guides:
+                    placed = guidance.on_chart(its_guides, numbers[a], its_chart, grid)
                     found = guidance.lead(device, (image_a, image_b), found, placed, its_chart.around(grid))
                 result.append(PairFlow(a, b, its_chart, *found))
             advance(1)

@@ -13,7 +13,7 @@ from test_flow_truth import scene
 from hugin_abflow import geometry
 from hugin_abflow.chart import pair_chart
 from hugin_abflow.guidance import on_chart
-from hugin_abflow.guides import Guide, doubts
+from hugin_abflow.guides import Guide, by_pair, doubts
 from hugin_abflow.layer import Canvas, Layer
 from hugin_abflow.merge import merge_layers
 from hugin_abflow.opencl import Device
@@ -67,6 +67,14 @@ def test_repeated_guides_count_once():
     assert "neighbours move otherwise" in reasons[4] and reasons[5] == "it repeats another"
 
 
+def test_one_wrong_point_among_thousands():
+    random = np.random.default_rng(5)
+    places, moves = random.random((3000, 2)) * 2000, random.normal((20, 0), 1, (3000, 2))
+    moves[1234] = (-30, 50)
+    reasons = doubts(places, moves, 160)
+    assert [i for i, reason in enumerate(reasons) if reason and "repeats" not in reason] == [1234]
+
+
 def test_contradicting_guides_are_both_ignored():
     reasons = doubts(np.array([(5.0, 5), (5, 5.4), (300, 5)]), np.array([(10.0, 0), (0, 20), (1, 1)]), 100)
     assert ["sends the same place elsewhere" in reason for reason in reasons] == [True, True, False]
@@ -99,13 +107,16 @@ def test_guides_on_a_chart_are_where_kernels_put_them(name: str) -> None:
     chart = pair_chart(overlap, grid, grid)
     ends = [(9.5 + grid.region.left, 4.25 + grid.region.top), (12.0 + grid.region.left, 9 + grid.region.top)]
     guides = [Guide(0, 1, *ends, "there"), Guide(1, 0, ends[1], ends[0], "back"), Guide(0, 2, *ends, "other")]
-    placed = on_chart(guides, 0, 1, chart, grid)
+    pairs = by_pair(guides)
+    assert sorted(pairs) == [(0, 1), (0, 2)]
+    placed = on_chart(pairs[0, 1], 0, chart, grid)
     assert placed.names == ("there", "back")
     for found, end in ((placed.at_a, ends[0]), (placed.at_b, ends[1])):
         x, y = np.array(end) - (grid.region.left, grid.region.top)
         u, v = common.chart_position(common.canvas_point(x, y, grid.lens), chart.transform)
         assert np.allclose(found, [(u, v)] * 2, atol=1e-3)
-    assert len(on_chart(guides, 1, 2, chart, grid)) == 0
+    back = on_chart(pairs[0, 1], 1, chart, grid)
+    assert np.array_equal(back.at_a, placed.at_b) and np.array_equal(back.at_b, placed.at_a)
 
 
 @pytest.mark.parametrize("name", ["plane", "sphere", "window"])
@@ -192,9 +203,9 @@ def test_guides_move_with_the_mosaic(device, monkeypatch):
     seen = []
     original = guidance.on_chart
 
-    def watch(guides, a, b, chart, grid):
+    def watch(guides, *others):
         seen.append([(g.at_a, g.at_b) for g in guides])
-        return original(guides, a, b, chart, grid)
+        return original(guides, *others)
 
     monkeypatch.setattr(guidance, "on_chart", watch)
     y, x = pixel_places(CANVAS.height, CANVAS.width)
