@@ -30,11 +30,13 @@ _CELL = 16
 _CLIPPED = 0.98
 # Standard deviation of the differences within a cell that halves its trust, on the exposure scale.
 _SPREAD = 0.3
-# Rounds of (weight of the measured differences against smoothness, residual that halves a cell's trust). The
-# first round fits the trend; what lies far from it is no exposure but something that only one layer shows.
-_ROUNDS = ((0.1, 1.5), (1.0, 1.0), (100.0, 0.8))
-# The correction fades out over this share of the canvas's width.
-_FADE = 0.12
+# Rounds of (weight of the measured differences against smoothness, distance from the solution at which a cell
+# counts no longer): what is smooth is followed bit by bit.
+_ROUNDS = ((0.1, 4.0), (1.0, 3.0), (100.0, 2.5))
+# The same, slower and stricter: what lies far from it is no exposure but something that only one layer shows.
+_STRICT = ((0.01, 4.0), (0.03, 2.5), (0.3, 1.6), (3.0, 1.2), (100.0, 1.0))
+# The correction fades out over this share of the canvas's width; a trend hardly does.
+_FADE, _TREND_FADE = 0.12, 1.0
 # All gains shrink towards 0 by this, at most a quarter of an 8-bit level, so that small ones are exactly 0.
 _NEGLIGIBLE = 1e-3
 # Of the residual, relative: the gains are then right to a level of 255, where layers differ to a quarter.
@@ -65,11 +67,13 @@ def correction(
     covered: npt.NDArray[np.bool_],
     settings: Settings,
     ignored: npt.NDArray[np.bool_] | None = None,
+    strict: bool = False,
 ) -> Correction:
     """Measure the overlaps of the aligned layers and solve for the gains.
 
     fields: of geometry.py. covered: (layers, height, width) on any grid over the same region.
     ignored: (height, width) on any grid over the same region: what is no evidence, none of a cell's.
+    strict: leave out what may not be exposure, to see it.
     With `settings.exposure` off there is no correction.
     """
     cells = colour_grid(grid)
@@ -87,7 +91,7 @@ def correction(
     if not any(np.any(d[..., :3] * d[..., 3:]) for _, _, d in measured):
         return Correction(cells, (None,) * len(layers))
     inside = cells_reached(covered, cells)
-    gains = solve(measured, inside, cells)
+    gains = solve(measured, inside, cells, _STRICT if strict else _ROUNDS)
     gains = np.sign(gains) * np.maximum(np.abs(gains) - _NEGLIGIBLE, 0)
     result: list[Buffer | None] = []
     for gain, mask in zip(gains, inside, strict=True):
@@ -134,7 +138,10 @@ def cells_reached(covered: npt.NDArray[np.bool_], cells: Grid) -> npt.NDArray[np
 
 
 def solve(
-    measured: Sequence[tuple[int, int, npt.NDArray[np.float64]]], inside: npt.NDArray[np.bool_], cells: Grid
+    measured: Sequence[tuple[int, int, npt.NDArray[np.float64]]],
+    inside: npt.NDArray[np.bool_],
+    cells: Grid,
+    rounds: Sequence[tuple[float, float]] = _ROUNDS,
 ) -> npt.NDArray[np.float64]:
     """Gains (layers, height, width, 3) for differences (a, b, array of r, g, b, weight per cell)."""
     latitude = cells.lens[2] - (np.arange(cells.height) + 0.5) * cells.lens[3]
@@ -145,14 +152,16 @@ def solve(
         east[:, :, -1] = 0
     south = np.zeros(inside.shape)
     south[:, :-1] = (inside[:, :-1] & inside[:, 1:]) * np.sqrt(area[:-1] * area[1:])
-    fade = max(1.0, _FADE * cells.circumference / (cells.lens[1] or 1.0))  # cells
-    hold = inside * area / fade**2
+    round_ = cells.circumference / (cells.lens[1] or 1.0)  # cells
     solution = np.zeros((*inside.shape, 3))
-    for data, residual in _ROUNDS:
+    for data, limit in rounds:
+        fade = _TREND_FADE if rounds is _STRICT and data < rounds[-1][0] else _FADE
+        hold = inside * area / max(1.0, fade * round_) ** 2
         links = []
         for a, b, d in measured:
             off = np.linalg.norm(solution[a] - solution[b] + d[..., :3], axis=-1) if solution.any() else 0.0
-            links.append((a, b, data * area * d[..., 3] / (1 + (off / residual) ** 2), d[..., :3]))
+            trust = np.maximum(0.0, 1 - (off / limit) ** 2) ** 2  # Tukey's biweight
+            links.append((a, b, data * area * d[..., 3] * trust, d[..., :3]))
         solution = _minimise(links, hold, east, south, solution)
     return solution
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -149,20 +150,20 @@ def _align(
     What flow cannot explain spoils flow and exposure around it, so both are found again without it.
     """
     regions: npt.NDArray[np.bool_] | None = None
-    rounds = _SEAM_ROUNDS if settings.seam else 0
     pairs = [consistency.mend(device, pair, grid) for pair in flows]
     coefficients = transition.narrow(device, layers, coefficients, pairs, grid, settings)
-    while True:
-        fields = geometry.fields(device, layers, coefficients, pairs, grid, settings)
-        correction = colour.correction(device, layers, fields, pairs, grid, masks.host, settings, regions)
-        if not rounds:
-            break
-        found = seam.regions(device, layers, fields, pairs, correction, grid)
+    correct = partial(colour.correction, device, layers)
+    fields = geometry.fields(device, layers, coefficients, pairs, grid, settings)
+    for _ in range(_SEAM_ROUNDS if settings.seam else 0):
+        strict = correct(fields, pairs, grid, masks.host, settings, regions, strict=True)
+        found = seam.regions(device, layers, fields, pairs, strict, grid)
         grown = found if regions is None else found | regions
         if not grown.any() or (regions is not None and np.array_equal(grown, regions)):
             break
-        regions, rounds = grown, rounds - 1
+        regions = grown
         pairs = [consistency.mend(device, pair, grid, regions) for pair in flows]
+        fields = geometry.fields(device, layers, coefficients, pairs, grid, settings)
+    correction = correct(fields, pairs, grid, masks.host, settings, regions)
     if regions is not None:
         seam.cut(device, layers, fields, coefficients, pairs, correction, regions, masks, grid)
     return fields, correction
