@@ -155,7 +155,9 @@ def _align(
     correct = partial(colour.correction, device, layers)
     fields = geometry.fields(device, layers, coefficients, pairs, grid, settings)
     for _ in range(_SEAM_ROUNDS if settings.seam else 0):
-        strict = correct(fields, pairs, grid, masks.host, settings, regions, strict=True)
+        # exposure explains a difference whether it is corrected or not
+        exposure = replace(settings, exposure=True)
+        strict = correct(fields, pairs, grid, masks.host, exposure, regions, strict=True)
         found = seam.regions(device, layers, fields, pairs, strict, grid)
         grown = found if regions is None else found | regions
         if not grown.any() or (regions is not None and np.array_equal(grown, regions)):
@@ -163,10 +165,9 @@ def _align(
         regions = grown
         pairs = [consistency.mend(device, pair, grid, regions) for pair in flows]
         fields = geometry.fields(device, layers, coefficients, pairs, grid, settings)
-    correction = correct(fields, pairs, grid, masks.host, settings, regions)
     if regions is not None:
-        seam.cut(device, layers, fields, coefficients, pairs, correction, regions, masks, grid)
-    return fields, correction
+        seam.cut(device, layers, fields, coefficients, pairs, strict, regions, masks, grid)
+    return fields, correct(fields, pairs, grid, masks.host, settings, regions)
 
 
 def _read(device: Device, layers: Sequence[Layer], grid: Grid, progress: Progress) -> list[WorkingLayer]:
