@@ -6,33 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from reference.common import (
-    Array,
-    Numbers,
-    canvas_point,
-    canvas_position,
-    exposure_scale,
-    four_taps,
-    grid_border,
-    pixels,
-    take,
-)
-
-
-def _seen(
-    layer: Array, field: Array, box: Sequence[int], x: Array, y: Array, border: Sequence[int], lens: Numbers
-) -> Array:
-    """What a layer shows for working pixels (x, y) after its displacement: r, g, b, valid."""
-    way = take(field, box, x, y)[..., :3]
-    own = take(layer, box, x, y)[..., 3] != 0
-    px, py = canvas_position(canvas_point(x + 0.5, y + 0.5, lens) + way, lens)
-    still = ~way.any(-1)
-    px, py = np.where(still, x + 0.5, px), np.where(still, y + 0.5, py)
-    total = 0.0
-    for column, row, weight in four_taps(px, py):
-        column, row, inside = grid_border(column, row, border)
-        total = total + weight[..., None] * take(layer, box, column, row, inside)
-    return np.where((own & (total[..., 3] > 0.999))[..., None], total, 0.0)
+from reference.common import Array, Numbers, exposure_scale, layer_seen, pixels
 
 
 def colour_difference(
@@ -51,8 +25,8 @@ def colour_difference(
 ) -> Array:
     """Mean difference a - b of every cell's pixels, every other one in x and y, and its weight."""
     columns, rows = pixels(border[0], border[1])
-    a = _seen(layer_a, field_a, box_a, columns, rows, border, lens)
-    b = _seen(layer_b, field_b, box_b, columns, rows, border, lens)
+    a = layer_seen(layer_a, field_a, box_a, columns, rows, border, lens)
+    b = layer_seen(layer_b, field_b, box_b, columns, rows, border, lens)
     usable = (
         (a[..., 3] > 0) & (b[..., 3] > 0) & (a[..., :3].max(-1) <= clipped) & (b[..., :3].max(-1) <= clipped)
     )

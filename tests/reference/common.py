@@ -1,4 +1,4 @@
-"""Twins of kernels/common.cl: borders of a grid, canvas and chart transforms, bicubic weights.
+"""Twins of kernels/common.cl: borders, canvas and chart transforms, layers sampled, bicubic weights.
 
 Everything is float64; positions are arrays (x right, y down), points arrays (..., 3).
 """
@@ -110,6 +110,22 @@ def chart_position(point: Array, chart: Numbers) -> tuple[Array, Array]:
     lon = np.arctan2(turned[..., 0], turned[..., 1])
     lat = np.arctan2(turned[..., 2], np.hypot(turned[..., 0], turned[..., 1]))
     return lon * t[9] + t[11], t[12] - lat * t[10]
+
+
+def layer_seen(
+    layer: Array, field: Array, box: Sequence[int], x: Array, y: Array, border: Sequence[int], lens: Numbers
+) -> Array:
+    """layer_sample at layer_position: what a layer shows for working pixels (x, y), r, g, b, valid."""
+    way = take(field, box, x, y)[..., :3]
+    own = take(layer, box, x, y)[..., 3] != 0
+    px, py = canvas_position(canvas_point(x + 0.5, y + 0.5, lens) + way, lens)
+    still = ~way.any(-1)
+    px, py = np.where(still, x + 0.5, px), np.where(still, y + 0.5, py)
+    total = 0.0
+    for column, row, weight in four_taps(px, py):
+        column, row, inside = grid_border(column, row, border)
+        total = total + weight[..., None] * take(layer, box, column, row, inside)
+    return np.where((own & (total[..., 3] > 0.999))[..., None], total, 0.0)
 
 
 EXPOSURE_FLOOR = 0.02

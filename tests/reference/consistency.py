@@ -1,0 +1,76 @@
+"""Twins of kernels/consistency.cl."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from reference.common import Array, Numbers, bilinear, canvas_position, chart_point, grid_border, pixels
+
+
+def consistency_trust(flow: Array, back: Array, grid: Sequence[int], tolerance: float) -> Array:
+    """Flow, and how far going there and back again ends at the start; (height, width, 4)."""
+    columns, rows = pixels(grid[0], grid[1])
+    x, y = columns + 0.5 + flow[..., 0], rows + 0.5 + flow[..., 1]
+    y = np.clip(y, 0.5, grid[1] - 0.5)
+    if not grid[2]:
+        x = np.clip(x, 0.5, grid[0] - 0.5)
+    returned, share = bilinear(back, grid, x, y)
+    away = np.linalg.norm(flow + returned / share[..., None], axis=-1)
+    trust = (1 + (away / tolerance) ** 2) ** -2
+    return np.dstack([flow, trust, np.zeros_like(trust)])
+
+
+def consistency_distrust(
+    trusted: Array,
+    chart: Numbers,
+    size: Sequence[int],
+    lens: Numbers,
+    border: Sequence[int],
+    regions: Array,
+    cells: Sequence[int],
+) -> Array:
+    """Trust 0 where a pixel of the chart shows a cell of the regions."""
+    columns, rows = pixels(size[0], size[1])
+    x, y = canvas_position(chart_point(columns + 0.5, rows + 0.5, chart), lens)
+    column = np.floor(x * cells[0] / border[0]).astype(int)
+    row = np.floor(y * cells[1] / border[1]).astype(int)
+    column, row, inside = grid_border(column, row, cells)
+    hit = inside & (regions[np.clip(row, 0, cells[1] - 1), np.clip(column, 0, cells[0] - 1)] != 0)
+    result = trusted.astype(np.float64)
+    result[hit, 2] = 0
+    return result
+
+
+def _around(values: Array, fine: Sequence[int]) -> Array:
+    """Three pixels more on each side: zeros, or left and right the other side where the grid wraps."""
+    values = np.pad(values, ((3, 3), (0, 0), (0, 0)))
+    return np.pad(values, ((0, 0), (3, 3), (0, 0)), mode="wrap" if fine[2] else "constant")
+
+
+def consistency_push(trusted: Array, fine: Sequence[int]) -> Array:
+    """Trust-weighted mean flow and mean trust, ((height + 1) // 2, (width + 1) // 2, 4)."""
+    width, height = fine[:2]
+    trust = trusted[..., 2].astype(np.float64)
+    summands = np.dstack([trusted[..., 0] * trust, trusted[..., 1] * trust, trust, np.ones_like(trust)])
+    padded, total = _around(summands, fine), 0.0
+    for (j, i), tap in np.ndenumerate(np.outer([1, 3, 3, 1], [1, 3, 3, 1]) / 64):
+        total = total + tap * padded[2 + j : 2 + j + height : 2, 2 + i : 2 + i + width : 2]
+    known = total[..., 2:3] > 0
+    mean = np.where(known, total[..., :2] / np.where(known, total[..., 2:3], 1), 0)
+    return np.dstack([mean, total[..., 2] / total[..., 3], np.zeros(known.shape[:2])])
+
+
+def consistency_pull(trusted: Array, fine: Sequence[int], coarse: Array, size: Sequence[int]) -> Array:
+    """The level with its flow mixed by trust with that of the coarser level, which is read bilinearly."""
+    columns, rows = pixels(fine[0], fine[1])
+    below, share = bilinear(coarse[..., :2], size, (columns + 0.5) / 2, (rows + 0.5) / 2)
+    result, trust = trusted.astype(np.float64), trusted[..., 2:3]
+    result[..., :2] = trust * trusted[..., :2] + (1 - trust) * below / share[..., None]
+    return result
+
+
+def consistency_flow(trusted: Array) -> Array:
+    """The flow alone, (height, width, 2)."""
+    return trusted[..., :2]

@@ -1,0 +1,347 @@
+"""Trust in flow and its filling: kernels against twins, twins against SciPy, flows that are known."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from grids import GRIDS, patches, plane, sphere
+from reference import common
+from reference import consistency as twin
+from scipy import ndimage
+from tolerances import DECISIONS, POSITION, SUM, assert_close
+
+from hugin_abflow import consistency
+from hugin_abflow.chart import Chart, pair_chart
+from hugin_abflow.geometry import PairFlow
+from hugin_abflow.opencl import Device
+from hugin_abflow.working import Grid
+
+SIZES = [(77, 53), (64, 31), (5, 3), (1, 7), (1, 1)]
+WRAPS = [False, True]
+
+
+def smooth_flow(seed: int, width: int, height: int, most: float, wraps: bool) -> np.ndarray:
+    """Flow float32 (height, width, 2) of at most `most` px in each direction."""
+    random = np.random.default_rng(seed).normal(size=(height, width, 2))
+    flow = ndimage.gaussian_filter(
+        random, (5, 5, 0), mode=("nearest", "wrap" if wraps else "nearest", "nearest")
+    )
+    return (flow * most / max(np.abs(flow).max(), 1e-9)).astype(np.float32)
+
+
+def random_trusted(seed: int, width: int, height: int) -> np.ndarray:
+    """Flow, trust 0..1 with patches of none, and 0."""
+    random = np.random.default_rng(seed)
+    trusted = random.normal(size=(height, width, 4)).astype(np.float32) * 3
+    trusted[..., 2] = random.random((height, width)) * patches(seed, width, height, 0.6)
+    trusted[..., 3] = 0
+    return trusted
+
+
+def on_tiles(values: np.ndarray, wraps: bool, by: int = 8) -> np.ndarray:
+    """What lies around: another turn, or the border's own value."""
+    values = np.pad(values, ((by, by), (0, 0)), mode="edge")
+    return np.pad(values, ((0, 0), (by, by)), mode="wrap" if wraps else "edge")
+
+
+def read_at(values: np.ndarray, x: np.ndarray, y: np.ndarray, wraps: bool, by: int = 8) -> np.ndarray:
+    """SciPy's linear interpolation at positions whose pixel centres are at n + 0.5, up to `by` px outside."""
+    return ndimage.map_coordinates(on_tiles(values, wraps, by), [y - 0.5 + by, x - 0.5 + by], order=1)
+
+
+@pytest.mark.parametrize("wraps", WRAPS)
+def test_twin_of_trust_is_the_formula(wraps: bool) -> None:
+    flow, back = (smooth_flow(k, 77, 53, 6.0, wraps).astype(np.float64) for k in (0, 1))
+    trusted = twin.consistency_trust(flow, back, (77, 53, int(wraps), 0), 1.5)
+    columns, rows = common.pixels(77, 53)
+    there = columns + 0.5 + flow[..., 0], rows + 0.5 + flow[..., 1]
+    u, v = (read_at(back[..., k], *there, wraps) for k in (0, 1))
+    squared = (flow[..., 0] + u) ** 2 + (flow[..., 1] + v) ** 2
+    assert np.allclose(trusted[..., 2], 1 / (1 + squared / 1.5**2) ** 2)
+    assert np.array_equal(trusted[..., :2], flow)
+    off = np.array([[[1.5, 0.0]]])  # 1.5 px from the start: a quarter
+    assert twin.consistency_trust(off, 0 * off, (1, 1, 0, 0), 1.5)[0, 0, 2] == pytest.approx(0.25)
+
+
+@pytest.mark.parametrize("size", SIZES)
+@pytest.mark.parametrize("wraps", WRAPS)
+def test_trust_equals_its_twin(device: Device, size: tuple[int, int], wraps: bool) -> None:
+    flow, back = (smooth_flow(k, *size, 6.0, wraps) for k in (2, 3))
+    kernel = consistency.trust(device, device.upload(flow), device.upload(back), wraps).get()
+    expected = twin.consistency_trust(flow, back, (*size, int(wraps), 0), consistency._TOLERANCE)
+    assert np.array_equal(kernel[..., :2], flow)
+    assert_close(kernel, expected, POSITION)
+
+
+@pytest.mark.parametrize("wraps", WRAPS)
+@pytest.mark.parametrize("width", [76, 77])
+def test_twin_of_push_is_a_weighted_mean(wraps: bool, width: int) -> None:
+    """Every output by hand: taps (1 3 3 1) / 8 in x and y of what lies on the grid."""
+    trusted = random_trusted(4, width, 11).astype(np.float64)
+    trusted[:6, 10:20, 2] = 0
+    small = twin.consistency_push(trusted, (width, 11, int(wraps), 0))
+    taps = [1 / 8, 3 / 8, 3 / 8, 1 / 8]
+    assert small.shape == (6, (width + 1) // 2, 4)
+    for row, column in np.ndindex(small.shape[:2]):
+        flows, trusts, weights = [], [], []
+        for j in range(4):
+            for i in range(4):
+                x, y = 2 * column - 1 + i, 2 * row - 1 + j
+                if 0 <= y < 11 and (wraps or 0 <= x < width):
+                    own = trusted[y, x % width]
+                    flows.append(own[:2])
+                    trusts.append(own[2])
+                    weights.append(taps[i] * taps[j])
+        assert small[row, column, 2] == pytest.approx(np.average(trusts, weights=weights))
+        counted = np.multiply(weights, trusts)
+        mean = counted @ np.array(flows) / counted.sum() if counted.sum() else np.zeros(2)
+        assert np.allclose(small[row, column, :2], mean)
+    assert (small[..., 2] == 0).any()
+    assert (small[..., 2] > 0.3).any()
+
+
+@pytest.mark.parametrize("size", SIZES)
+@pytest.mark.parametrize("wraps", WRAPS)
+def test_push_equals_its_twin(device: Device, size: tuple[int, int], wraps: bool) -> None:
+    trusted = random_trusted(5, *size)
+    half = ((size[0] + 1) // 2, (size[1] + 1) // 2)
+    small, fine = device.empty((*half[::-1], 4)), (*size, int(wraps), 0)
+    device.run("consistency", "consistency_push", half, device.upload(trusted), fine, small, half)
+    assert_close(small.get(), twin.consistency_push(trusted, fine), 10 * SUM)
+
+
+@pytest.mark.parametrize("wraps", WRAPS)
+@pytest.mark.parametrize("width", [76, 77])
+def test_twin_of_pull_mixes_with_scipys_zoom(wraps: bool, width: int) -> None:
+    trusted, coarse = random_trusted(6, width, 11), random_trusted(7, (width + 1) // 2, 6)
+    grids = (width, 11, int(wraps), 0), ((width + 1) // 2, 6, int(wraps), 0)
+    pulled = twin.consistency_pull(trusted, grids[0], coarse, grids[1])
+    columns, rows = common.pixels(width, 11)
+    for k in (0, 1):
+        below = read_at(coarse[..., k].astype(np.float64), (columns + 0.5) / 2, (rows + 0.5) / 2, wraps)
+        expected = below + trusted[..., 2] * (trusted[..., k] - below)
+        assert np.allclose(pulled[..., k], expected, atol=1e-5)
+    assert np.array_equal(pulled[..., 2:], trusted[..., 2:])
+
+
+@pytest.mark.parametrize("size", SIZES)
+@pytest.mark.parametrize("wraps", WRAPS)
+def test_pull_equals_its_twin(device: Device, size: tuple[int, int], wraps: bool) -> None:
+    half = ((size[0] + 1) // 2, (size[1] + 1) // 2)
+    trusted, coarse = random_trusted(8, *size), random_trusted(9, *half)
+    level, grids = device.upload(trusted), ((*size, int(wraps), 0), (*half, int(wraps), 0))
+    device.run("consistency", "consistency_pull", size, level, grids[0], device.upload(coarse), grids[1])
+    assert_close(level.get(), twin.consistency_pull(trusted, grids[0], coarse, grids[1]), 10 * SUM)
+
+
+def test_flow_equals_its_twin(device: Device) -> None:
+    trusted = random_trusted(10, 77, 53)
+    flow = device.empty((53, 77, 2))
+    device.run("consistency", "consistency_flow", (77, 53), device.upload(trusted), (77, 53, 0, 0), flow)
+    assert np.array_equal(flow.get(), twin.consistency_flow(trusted))
+
+
+def distrusted(device: Device, found: Chart, grid: Grid, regions: np.ndarray, trusted: np.ndarray) -> tuple:
+    """Kernel and twin of the same."""
+    cells, size = grid.resized(*regions.shape[::-1]).border, (found.width, found.height)
+    level, marked = device.upload(trusted), regions.astype(np.uint8)
+    device.run(
+        "consistency", "consistency_distrust", size, level, found.transform, size, grid.lens, grid.border,
+        device.upload(marked), cells,
+    )  # fmt: skip
+    expected = twin.consistency_distrust(
+        trusted, found.transform, size, grid.lens, grid.border, marked, cells
+    )
+    return level.get(), expected
+
+
+@pytest.mark.parametrize("name", list(GRIDS))
+def test_distrust_equals_its_twin(device: Device, name: str) -> None:
+    """On a chart of its own axis (over a pole, on the sphere), for a grid of cells that divides nothing."""
+    grid = GRIDS[name]
+    overlap = np.zeros(grid.shape, bool)
+    overlap[: grid.height // 2, 20:40] = overlap[3:8, -4:] = True
+    found = pair_chart(overlap, grid, grid)
+    trusted = random_trusted(11, found.width, found.height)
+    trusted[..., 2] += 0.5
+    regions = patches(12, 11, 7, 0.5, 2) > 0
+    kernel, expected = distrusted(device, found, grid, regions, trusted)
+    assert 0.1 < (expected[..., 2] == 0).mean() < 0.9
+    assert_close(kernel, expected, SUM, decisions=5 * DECISIONS)
+    assert np.array_equal(kernel[..., :2], trusted[..., :2])
+
+
+@pytest.mark.parametrize("wraps", WRAPS)
+def test_twin_of_distrust_on_a_plane_is_a_cut_out(device: Device, wraps: bool) -> None:
+    """A plane's chart is a part of the canvas, on which cells of 8 px are blocks; it may cross the border."""
+    grid, regions = plane(80, 56, wraps), patches(13, 10, 7, 0.5, 1) > 0
+    overlap = np.zeros(grid.shape, bool)
+    overlap[20:40, 70:] = True
+    overlap[20:40, :9] = wraps
+    found = pair_chart(overlap, grid, grid)
+    kernel, expected = distrusted(
+        device, found, grid, regions, np.ones((found.height, found.width, 4), np.float32)
+    )
+    blocks = np.kron(regions, np.ones((8, 8), bool))
+    left, top = (-found.transform[11:13]).astype(int)
+    columns = np.arange(left, left + found.width) % 80
+    cut_out = blocks[top : top + found.height][:, columns]
+    assert 0.2 < cut_out.mean() < 0.8
+    assert np.array_equal(expected[..., 2] == 0, cut_out)
+    assert np.array_equal(kernel, expected)
+
+
+def test_twin_of_distrust_on_a_sphere_takes_angles(device: Device) -> None:
+    """A cap around the north pole: on a chart over the pole a disc, whose radius is the cap's."""
+    grid = sphere(402, 201)
+    overlap = np.zeros(grid.shape, bool)
+    overlap[:40] = True
+    found = pair_chart(overlap, grid, grid)
+    regions = np.zeros((201, 402), bool)
+    regions[:20] = True
+    _, expected = distrusted(
+        device, found, grid, regions, np.ones((found.height, found.width, 4), np.float32)
+    )
+    columns, rows = common.pixels(found.width, found.height)
+    point = common.chart_point(columns + 0.5, rows + 0.5, found.transform)
+    assert np.array_equal(expected[..., 2] == 0, np.arccos(point[..., 2]) < 20 * math.pi / 201)
+
+
+# The module
+
+
+def chart_of(grid: Grid) -> Chart:
+    return pair_chart(np.ones(grid.shape, bool), grid, grid)
+
+
+def mended(
+    device: Device,
+    grid: Grid,
+    forward: np.ndarray,
+    backward: np.ndarray,
+    regions: np.ndarray | None = None,
+    found: Chart | None = None,
+) -> tuple[np.ndarray, np.ndarray]:
+    flows = (device.upload(flow.astype(np.float32)) for flow in (forward, backward))
+    pair = PairFlow(0, 1, found or chart_of(grid), *flows)
+    result = consistency.mend(device, pair, grid, regions)
+    assert (result.a, result.b, result.chart) == (0, 1, pair.chart)
+    return result.forward.get(), result.backward.get()
+
+
+def still(found: Chart) -> np.ndarray:
+    return np.zeros((found.height, found.width, 2))
+
+
+CANVASES = {"plane": plane(97, 61), "cylinder": plane(128, 61, wraps=True), "sphere": sphere(130, 65)}
+
+
+@pytest.mark.parametrize("name", list(CANVASES))
+def test_no_flow_stays_exactly_none(device: Device, name: str) -> None:
+    grid = CANVASES[name]
+    nothing = still(chart_of(grid))
+    for regions in (None, patches(14, 16, 8, 0.3, 2) > 0):
+        for flow in mended(device, grid, nothing, nothing, regions):
+            assert not flow.any()
+
+
+@pytest.mark.parametrize("name", ["cylinder", "sphere"])
+def test_a_flow_that_leads_back_exactly_stays_to_the_bit(device: Device, name: str) -> None:
+    there = np.add(still(chart_of(CANVASES[name])), [2.5, -1.25])
+    forward, backward = mended(device, CANVASES[name], there, -there)
+    assert np.array_equal(forward, there)
+    assert np.array_equal(backward, -there)
+
+
+@pytest.mark.parametrize("name", list(CANVASES))
+def test_consistent_flows_come_out_unchanged(device: Device, name: str) -> None:
+    """Of a smooth field, whose inverse is found by iteration: within the interpolation's own error."""
+    found = chart_of(CANVASES[name])
+    columns, rows = common.pixels(found.width, found.height)
+    turn = 6 * math.pi / found.width
+    forward = 3 * np.stack([np.sin(turn * columns + rows / 9), np.cos(rows / 7 - turn * columns)], -1)
+    backward = np.zeros_like(forward)
+    for _ in range(30):  # F_ba(q) = -F_ab(q + F_ba(q))
+        x, y = columns + 0.5 + backward[..., 0], rows + 0.5 + backward[..., 1]
+        x = x if found.wraps else np.clip(x, 0.5, found.width - 0.5)
+        y = np.clip(y, 0.5, found.height - 0.5)
+        backward = -np.stack([read_at(forward[..., k], x, y, found.wraps) for k in (0, 1)], -1)
+    inner = np.s_[4:-4, 4:-4]  # at the rim flow leads out
+    for result, flow in zip(
+        mended(device, CANVASES[name], forward, backward), (forward, backward), strict=True
+    ):
+        assert np.abs(flow[inner]).max() > 2.5
+        assert np.abs(result - flow)[inner].max() < 0.01
+
+
+# Wrong flow is 4 to 9 px off; what is left of that after the mending, in px.
+LEFT = 0.15
+
+
+@pytest.mark.parametrize("centre", [(60, 30), (0, 30)])
+def test_a_patch_of_wrong_flow_is_filled_from_around(device: Device, centre: tuple[int, int]) -> None:
+    """In one direction only, as behind somebody; in a field that changes slowly; also across the border."""
+    grid = CANVASES["cylinder"]
+    columns, rows = common.pixels(128, 61)
+    angle = columns * (2 * math.pi / 128)
+    forward = np.stack([2 + np.sin(angle), 0.5 * np.cos(angle)], -1)
+    # F_ba at the place where F_ab leads; its slope is small
+    backward = -np.stack([2 + np.sin(angle - 2 * math.pi / 64), 0.5 * np.cos(angle - 2 * math.pi / 64)], -1)
+    away = np.abs(columns - centre[0])
+    disc = np.hypot(np.minimum(away, 128 - away), rows - centre[1]) < 9
+    wrong = forward + disc[..., None] * [8.0, -3.0]
+    results = mended(device, grid, wrong, backward)
+    assert np.abs(results[0] - forward)[disc].max() < LEFT
+    assert np.abs(results[0] - forward)[~disc].max() < LEFT
+    assert np.abs(results[1] - backward).max() < LEFT
+
+
+def test_near_flow_counts_before_far(device: Device) -> None:
+    """Between two motions a gap takes each side's own near that side."""
+    grid = plane(97, 61)
+    forward = np.zeros((61, 97, 2))
+    forward[:, 50:, 0] = 6.0
+    backward = -forward
+    backward[:, 53:59] = -6.0
+    gap = np.s_[:, 44:56]
+    forward[gap] = [-9.0, 30.0]
+    result, _ = mended(device, grid, forward, backward)
+    assert np.abs(result[:, 44:46]).max() < 1.5
+    assert np.abs(result[:, 54:56] - [6.0, 0.0]).max() < 1.5
+    middle = result[30, 44:56, 0]
+    assert (np.diff(middle) > -0.2).all()
+
+
+def disc(grid: Grid, x: float, y: float, radius: float) -> np.ndarray:
+    """Pixels within a radius (columns) of a place, on the sphere by angle."""
+    columns, rows = common.pixels(grid.width, grid.height)
+    points = common.canvas_point(columns + 0.5, rows + 0.5, grid.lens)
+    middle = common.canvas_point(np.array(x), np.array(y), grid.lens)
+    if grid.lens[1]:
+        return np.arccos(np.clip(points @ middle, -1, 1)) < radius * grid.lens[1]
+    away = np.abs(points[..., 0] - x)
+    return np.hypot(np.minimum(away, grid.width - away) if grid.wraps else away, points[..., 1] - y) < radius
+
+
+@pytest.mark.parametrize(("name", "x", "y"), [("plane", 48, 30), ("cylinder", 2, 30), ("sphere", 65, 6)])
+def test_regions_on_the_canvas_are_filled_on_the_chart(device: Device, name: str, x: int, y: int) -> None:
+    """Flow that leads back, but in a region where it is known to be wrong: both directions are filled there.
+    The cylinder's lies across the border, the sphere's near a pole, where a chart shows it elsewhere."""
+    grid = CANVASES[name]
+    found = pair_chart(disc(grid, x, y, 24), grid, grid)
+    u, v = common.pixels(found.width, found.height)
+    across, down = common.canvas_position(common.chart_point(u + 0.5, v + 0.5, found.transform), grid.lens)
+    column, row = np.floor(across).astype(int) % grid.width, np.floor(down).astype(int)
+    row = np.clip(row, 0, grid.height - 1)
+    regions = disc(grid, x, y, 8)
+    shown, deep = regions[row, column], disc(grid, x, y, 3)[row, column]
+    assert 150 < shown.sum() < 300
+    assert deep.sum() > 15
+    forward = still(found) + [1.0, 0.5] + shown[..., None] * [4.0, -2.0]
+    there, _ = mended(device, grid, forward, -forward, None, found)
+    assert np.abs(there[deep] - [5.0, -1.5]).max() < 1.5  # without them most of it stays
+    known = mended(device, grid, forward, -forward, regions, found)
+    for result, sign in zip(known, (1, -1), strict=True):
+        assert np.abs(sign * result[shown] - [1.0, 0.5]).max() < LEFT
