@@ -156,10 +156,13 @@ def _connected(mask: npt.NDArray[np.bool_], wraps: bool) -> list[npt.NDArray[np.
     """The connected parts of a mask."""
     count, found = cv2.connectedComponents(mask.astype(np.uint8), connectivity=8)
     labels = np.asarray(found)
-    if wraps:  # parts that meet across the border are one
-        for first, last in zip(labels[:, 0], labels[:, -1], strict=True):
-            if first and last and first != last:
-                labels[labels == last] = first
+    if wraps:  # parts that meet across the border, at a corner too, are one
+        height = labels.shape[0]
+        for down in (-1, 0, 1):
+            for row in range(max(0, -down), height - max(0, down)):
+                first, last = labels[row, 0], labels[row + down, -1]
+                if first and last and first != last:
+                    labels[labels == last] = first
     return [labels == k for k in np.unique(labels[mask])] if count > 1 else []
 
 
