@@ -271,7 +271,11 @@ def exposed(device: Device, gain: float, dtype: type = np.uint8) -> tuple[list[W
 
 
 def corrected(
-    device: Device, layers: list[WorkingLayer], grid: Grid, settings: Settings
+    device: Device,
+    layers: list[WorkingLayer],
+    grid: Grid,
+    settings: Settings,
+    ignored: np.ndarray | None = None,
 ) -> colour.Correction:
     covered = np.zeros((2, 208, 768), bool)
     covered[0, :, :448] = covered[1, :, 320:] = True
@@ -279,7 +283,7 @@ def corrected(
     zero = device.zeros((found.height, found.width, 2))
     fields = [device.zeros(layer.pixels.shape) for layer in layers]
     flows = [PairFlow(0, 1, found, zero, zero)]
-    return colour.correction(device, layers, fields, flows, grid, covered, settings)
+    return colour.correction(device, layers, fields, flows, grid, covered, settings, ignored)
 
 
 @pytest.mark.parametrize(("gain", "dtype"), [(0.5, np.uint8), (-0.3, np.uint16), (0.7, np.float32)])
@@ -312,3 +316,22 @@ def test_equal_layers_are_not_corrected(device: Device) -> None:
 def test_exposure_off_is_off(device: Device) -> None:
     layers, grid = exposed(device, 0.5)
     assert corrected(device, layers, grid, Settings(exposure=False)).gains == (None, None)
+
+
+def test_what_is_ignored_is_no_evidence(device: Device) -> None:
+    """The same gains whatever lies there; a cell of which any of it is ignored counts for nothing."""
+    gains, ignored = [], np.zeros((104, 384), bool)
+    ignored[30:51, 175:190] = True
+    for shown in (0.1, 0.9, None):
+        layers, grid = exposed(device, 0.5)
+        pixels = layers[1].pixels.get()
+        if shown is not None:
+            pixels[60:102, 30:60, :3] = shown  # at column 320 of the canvas
+        layers[1].pixels.set(pixels)
+        result = corrected(device, layers, grid, Settings(), None if shown is None else ignored)
+        gains.append(np.stack([gain.get() for gain in result.gains]))
+        if shown is not None:
+            seen = np.stack([g.get() for g in corrected(device, layers, grid, Settings()).gains])
+            assert np.abs(seen - gains[-1]).max() > 0.02
+    assert np.array_equal(gains[0], gains[1])
+    assert np.abs(gains[0] - gains[2]).max() < 0.03  # beside 0.25 each
