@@ -181,18 +181,14 @@ def test_a_cut_runs_through_the_least_residual(shift: int, wraps: bool) -> None:
 
 
 def test_a_border_counts_as_a_cut() -> None:
-    """A layer that ends inside the region, where the difference is large, gives way to one that goes on; it
-    is favoured, but not by more than the border costs."""
-    rows, columns = (v.ravel() for v in np.mgrid[0:6, 0:12])
-    cover = np.ones((2, 6, 12), bool)
-    cover[1, :, 7:] = False
+    """A favoured layer that ends where its region does gives way to one that goes on beyond; where both end
+    there is no cut to be seen."""
+    rows, columns = (v.ravel() for v in np.mgrid[0:6, 0:7])
+    residual, cover = np.ones((6, 12)), np.ones((2, 6, 12), bool)
     shares = np.stack([np.full((6, 12), 0.2), np.full((6, 12), 0.8)])
-    # where both end there is nothing to go on to
-    assert (seam.label(rows, columns, np.ones((6, 12)), shares, cover, False) == 0).all()
-    cover[0, :, 7:] = False
-    inside = columns < 7
-    found = seam.label(rows[inside], columns[inside], np.ones((6, 12)), shares, cover, False)
-    assert (found == 1).all()
+    for ends, taken in (((), 1), ((1,), 0), ((0, 1), 1)):
+        cover[list(ends), :, 7:] = False
+        assert (seam.label(rows, columns, residual, shares, cover, False) == taken).all()
 
 
 # Regions
