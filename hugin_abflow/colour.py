@@ -209,7 +209,10 @@ def _minimise(
         if rho <= enough:
             break
         image = apply(direction)
-        length = rho / float(np.vdot(direction, image))
+        curvature = float(np.vdot(direction, image))
+        if curvature <= 0:  # what is left is rounding
+            break
+        length = rho / curvature
         solution += length * direction
         residual -= length * image
         z = scale * residual

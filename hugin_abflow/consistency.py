@@ -9,45 +9,19 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-import numpy as np
-import numpy.typing as npt
-
 from hugin_abflow.geometry import PairFlow
 from hugin_abflow.opencl import Buffer, Device
-from hugin_abflow.working import Grid
 
 # Pixels between start and return that leave a quarter of the trust.
 _TOLERANCE = 1.5
 
 
-def mend(
-    device: Device, pair: PairFlow, grid: Grid, regions: npt.NDArray[np.bool_] | None = None
-) -> PairFlow:
-    """The pair's flows, filled where they disagree, and in `regions`.
-
-    regions: (height, width) on any grid over the region of the working grid `grid`: where flow is known not
-    to explain what the layers show.
-    """
-    unexplained = None if regions is None else device.upload(regions.astype(np.uint8))
-    forward, backward = (
-        _fill(device, _trusted(device, pair, *flows, grid, unexplained), pair.chart.wraps)
-        for flows in ((pair.forward, pair.backward), (pair.backward, pair.forward))
-    )
+def mend(device: Device, pair: PairFlow) -> PairFlow:
+    """The pair's flows, filled where they disagree."""
+    wraps = pair.chart.wraps
+    forward = _fill(device, trust(device, pair.forward, pair.backward, wraps), wraps)
+    backward = _fill(device, trust(device, pair.backward, pair.forward, wraps), wraps)
     return replace(pair, forward=forward, backward=backward)
-
-
-def _trusted(
-    device: Device, pair: PairFlow, flow: Buffer, back: Buffer, grid: Grid, regions: Buffer | None
-) -> Buffer:
-    trusted = trust(device, flow, back, pair.chart.wraps)
-    if regions is not None:
-        cells = grid.resized(regions.shape[1], regions.shape[0]).border
-        size = (pair.chart.width, pair.chart.height)
-        device.run(
-            "consistency", "consistency_distrust", size, trusted, pair.chart.transform, size, grid.lens,
-            grid.border, regions, cells,
-        )  # fmt: skip
-    return trusted
 
 
 def trust(device: Device, flow: Buffer, back: Buffer, wraps: bool) -> Buffer:

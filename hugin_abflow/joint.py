@@ -147,10 +147,10 @@ def _align(
 ) -> tuple[list[Buffer], Correction]:
     """Geometry and colour that make the layers agree; where nothing does, one layer whole.
 
-    What flow cannot explain spoils flow and exposure around it, so both are found again without it.
+    What flow cannot explain spoils the exposure around it, which is found again without it.
     """
     regions: npt.NDArray[np.bool_] | None = None
-    pairs = [consistency.mend(device, pair, grid) for pair in flows]
+    pairs = [consistency.mend(device, pair) for pair in flows]
     coefficients = transition.narrow(device, layers, coefficients, pairs, grid, settings)
     correct = partial(colour.correction, device, layers)
     fields = geometry.fields(device, layers, coefficients, pairs, grid, settings)
@@ -163,10 +163,8 @@ def _align(
         if not grown.any() or (regions is not None and np.array_equal(grown, regions)):
             break
         regions = grown
-        pairs = [consistency.mend(device, pair, grid, regions) for pair in flows]
-        fields = geometry.fields(device, layers, coefficients, pairs, grid, settings)
     if regions is not None:
-        seam.cut(device, layers, fields, coefficients, pairs, strict, regions, masks, grid)
+        seam.cut(device, layers, fields, pairs, strict, regions, masks, grid)
     return fields, correct(fields, pairs, grid, masks.host, settings, regions)
 
 

@@ -2,30 +2,29 @@
 
 Somebody who walked, or a near thing that hides another part of the scene for each camera, leaves aligned
 layers that differ although exposure is corrected. In each connected region of such cells every cell is given
-to one layer: the one that the blend coefficients favour, with cuts between layers, and at the layers' own
+to one layer: the one that the softmax favours, with cuts between layers, and at the layers' own
 borders, where they show least. This is a labelling of least energy,
 
-    sum_cells r (1 - w_k)  +  sum_neighbours c (r + r') / 2 [k != k']  +  sum_borders c r
+    sum_cells r (1 - s_k)  +  sum_neighbours c (r + r') / 2 [k != k']  +  sum_borders c r
 
-with r the residual, w_k the blend coefficient and c the price of a cut, found by graph cuts (alpha expansion:
+with r the residual, s_k the share of the softmax and c the price of a cut, found by graph cuts (alpha expansion:
 Boykov, Veksler, Zabih, "Fast approximate energy minimization via graph cuts", 2001). Regions keep to
 themselves: elsewhere the softmax stays as it is, and the transition lies where the layers agree.
 """
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from typing import Any
 
 import cv2
 import numpy as np
 import numpy.typing as npt
+from scipy import ndimage
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import breadth_first_order, maximum_flow
 
-from hugin_abflow import colour
-from hugin_abflow.coefficient import Coefficients, Masks
+from hugin_abflow.coefficient import Masks
 from hugin_abflow.colour import Correction
 from hugin_abflow.geometry import PairFlow
 from hugin_abflow.opencl import Buffer, Device
@@ -35,11 +34,11 @@ from hugin_abflow.working import Grid, WorkingLayer
 _CELL = 8
 # Cells over which differences are averaged: texture that is a little off is no reason to cut.
 _SIGMA = 1.0
-# Residual on the exposure scale that makes a region one layer's, and that of its outskirts.
-_STRONG, _WEAK = 0.8, 0.2
+# Residual, of full scale, that makes a region one layer's, and that of its outskirts.
+_STRONG, _WEAK = 0.2, 0.045
 # Strong cells, of the equator's size, that a region has at least: fewer are an edge that is a pixel off.
 _LEAST = 6.0
-# Price of a cut, in cells: what is cut off must be favoured by the coefficients over this depth.
+# Price of a cut, in cells: what is cut off must be favoured by the softmax over this depth.
 _CUT = 20.0
 # No layer is taken where it is not.
 _FORBIDDEN = 1e4
@@ -70,7 +69,6 @@ def cut(
     device: Device,
     layers: Sequence[WorkingLayer],
     fields: Sequence[Buffer],
-    coefficients: Sequence[Coefficients],
     pairs: Sequence[PairFlow],
     correction: Correction,
     whole: npt.NDArray[np.bool_],
@@ -84,8 +82,9 @@ def cut(
     residual = _residual(device, layers, fields, pairs, correction, grid, cells)
     cover = _cells_whole(masks.host, cells)
     shares = np.stack(
-        [_on_cells(c.blend.get(), k.box, grid, cells) for c, k in zip(coefficients, layers, strict=True)]
+        [_on_cells(f.get()[..., 3], k.box, grid, cells) for f, k in zip(fields, layers, strict=True)]
     )
+    shares /= np.maximum(shares.sum(0), 1e-12)
     yields = np.zeros(cover.shape, np.float32)
     for region in _connected(whole, cells.wraps):
         rows, columns = np.nonzero(region)
@@ -107,32 +106,29 @@ def _residual(
     cells: Grid,
 ) -> npt.NDArray[np.float64]:
     """How far low frequencies differ: per cell the largest of any pair and channel, 0 where no two lie."""
+    none = device.zeros((*correction.grid.shape, 4))
+    difference = device.empty((*cells.shape, 4))
     largest = np.zeros(cells.shape)
     for pair in pairs:
-        difference = colour.difference(device, layers, fields, pair, grid, cells)
-        left = difference[..., :3] + _gain(correction, pair.a, cells) - _gain(correction, pair.b, cells)
-        mean = _smooth(np.dstack([left * difference[..., 3:], difference[..., 3]]), cells.wraps)
-        known = difference[..., 3] > 0
-        mean = np.abs(mean[..., :3]).max(-1) / np.where(known, mean[..., 3], 1)
-        largest = np.maximum(largest, mean * known)
+        sides: list[Any] = []
+        for k in (pair.a, pair.b):
+            sides += [layers[k].pixels, fields[k], layers[k].box, correction.gains[k] or none]
+        device.run(
+            "seam", "seam_difference", cells.border[:2], *sides, grid.border, grid.lens,
+            correction.grid.border, cells.border, int(layers[pair.a].layer.dtype.kind == "u"), difference,
+        )  # fmt: skip
+        found = difference.get().astype(np.float64)
+        share = found[..., 3]
+        mean = _smooth(np.dstack([found[..., :3] * share[..., None], share]), cells.wraps)
+        mean = np.abs(mean[..., :3]).max(-1) / np.where(share > 0, mean[..., 3], 1)
+        largest = np.maximum(largest, mean * (share > 0))
     return largest
-
-
-def _gain(correction: Correction, index: int, cells: Grid) -> npt.NDArray[np.float32]:
-    """A layer's correction on the seam grid: nearest, it is smooth."""
-    gain = correction.gains[index]
-    if gain is None:
-        return np.zeros((*cells.shape, 3), np.float32)
-    rows = np.arange(cells.height) * correction.grid.height // cells.height
-    columns = np.arange(cells.width) * correction.grid.width // cells.width
-    return gain.get()[rows][:, columns, :3]
 
 
 def _smooth(values: npt.NDArray[np.float64], wraps: bool) -> npt.NDArray[np.float64]:
     """A Gaussian of _SIGMA cells, not normalised at the borders."""
-    by = math.ceil(3 * _SIGMA)
-    blurred = cv2.GaussianBlur(_padded(values, by, wraps), (2 * by + 1, 2 * by + 1), _SIGMA)
-    return np.asarray(blurred[by:-by, by:-by])
+    modes = ("constant", "wrap" if wraps else "constant", "constant")
+    return np.asarray(ndimage.gaussian_filter(values, (_SIGMA, _SIGMA, 0), mode=modes, truncate=3))
 
 
 def _padded(values: npt.NDArray[Any], by: int, wraps: bool) -> npt.NDArray[Any]:
@@ -176,7 +172,7 @@ def label(
 ) -> npt.NDArray[np.intp]:
     """Which layer each cell (rows, columns) of a region is taken from: the least energy found.
 
-    residual: (height, width). shares, cover: blend coefficients and coverage (layers, height, width).
+    residual: (height, width). shares, cover: shares of the softmax and coverage (layers, height, width).
     """
     candidates = np.flatnonzero(cover[:, rows, columns].any(1))
     if candidates.size < 2:
@@ -257,20 +253,19 @@ def _cells_whole(covered: npt.NDArray[np.bool_], cells: Grid) -> npt.NDArray[np.
 
 
 def _on_cells(
-    blend: npt.NDArray[np.float32], box: tuple[int, int, int, int], grid: Grid, cells: Grid
+    weights: npt.NDArray[np.float32], box: tuple[int, int, int, int], grid: Grid, cells: Grid
 ) -> npt.NDArray[np.float64]:
-    """Blend coefficients at the cells' centres; 0 outside the layer's box."""
+    """Weights at the cells' centres; 0 outside the layer's box."""
     left, top, width, height = box
     rows = ((np.arange(cells.height) + 0.5) * grid.height / cells.height).astype(int) - top
     columns = ((np.arange(cells.width) + 0.5) * grid.width / cells.width).astype(int) - left
     row_inside, column_inside = (rows >= 0) & (rows < height), (columns >= 0) & (columns < width)
     result = np.zeros(cells.shape)
-    result[np.ix_(row_inside, column_inside)] = blend[np.ix_(rows[row_inside], columns[column_inside])]
+    result[np.ix_(row_inside, column_inside)] = weights[np.ix_(rows[row_inside], columns[column_inside])]
     return result
 
 
 def _soften(mask: npt.NDArray[np.float32], wraps: bool) -> npt.NDArray[np.float32]:
     """Blur a mask's outline over a cell to each side."""
-    padded = np.pad(mask, ((1, 1), (0, 0)), mode="edge")  # nothing yields less at a pole
-    padded = np.pad(padded, ((0, 0), (1, 1)), mode="wrap" if wraps else "edge")
-    return np.ascontiguousarray(cv2.blur(padded, (3, 3))[1:-1, 1:-1])
+    modes = ("nearest", "wrap" if wraps else "nearest")  # "nearest": nothing yields less at a pole
+    return np.ascontiguousarray(ndimage.uniform_filter(mask, 3, mode=modes))

@@ -12,13 +12,12 @@ with a smooth n: most of an overlap comes from one photo as it is, and no transi
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import replace
 
-import cv2
 import numpy as np
 import numpy.typing as npt
+from scipy import ndimage
 
 from hugin_abflow import geometry
 from hugin_abflow.coefficient import Coefficients
@@ -82,7 +81,5 @@ def exponent(strain: npt.NDArray[np.float64], wanted: float, wraps: bool) -> npt
 
 def _smooth(values: npt.NDArray[np.float64], wraps: bool) -> npt.NDArray[np.float64]:
     """A Gaussian of _SIGMA cells, not normalised at the borders."""
-    by = math.ceil(4 * _SIGMA)
-    values = np.pad(values, ((by, by), (0, 0), (0, 0)))
-    values = np.pad(values, ((0, 0), (by, by), (0, 0)), mode="wrap" if wraps else "constant")
-    return np.asarray(cv2.GaussianBlur(values, (2 * by + 1, 2 * by + 1), _SIGMA)[by:-by, by:-by])
+    modes = ("constant", "wrap" if wraps else "constant", "constant")
+    return np.asarray(ndimage.gaussian_filter(values, (_SIGMA, _SIGMA, 0), mode=modes))

@@ -23,22 +23,6 @@ __kernel void consistency_trust(__global const float2 *flow, /* (grid.y, grid.x)
     trusted[at] = (float4)(f, c * c, 0.0f);
 }
 
-/* No trust in what a region of the canvas shows. */
-__kernel void consistency_distrust(__global float4 *trusted,        /* (size.y, size.x) of the chart */
-                                   float16 chart, int2 size,        /* run size */
-                                   float4 lens, int4 border,        /* working grid */
-                                   __global const uchar *regions,   /* (cells.y, cells.x) over the same region */
-                                   int4 cells)
-{
-    const int x = get_global_id(0), y = get_global_id(1);
-    if (x >= size.x || y >= size.y)
-        return;
-    const float2 p = canvas_position(chart_point((float2)(x + 0.5f, y + 0.5f), &chart), lens);
-    int2 c = (int2)((int)floor(p.x * cells.x / border.x), (int)floor(p.y * cells.y / border.y));
-    if (grid_border(&c, cells) && regions[c.y * cells.x + c.x])
-        trusted[y * size.x + x].z = 0.0f;
-}
-
 /* Halve: the mean flow, weighted by trust, and the mean trust; taps as in pyramid_reduce. */
 __kernel void consistency_push(__global const float4 *trusted, /* (fine.y, fine.x) flow, trust, 0 */
                                int4 fine,                      /* width, height, wraps, 0 */

@@ -1,5 +1,48 @@
 /* Where one layer is taken whole. */
 
+/* A colour as a difference of it is seen: integer images are coded so already, floats are linear light. */
+static inline float3 seam_look(float3 c, float3 gain, int integer) {
+    c = exposure_shift(c, gain, integer);
+    return integer ? c : sqrt(fmax(c, 0.0f));
+}
+
+/* Mean difference a - b of two aligned, corrected layers over the pixels of a cell (every second one in x and y)
+   that both show, and the share of these. */
+__kernel void seam_difference(__global const float4 *layer_a, __global const float4 *field_a, int4 box_a,
+                              __global const float4 *gain_a, /* (colours.y, colours.x) */
+                              __global const float4 *layer_b, __global const float4 *field_b, int4 box_b,
+                              __global const float4 *gain_b, /* (colours.y, colours.x) */
+                              int4 border, float4 lens,    /* working grid */
+                              int4 colours, int4 cells,    /* grid of the gains; seam grid, run size */
+                              int integer,                 /* which exposure scale */
+                              __global float4 *difference) /* (cells.y, cells.x): r, g, b, share */
+{
+    const int cx = get_global_id(0), cy = get_global_id(1);
+    if (cx >= cells.x || cy >= cells.y)
+        return;
+    const int left = cx * border.x / cells.x, right = (cx + 1) * border.x / cells.x;
+    const int top = cy * border.y / cells.y, bottom = (cy + 1) * border.y / cells.y;
+    /* gains are smooth: the cell's centre will do */
+    const int g = (2 * cy + 1) * colours.y / (2 * cells.y) * colours.x + (2 * cx + 1) * colours.x / (2 * cells.x);
+    float3 sum = (float3)(0.0f);
+    float n = 0.0f, tried = 0.0f;
+    for (int y = top; y < bottom; y += 2)
+        for (int x = left; x < right; x += 2) {
+            tried += 1.0f;
+            const int2 p = (int2)(x, y);
+            const int at_a = box_index(p, box_a), at_b = box_index(p, box_b);
+            if (at_a < 0 || at_b < 0 || layer_a[at_a].w == 0.0f || layer_b[at_b].w == 0.0f)
+                continue;
+            const float4 a = layer_sample(layer_a, box_a, layer_position(p, field_a[at_a].xyz, lens), border);
+            const float4 b = layer_sample(layer_b, box_b, layer_position(p, field_b[at_b].xyz, lens), border);
+            if (a.w == 0.0f || b.w == 0.0f)
+                continue;
+            sum += seam_look(a.xyz, gain_a[g].xyz, integer) - seam_look(b.xyz, gain_b[g].xyz, integer);
+            n += 1.0f;
+        }
+    difference[cy * cells.x + cx] = n > 0.0f ? (float4)(sum / n, n / tried) : (float4)(0.0f);
+}
+
 /* Take a layer's colour weight away where it yields: bilinear from the seam grid. A trace is left, so that a
    pixel that no other layer can fill stays opaque. */
 __kernel void seam_yield(__global float4 *field,        /* (box.w, box.z) of the working grid; w is scaled */

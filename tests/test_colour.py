@@ -132,15 +132,17 @@ def test_twins_of_the_exposure_scale(monkeypatch: pytest.MonkeyPatch) -> None:
         assert np.allclose(scales[1] - scales[0], 0.4)
 
 
-def dense_gains(measured: list, inside: np.ndarray, cells: Grid) -> np.ndarray:
+def dense_gains(measured: list, inside: np.ndarray, cells: Grid, rounds: tuple) -> np.ndarray:
     """The minimum of the sum in colour.py, by least squares over all cells of all layers."""
     _, height, width = inside.shape
     index = np.arange(inside.size).reshape(inside.shape)
     latitude = cells.lens[2] - (np.arange(height) + 0.5) * cells.lens[3]
     area = np.maximum(np.cos(latitude), 0.02) if cells.lens[1] else np.ones(height)
-    fade = max(1.0, colour._FADE * (2 * math.pi / cells.lens[1] if cells.lens[1] else width))
+    circle = 2 * math.pi / cells.lens[1] if cells.lens[1] else width
     solution = np.zeros((*inside.shape, 3))
-    for data, residual in colour._ROUNDS:
+    for data, limit in rounds:
+        last = rounds is colour._ROUNDS or (data, limit) == rounds[-1]
+        fade = max(1.0, (colour._FADE if last else colour._TREND_FADE) * circle)
         rows, targets = [], []
 
         def term(weight: float, entries: dict[int, float], target: np.ndarray, rows=rows, targets=targets):
@@ -161,7 +163,8 @@ def dense_gains(measured: list, inside: np.ndarray, cells: Grid) -> np.ndarray:
         for a, b, d in measured:
             for y, x in np.argwhere(d[..., 3] > 0):
                 off = solution[a, y, x] - solution[b, y, x] + d[y, x, :3]
-                trust = 1 / (1 + (np.linalg.norm(off) / residual) ** 2) if solution.any() else 1.0
+                distance = np.linalg.norm(off) if solution.any() else 0.0
+                trust = (1 - (distance / limit) ** 2) ** 2 if distance < limit else 0.0
                 weight = data * area[y] * d[y, x, 3] * trust
                 term(weight, {index[a, y, x]: 1, index[b, y, x]: -1}, -d[y, x, :3])
         solution = np.linalg.lstsq(np.array(rows), np.array(targets), rcond=None)[0].reshape(*inside.shape, 3)
@@ -190,13 +193,16 @@ CELLS = {
 }
 
 
+@pytest.mark.parametrize("rounds", [colour._ROUNDS, colour._STRICT], ids=["normal", "strict"])
 @pytest.mark.parametrize("name", list(CELLS))
-def test_solve_is_dense_least_squares(monkeypatch: pytest.MonkeyPatch, name: str) -> None:
+def test_solve_is_dense_least_squares(
+    monkeypatch: pytest.MonkeyPatch, name: str, rounds: tuple[tuple[float, float], ...]
+) -> None:
     monkeypatch.setattr(colour, "_TOLERANCE", 1e-10)
     cells = CELLS[name]
     measured, inside = overlapping(0, cells)
-    gains = colour.solve(measured, inside, cells)
-    expected = dense_gains(measured, inside, cells)
+    gains = colour.solve(measured, inside, cells, rounds)
+    expected = dense_gains(measured, inside, cells, rounds)
     assert np.abs(expected).max() > 0.05
     assert np.allclose(gains, expected, atol=1e-7)
     assert not gains[~inside].any()
@@ -207,7 +213,7 @@ def test_solve_is_accurate_enough_as_it_is() -> None:
     measured, inside = overlapping(1, CELLS["cylinder"])
     gains, expected = (
         colour.solve(measured, inside, CELLS["cylinder"]),
-        dense_gains(measured, inside, CELLS["cylinder"]),
+        dense_gains(measured, inside, CELLS["cylinder"], colour._ROUNDS),
     )
     assert np.abs(gains - expected).max() < 2e-3
 

@@ -6,11 +6,11 @@ import math
 
 import numpy as np
 import pytest
-from grids import GRIDS, patches, plane, sphere
+from grids import patches, plane, sphere
 from reference import common
 from reference import consistency as twin
 from scipy import ndimage
-from tolerances import DECISIONS, POSITION, SUM, assert_close
+from tolerances import POSITION, SUM, assert_close
 
 from hugin_abflow import consistency
 from hugin_abflow.chart import Chart, pair_chart
@@ -143,72 +143,6 @@ def test_flow_equals_its_twin(device: Device) -> None:
     assert np.array_equal(flow.get(), twin.consistency_flow(trusted))
 
 
-def distrusted(device: Device, found: Chart, grid: Grid, regions: np.ndarray, trusted: np.ndarray) -> tuple:
-    """Kernel and twin of the same."""
-    cells, size = grid.resized(*regions.shape[::-1]).border, (found.width, found.height)
-    level, marked = device.upload(trusted), regions.astype(np.uint8)
-    device.run(
-        "consistency", "consistency_distrust", size, level, found.transform, size, grid.lens, grid.border,
-        device.upload(marked), cells,
-    )  # fmt: skip
-    expected = twin.consistency_distrust(
-        trusted, found.transform, size, grid.lens, grid.border, marked, cells
-    )
-    return level.get(), expected
-
-
-@pytest.mark.parametrize("name", list(GRIDS))
-def test_distrust_equals_its_twin(device: Device, name: str) -> None:
-    """On a chart of its own axis (over a pole, on the sphere), for a grid of cells that divides nothing."""
-    grid = GRIDS[name]
-    overlap = np.zeros(grid.shape, bool)
-    overlap[: grid.height // 2, 20:40] = overlap[3:8, -4:] = True
-    found = pair_chart(overlap, grid, grid)
-    trusted = random_trusted(11, found.width, found.height)
-    trusted[..., 2] += 0.5
-    regions = patches(12, 11, 7, 0.5, 2) > 0
-    kernel, expected = distrusted(device, found, grid, regions, trusted)
-    assert 0.1 < (expected[..., 2] == 0).mean() < 0.9
-    assert_close(kernel, expected, SUM, decisions=5 * DECISIONS)
-    assert np.array_equal(kernel[..., :2], trusted[..., :2])
-
-
-@pytest.mark.parametrize("wraps", WRAPS)
-def test_twin_of_distrust_on_a_plane_is_a_cut_out(device: Device, wraps: bool) -> None:
-    """A plane's chart is a part of the canvas, on which cells of 8 px are blocks; it may cross the border."""
-    grid, regions = plane(80, 56, wraps), patches(13, 10, 7, 0.5, 1) > 0
-    overlap = np.zeros(grid.shape, bool)
-    overlap[20:40, 70:] = True
-    overlap[20:40, :9] = wraps
-    found = pair_chart(overlap, grid, grid)
-    kernel, expected = distrusted(
-        device, found, grid, regions, np.ones((found.height, found.width, 4), np.float32)
-    )
-    blocks = np.kron(regions, np.ones((8, 8), bool))
-    left, top = (-found.transform[11:13]).astype(int)
-    columns = np.arange(left, left + found.width) % 80
-    cut_out = blocks[top : top + found.height][:, columns]
-    assert 0.2 < cut_out.mean() < 0.8
-    assert np.array_equal(expected[..., 2] == 0, cut_out)
-    assert np.array_equal(kernel, expected)
-
-
-def test_twin_of_distrust_on_a_sphere_takes_angles(device: Device) -> None:
-    """A cap around the north pole: on a chart over the pole a disc, whose radius is the cap's."""
-    grid = sphere(402, 201)
-    overlap = np.zeros(grid.shape, bool)
-    overlap[:40] = True
-    found = pair_chart(overlap, grid, grid)
-    regions = np.zeros((201, 402), bool)
-    regions[:20] = True
-    _, expected = distrusted(
-        device, found, grid, regions, np.ones((found.height, found.width, 4), np.float32)
-    )
-    columns, rows = common.pixels(found.width, found.height)
-    point = common.chart_point(columns + 0.5, rows + 0.5, found.transform)
-    assert np.array_equal(expected[..., 2] == 0, np.arccos(point[..., 2]) < 20 * math.pi / 201)
-
-
 # The module
 
 
@@ -221,12 +155,11 @@ def mended(
     grid: Grid,
     forward: np.ndarray,
     backward: np.ndarray,
-    regions: np.ndarray | None = None,
     found: Chart | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:
     flows = (device.upload(flow.astype(np.float32)) for flow in (forward, backward))
     pair = PairFlow(0, 1, found or chart_of(grid), *flows)
-    result = consistency.mend(device, pair, grid, regions)
+    result = consistency.mend(device, pair)
     assert (result.a, result.b, result.chart) == (0, 1, pair.chart)
     return result.forward.get(), result.backward.get()
 
@@ -242,9 +175,8 @@ CANVASES = {"plane": plane(97, 61), "cylinder": plane(128, 61, wraps=True), "sph
 def test_no_flow_stays_exactly_none(device: Device, name: str) -> None:
     grid = CANVASES[name]
     nothing = still(chart_of(grid))
-    for regions in (None, patches(14, 16, 8, 0.3, 2) > 0):
-        for flow in mended(device, grid, nothing, nothing, regions):
-            assert not flow.any()
+    for flow in mended(device, grid, nothing, nothing):
+        assert not flow.any()
 
 
 @pytest.mark.parametrize("name", ["cylinder", "sphere"])
@@ -323,25 +255,3 @@ def disc(grid: Grid, x: float, y: float, radius: float) -> np.ndarray:
         return np.arccos(np.clip(points @ middle, -1, 1)) < radius * grid.lens[1]
     away = np.abs(points[..., 0] - x)
     return np.hypot(np.minimum(away, grid.width - away) if grid.wraps else away, points[..., 1] - y) < radius
-
-
-@pytest.mark.parametrize(("name", "x", "y"), [("plane", 48, 30), ("cylinder", 2, 30), ("sphere", 65, 6)])
-def test_regions_on_the_canvas_are_filled_on_the_chart(device: Device, name: str, x: int, y: int) -> None:
-    """Flow that leads back, but in a region where it is known to be wrong: both directions are filled there.
-    The cylinder's lies across the border, the sphere's near a pole, where a chart shows it elsewhere."""
-    grid = CANVASES[name]
-    found = pair_chart(disc(grid, x, y, 24), grid, grid)
-    u, v = common.pixels(found.width, found.height)
-    across, down = common.canvas_position(common.chart_point(u + 0.5, v + 0.5, found.transform), grid.lens)
-    column, row = np.floor(across).astype(int) % grid.width, np.floor(down).astype(int)
-    row = np.clip(row, 0, grid.height - 1)
-    regions = disc(grid, x, y, 8)
-    shown, deep = regions[row, column], disc(grid, x, y, 3)[row, column]
-    assert 150 < shown.sum() < 300
-    assert deep.sum() > 15
-    forward = still(found) + [1.0, 0.5] + shown[..., None] * [4.0, -2.0]
-    there, _ = mended(device, grid, forward, -forward, None, found)
-    assert np.abs(there[deep] - [5.0, -1.5]).max() < 1.5  # without them most of it stays
-    known = mended(device, grid, forward, -forward, regions, found)
-    for result, sign in zip(known, (1, -1), strict=True):
-        assert np.abs(sign * result[shown] - [1.0, 0.5]).max() < LEFT

@@ -1,4 +1,4 @@
-"""One layer, whole, where flow explains nothing: labels of least energy, regions, and whole panoramas."""
+"""One layer, whole, where flow explains nothing: the kernels, labels of least energy, regions."""
 
 from __future__ import annotations
 
@@ -6,19 +6,15 @@ from itertools import product
 
 import numpy as np
 import pytest
-from grids import GRIDS, patches, plane, sphere
+from grids import GRIDS, patches, plane, random_layer, sphere
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from pictures import masked, merged, one_device, pixel_places, texture
-from reference.seam import seam_yield
+from reference.seam import seam_difference, seam_yield
 from scipy import ndimage
-from tolerances import SUM, assert_close
+from tolerances import POSITION, SUM, assert_close
 
-from hugin_abflow import joint, seam
-from hugin_abflow.layer import Canvas, Layer
+from hugin_abflow import seam
 from hugin_abflow.opencl import Device
-from hugin_abflow.progress import silent
-from hugin_abflow.settings import Settings
 
 WRAPS = [False, True]
 
@@ -42,6 +38,31 @@ def test_twin_of_yield_reads_scipys_zoom() -> None:
         )
         assert np.array_equal(result[..., :3], field[..., :3])
         assert result[..., 3].min() > 0
+
+
+@pytest.mark.parametrize("name", list(GRIDS))
+@pytest.mark.parametrize("integer", [0, 1])
+def test_difference_equals_its_twin(device: Device, name: str, integer: int) -> None:
+    grid = GRIDS[name]
+    cells, colours = grid.resized(10, 7).border, grid.resized(5, 3).border
+    sides: list = []
+    for k, box in enumerate(((0, 0, 60, grid.height), (9, 1, grid.width - 9, grid.height - 1))):
+        pixels = random_layer(20 + k, box[2], box[3], 0.9)
+        field = ndimage.gaussian_filter(np.random.default_rng(k).normal(size=(box[3], box[2], 4)), (4, 4, 0))
+        field = (3 * field * (grid.lens[1] or 1)).astype(np.float32)
+        if not grid.lens[1]:
+            field[..., 2] = 0
+        gain = np.random.default_rng(9 + k).normal(size=(3, 5, 4)).astype(np.float32)
+        sides += [pixels, field, box, gain]
+    out = device.empty((7, 10, 4))
+    uploaded = [device.upload(one) if isinstance(one, np.ndarray) else one for one in sides]
+    device.run(
+        "seam", "seam_difference", (10, 7), *uploaded, grid.border, grid.lens, colours, cells, integer, out
+    )
+    expected = seam_difference(*sides, grid.border, grid.lens, colours, cells, integer)
+    assert (expected[..., 3] > 0).mean() > 0.4
+    # a pixel more or less at a mask's rim is one of some ten of a cell
+    assert_close(out.get(), expected, 10 * POSITION, decisions=0.05)
 
 
 @pytest.mark.parametrize("name", list(GRIDS))
@@ -233,7 +254,7 @@ def test_a_region_is_strong_and_takes_its_outskirts() -> None:
 def test_a_region_across_the_border_is_one() -> None:
     residual = np.zeros((40, 60))
     residual[5:9, 58:] = residual[5:8, :1] = 2.0  # neither side is enough alone
-    residual[7:9, 58:] = 0.5
+    residual[7:9, 58:] = 0.5 * (seam._WEAK + seam._STRONG)
     cells = plane(480, 320, wraps=True).resized(60, 40)
     (region,) = seam._regions(residual, cells)
     assert region[:, [57, 58, 59, 0, 1]].any(0).all()
@@ -267,183 +288,3 @@ def test_cells_that_a_layer_covers_whole() -> None:
     covered[0, 12, 20] = covered[1, 52, 76] = False
     whole = seam._cells_whole(covered, plane(110, 70).resized(9, 5))
     assert np.argwhere(~whole).tolist() == [[0, 1, 2], [1, 4, 8]]
-
-
-# Whole panoramas: a dark disc in one of two layers that show the same wall
-
-
-RADIUS, LAP = 28, 90  # px; overlaps are 2 LAP wide
-DISC = (24, 16, 12)
-CANVASES = {
-    "plane": (Canvas.plane(480, 208), 240, 100),
-    "across the border": (Canvas.plane(480, 208, wraps=True), 0, 100),
-    "beside the border": (Canvas.plane(480, 208, wraps=True), 466, 80),
-    "sphere": (Canvas.sphere(480, 240), 0, 100),
-    "near a pole": (Canvas.sphere(480, 240), 2, 40),
-}
-
-
-def wall(canvas: Canvas, dx: float = 0.0) -> np.ndarray:
-    """Mid tones everywhere, brighter than the disc."""
-    y, x = pixel_places(canvas.height, canvas.width)
-    picture = texture(y, x - dx, np.uint8, canvas.width if canvas.wraps else 0)
-    picture[..., :3] = 64 + picture[..., :3] // 2
-    return picture
-
-
-def distance(canvas: Canvas, x: float, y: float) -> np.ndarray:
-    """Of every pixel from a place, in px, on the sphere by angle."""
-    rows, columns = (place + 0.5 for place in pixel_places(canvas.height, canvas.width))
-    across = np.abs(columns - x)
-    if canvas.wraps:
-        across = np.minimum(across, canvas.width - across)
-    if not canvas.spherical:
-        return np.hypot(across, rows - y)
-    step = np.pi / canvas.height
-    lat, its, lon = np.pi / 2 - rows * step, np.pi / 2 - y * step, across * 2 * np.pi / canvas.width
-    cosine = np.sin(lat) * np.sin(its) + np.cos(lat) * np.cos(its) * np.cos(lon)
-    return np.arccos(np.clip(cosine, -1, 1)) / step
-
-
-def halves(canvas: Canvas, x: int) -> tuple[np.ndarray, np.ndarray]:
-    """Masks of two layers that overlap around column x, and opposite of it on a canvas that wraps."""
-    columns = pixel_places(canvas.height, canvas.width)[1]
-    if not canvas.wraps:
-        return columns < x + LAP, columns >= x - LAP
-    around, half = (columns - x) % canvas.width, canvas.width // 2
-    return (around < half + LAP) | (around >= canvas.width - LAP), (around < LAP) | (around >= half - LAP)
-
-
-def scene(
-    name: str, who: int | None, light: float = 1.0, dx: float = 0.0
-) -> tuple[list[Layer], Canvas, np.ndarray, np.ndarray]:
-    """Two layers of the wall, of which `who` shows the disc and the second is darker and moved; the canvas;
-    how far each pixel is from the disc's centre; the wall."""
-    canvas, x, y = CANVASES[name]
-    away, plain = distance(canvas, x, y), wall(canvas)
-    layers = []
-    for index, mask in enumerate(halves(canvas, x)):
-        picture = wall(canvas, dx * index)
-        if index == who:
-            picture[away < RADIUS, :3] = DISC
-        if index == 1:
-            picture[..., :3] = np.rint(picture[..., :3] * light)
-        layers.append(masked(picture, mask))
-    return layers, canvas, away, plain
-
-
-def off(result: np.ndarray, colours: np.ndarray | tuple[int, ...]) -> np.ndarray:
-    """Largest difference of a channel, per pixel, in levels."""
-    return np.abs(result[..., :3].astype(int) - np.asarray(colours)[..., :3]).max(-1)
-
-
-def doubt(result: np.ndarray, plain: np.ndarray, away: np.ndarray) -> np.ndarray:
-    """How far each pixel is from what either layer shows, in levels."""
-    shown = plain.copy()
-    shown[away < RADIUS, :3] = DISC
-    return np.minimum(off(result, plain), off(result, shown))
-
-
-@pytest.mark.usefixtures(one_device.__name__)
-@pytest.mark.parametrize(
-    ("name", "who"),
-    [("plane", 0), ("plane", 1), ("across the border", 0), ("across the border", 1), ("beside the border", 0),
-     ("sphere", 1), ("near a pole", 0)],
-)  # fmt: skip
-def test_what_only_one_layer_shows_is_whole_or_absent(name: str, who: int) -> None:
-    layers, canvas, away, plain = scene(name, who)
-    result = merged(layers, canvas, seam=True)
-    assert doubt(result, plain, away).max() <= 8  # every pixel is one layer's; on the sphere flow resamples
-    assert (off(result, DISC)[away < RADIUS - 1] <= 8).mean() in (0, 1)
-    assert off(result, plain)[away >= RADIUS + 16].max() <= 8
-    assert (result[..., 3] == 255).all()
-
-
-@pytest.mark.usefixtures(one_device.__name__)
-@pytest.mark.parametrize("name", ["plane", "across the border"])
-def test_without_seam_it_is_half_transparent(name: str) -> None:
-    layers, canvas, away, plain = scene(name, 0)
-    result = merged(layers, canvas, seam=False)
-    assert (doubt(result, plain, away)[away < RADIUS] > 20).mean() > 0.4
-
-
-@pytest.mark.usefixtures(one_device.__name__)
-@pytest.mark.parametrize("who", [0, 1])
-@pytest.mark.parametrize("name", ["plane", "across the border"])
-def test_what_only_one_layer_shows_does_not_change_the_exposure_around(name: str, who: int) -> None:
-    """With layers of different light, beside the same without the disc."""
-    layers, canvas, away, _ = scene(name, who, 0.8)
-    clean = merged(scene(name, None, 0.8)[0], canvas)
-    result = merged(layers, canvas)
-    assert off(result, clean)[away > RADIUS + 32].max() <= 2
-    # where the disc is absent the wall behind it has its light, but for what the correction fades by over so
-    # small a canvas, else the disc is whole; layers differ by some 26 levels, the disc and the wall by 100
-    inside = away < RADIUS - 8
-    behind = ndimage.gaussian_filter(result[..., 1].astype(float) - clean[..., 1], 3, mode="wrap")[inside]
-    absent = np.abs(behind).max() <= 8
-    assert absent or off(result, DISC)[inside].max() <= 8
-
-
-def prepared(device: Device, layers: list[Layer], canvas: Canvas, **chosen) -> joint.Prepared:
-    return joint.prepare(device, layers, canvas, Settings(**chosen), silent)
-
-
-def fields_of(found: joint.Prepared) -> list[np.ndarray]:
-    return [layer.field.get() for layer in found.layers]
-
-
-@pytest.mark.parametrize(
-    ("dx", "light", "exposure"),
-    [(1.5, 1.0, True), (4.0, 1.0, False), (0.0, 0.5, True), (0.0, 0.5, False), (3.0, 0.8, True)],
-)
-def test_layers_that_agree_are_blended_as_ever(
-    device: Device, dx: float, light: float, exposure: bool
-) -> None:
-    """No region, and weights and places to the bit, whether the exposure is corrected or only known."""
-    layers, canvas, *_ = scene("across the border", None, light, dx)
-    with_, without = (prepared(device, layers, canvas, seam=s, exposure=exposure) for s in (True, False))
-    for one, other in zip(fields_of(with_), fields_of(without), strict=True):
-        np.testing.assert_array_equal(one, other)
-    gains = [[layer.gain for layer in found.layers] for found in (with_, without)]
-    if exposure:
-        for one, other in zip(*gains, strict=True):
-            assert (one is None) == (other is None)
-            assert one is None or np.array_equal(one.get(), other.get())
-    else:
-        assert gains == [[None, None]] * 2
-
-
-def test_identical_layers_have_no_regions(device: Device, monkeypatch: pytest.MonkeyPatch) -> None:
-    """They are no pair, so that nothing is measured; weights and places are the same to the bit."""
-    asked = []
-    monkeypatch.setattr(seam, "regions", lambda *a, found=seam.regions: asked.append(found(*a)) or asked[-1])
-    layers, canvas, *_ = scene("across the border", None)
-    with_, without = (prepared(device, layers, canvas, seam=s) for s in (True, False))
-    assert len(asked) == 1 and asked[0].shape == (26, 60) and not asked[0].any()
-    for one, other in zip(fields_of(with_), fields_of(without), strict=True):
-        np.testing.assert_array_equal(one, other)
-
-
-def test_weights_outside_the_regions_stay(device: Device, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The cut takes weight away only where its cells, blurred by one, reach; a trace is left."""
-    seen = {}
-
-    def remember(device, layers, fields, *rest, original=seam.cut):
-        seen["before"], seen["regions"] = [f.get() for f in fields], rest[3]
-        original(device, layers, fields, *rest)
-        seen["after"] = [f.get() for f in fields]
-
-    monkeypatch.setattr(seam, "cut", remember)
-    layers, canvas, *_ = scene("across the border", 0)
-    found = prepared(device, layers, canvas)
-    reach = ndimage.binary_dilation(np.tile(seen["regions"], 3), np.ones((3, 3)), 2)[:, 60:120]
-    reach = np.kron(reach, np.ones((8, 8), bool))
-    changed = 0
-    for layer, before, after in zip(found.layers, seen["before"], seen["after"], strict=True):
-        left, top, width, height = layer.working.box
-        there = reach[top : top + height, left : left + width]
-        assert np.array_equal(before[~there], after[~there])
-        assert np.array_equal(before[..., :3], after[..., :3])
-        assert ((after[..., 3] > 0) == (before[..., 3] > 0)).all()
-        changed += (after[..., 3] < 1e-6 * before[..., 3]).sum()
-    assert changed > np.pi * RADIUS**2

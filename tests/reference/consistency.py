@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from reference.common import Array, Numbers, bilinear, canvas_position, chart_point, grid_border, pixels
+from reference.common import Array, bilinear, pixels
 
 
 def consistency_trust(flow: Array, back: Array, grid: Sequence[int], tolerance: float) -> Array:
@@ -20,27 +20,6 @@ def consistency_trust(flow: Array, back: Array, grid: Sequence[int], tolerance: 
     away = np.linalg.norm(flow + returned / share[..., None], axis=-1)
     trust = (1 + (away / tolerance) ** 2) ** -2
     return np.dstack([flow, trust, np.zeros_like(trust)])
-
-
-def consistency_distrust(
-    trusted: Array,
-    chart: Numbers,
-    size: Sequence[int],
-    lens: Numbers,
-    border: Sequence[int],
-    regions: Array,
-    cells: Sequence[int],
-) -> Array:
-    """Trust 0 where a pixel of the chart shows a cell of the regions."""
-    columns, rows = pixels(size[0], size[1])
-    x, y = canvas_position(chart_point(columns + 0.5, rows + 0.5, chart), lens)
-    column = np.floor(x * cells[0] / border[0]).astype(int)
-    row = np.floor(y * cells[1] / border[1]).astype(int)
-    column, row, inside = grid_border(column, row, cells)
-    hit = inside & (regions[np.clip(row, 0, cells[1] - 1), np.clip(column, 0, cells[0] - 1)] != 0)
-    result = trusted.astype(np.float64)
-    result[hit, 2] = 0
-    return result
 
 
 def _around(values: Array, fine: Sequence[int]) -> Array:

@@ -6,7 +6,49 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from reference.common import Array, bilinear, pixels
+from reference.common import Array, Numbers, bilinear, exposure_shift, layer_seen, pixels
+
+
+def seam_difference(
+    layer_a: Array,
+    field_a: Array,
+    box_a: Sequence[int],
+    gain_a: Array,
+    layer_b: Array,
+    field_b: Array,
+    box_b: Sequence[int],
+    gain_b: Array,
+    border: Sequence[int],
+    lens: Numbers,
+    colours: Sequence[int],
+    cells: Sequence[int],
+    integer: int,
+) -> Array:
+    """Mean corrected difference a - b of every cell's pixels, every other one in x and y, and their share."""
+    columns, rows = pixels(border[0], border[1])
+    gain_row = (2 * np.arange(cells[1]) + 1) * colours[1] // (2 * cells[1])
+    gain_column = (2 * np.arange(cells[0]) + 1) * colours[0] // (2 * cells[0])
+    cell = [
+        np.searchsorted(np.arange(1, c + 1) * b // c, np.arange(b), "right")
+        for b, c in zip(border, cells, strict=False)
+    ]
+    looks = []
+    usable = np.ones((border[1], border[0]), bool)
+    for layer, field, box, gain in ((layer_a, field_a, box_a, gain_a), (layer_b, field_b, box_b, gain_b)):
+        seen = layer_seen(layer, field, box, columns, rows, border, lens)
+        usable &= seen[..., 3] > 0
+        here = gain[gain_row[cell[1]][:, None], gain_column[cell[0]][None], :3].astype(np.float64)
+        shifted = exposure_shift(seen[..., :3], here, integer)
+        looks.append(shifted if integer else np.sqrt(np.maximum(shifted, 0)))
+    result = np.zeros((cells[1], cells[0], 4))
+    for j, i in np.ndindex(cells[1], cells[0]):
+        left, right = (k * border[0] // cells[0] for k in (i, i + 1))
+        top, bottom = (k * border[1] // cells[1] for k in (j, j + 1))
+        part = np.s_[top:bottom:2, left:right:2]
+        values = (looks[0] - looks[1])[part][usable[part]]
+        if len(values):
+            result[j, i] = [*values.mean(0), len(values) / usable[part].size]
+    return result
 
 
 def seam_yield(
