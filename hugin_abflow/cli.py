@@ -204,6 +204,12 @@ _information = partial(click.option, cls=_Option, group="Information")
     help="Let the project's control points lead the flow where it goes astray. off: leave them aside.",
 )
 @_blending(
+    "--seam",
+    type=click.Choice(["auto", "off"]),
+    default="auto" if _DEFAULTS.seam else "off",
+    help="Take from one photo, whole, what flow cannot explain (somebody who walked). off: blend it.",
+)
+@_blending(
     "--softmax-sharpness",
     metavar="NUMBER",
     type=float,
@@ -261,6 +267,7 @@ def command(
     merge: MergeMode,
     exposure: str,
     guides: str,
+    seam: str,
     softmax_sharpness: float,
     flow_magnitude: float,
     flow_quality: FlowQuality,
@@ -290,6 +297,7 @@ def command(
         flow_quality=flow_quality,
         exposure=exposure == "auto",
         guides=guides == "auto",
+        seam=seam == "auto",
         device=device,
     )
     merge_one = partial(

@@ -7,9 +7,9 @@ borders, where they show least. This is a labelling of least energy,
 
     sum_cells r (1 - s_k)  +  sum_neighbours c (r + r') / 2 [k != k']  +  sum_borders c r
 
-with r the residual, s_k the share of the softmax and c the price of a cut, found by graph cuts (alpha expansion:
-Boykov, Veksler, Zabih, "Fast approximate energy minimization via graph cuts", 2001). Regions keep to
-themselves: elsewhere the softmax stays as it is, and the transition lies where the layers agree.
+with r the residual, s_k the share of the softmax and c the price of a cut, found by graph cuts (alpha
+expansion: Boykov, Veksler, Zabih, "Fast approximate energy minimization via graph cuts", 2001). Regions keep
+to themselves: elsewhere the softmax stays as it is, and the transition lies where the layers agree.
 """
 
 from __future__ import annotations
