@@ -2,17 +2,22 @@
 
 Combined local-global optical flow: the data term is Lucas and Kanade's windowed least squares, on
 brightness and gradient, and a smoothness term spreads it over untextured pixels and beyond the masks
-(Bruhn, Weickert, Schnoerr, "Lucas/Kanade meets Horn/Schunck", 2005). Coarse to fine with warping.
+(Bruhn, Weickert, Schnoerr, "Lucas/Kanade meets Horn/Schunck", 2005). Coarse to fine with warping; motion too
+large for that comes from search.py.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
-from hugin_abflow import pyramid
+import numpy as np
+
+from hugin_abflow import pyramid, search
 from hugin_abflow.opencl import Buffer, Device
 from hugin_abflow.pyramid import Level
+from hugin_abflow.search import SearchParameters
 
 
 @dataclass(frozen=True)
@@ -29,6 +34,10 @@ class FlowParameters:
     contrast: float = 0.3  # step of h across which smoothness falls to 1/e
     noise: float = 0.01  # amplitude of h that is no texture
     mean_sigma: float = 6.0  # px: h is log brightness less its Gaussian mean of this sigma
+    reach: float = 0.16  # of the longer side: how large a motion is searched where the caller does not say
+    overlap: float = 0.5  # of the root of the common mask's area: no larger motion is searched
+    choose_from: int = 2  # finest level (0: full) on which pixels take over flow from beside them
+    search: SearchParameters = field(default_factory=SearchParameters)
 
 
 # Changes a level's linear system, (level, left side, right side) of kernel flow_system, before it is solved.
@@ -88,7 +97,7 @@ def _refine(
         )  # fmt: skip
         device.run("flow", "flow_window", size, tensor, right, grid, left, window_right)
         device.run(
-            "flow", "flow_system", size, left, window_right, flow, flow, a.feature, grid,
+            "flow", "flow_system", size, left, window_right, flow, a.feature, grid,
             parameters.smoothness, parameters.contrast, system_left, system_right,
         )  # fmt: skip
         if pull:
@@ -114,19 +123,44 @@ def finest_features(device: Device, image: Level, parameters: FlowParameters) ->
     return _features(device, image, pyramid.reduce(device, image), parameters).feature
 
 
+def _choose(
+    device: Device, features: list[_Features], flows: list[Buffer], level: int, searched: bool,
+    reach: float, parameters: FlowParameters,
+) -> list[Buffer]:  # fmt: skip
+    """The flows with which a level starts: each pixel's own, found by search, or from beside it."""
+    grid, how = features[0].grid, parameters.search
+    descriptors = a, b = [search.descriptor(device, f.feature, grid, how) for f in features]
+    others = flows
+    if searched:
+        others = search.exhaustive(device, a, b, flows, grid, reach / 2**level, how)
+    return [
+        search.choose(device, descriptors[i], descriptors[1 - i], flow, others[i], grid, how)
+        for i, flow in enumerate(flows)
+    ]
+
+
 def pair_flow(
     device: Device,
     a: Level,
     b: Level,
     parameters: FlowParameters | None = None,
     start: Start | None = None,
+    reach: float | None = None,
 ) -> tuple[Buffer, Buffer]:
     """Flow from a to b and from b to a: two float32 (height, width, 2) in px of the grid.
 
-    a, b: log brightness with masks, 0 outside them. start: its flows are worked on, not copied.
+    a, b: log brightness with masks, 0 outside them. start: its flows are worked on, not copied, and nothing
+    else is searched. reach: the largest motion that is searched, px; if it is None, `parameters.reach` of the
+    longer side. Raises `DeviceError` if the device fails.
     """
     parameters = parameters or FlowParameters()
     count = start.level + 1 if start else levels(a, parameters)
+    searched = -1
+    if not start:
+        reach = parameters.reach * max(a.grid[:2]) if reach is None else reach
+        common = np.count_nonzero(a.mask.get() * b.mask.get())
+        reach = min(reach, parameters.overlap * math.sqrt(common))
+        searched = search.level(reach, count, parameters.search)
     pyramids = [pyramid.build(device, image, count + 1) for image in (a, b)]
     flows: list[Buffer] | None = None
     for level in reversed(range(count)):
@@ -138,6 +172,9 @@ def pair_flow(
             flows = [device.zeros((grid[1], grid[0], 2)) for _ in range(2)]
         else:
             flows = [_expand(device, flow, grid) for flow in flows]
+        # a search on a level finer than choose_from is of small motion; its choice is made there alone
+        if min(searched, parameters.choose_from) <= level <= searched:
+            flows = _choose(device, features, flows, level, level == searched, reach or 0.0, parameters)
         flows = [
             _refine(
                 device,

@@ -43,6 +43,8 @@ _log = logging.getLogger(__name__)
 _LEAST_OVERLAP = 64
 # What only one layer shows first passes for exposure in part: its region grows to its size in a few rounds.
 _SEAM_ROUNDS = 2
+# Motion that is looked for, as a share of the canvas's width.
+_REACH = 0.1
 # Below this a working canvas is too small to be worth another attempt.
 _LEAST_WORKING_PIXELS = 20_000
 
@@ -215,6 +217,7 @@ def _flows(
     ]
     overlaps = [entry for entry in overlaps if np.count_nonzero(entry[2]) >= _LEAST_OVERLAP]
     result = []
+    reach = _REACH * (grid.canvas_width or grid.region.width) * grid.width / grid.region.width
     with progress("flow", len(overlaps)) as advance:
         for a, b, overlap in overlaps:
             pair = (layers[a], layers[b])
@@ -222,7 +225,7 @@ def _flows(
             if not working.same_where_both(device, *pair):
                 its_chart = chart.pair_chart(overlap, masks.grid, grid)
                 image_a, image_b = (chart.sample(device, layer, grid, its_chart) for layer in pair)
-                found = flow.pair_flow(device, image_a, image_b, parameters)
+                found = flow.pair_flow(device, image_a, image_b, parameters, reach=reach)
                 its_guides = guides.get((min(numbers[a], numbers[b]), max(numbers[a], numbers[b])))
                 if its_guides:
                     placed = guidance.on_chart(its_guides, numbers[a], its_chart, grid)

@@ -169,8 +169,7 @@ static inline float flow_edge(__global const float2 *flow, __global const float4
    the increment), and the smoothness weights towards the east and south neighbours. */
 __kernel void flow_system(__global const float4 *tensor,  /* (grid.y, grid.x) */
                           __global const float2 *right,   /* (grid.y, grid.x) */
-                          __global const float2 *base,    /* (grid.y, grid.x) flow of this linearisation */
-                          __global const float2 *flow,    /* (grid.y, grid.x) flow that sets the smoothness */
+                          __global const float2 *flow,    /* (grid.y, grid.x) of this linearisation */
                           __global const float4 *feature, /* (grid.y, grid.x) */
                           int4 grid,                      /* run size */
                           float smoothness, float contrast,
@@ -182,7 +181,7 @@ __kernel void flow_system(__global const float4 *tensor,  /* (grid.y, grid.x) */
         return;
     const int at = y * grid.x + x;
     const float4 j = tensor[at];
-    const float2 f = base[at], r = right[at];
+    const float2 f = flow[at], r = right[at];
     left_side[at] = (float4)(j.xyz, flow_edge(flow, feature, at, (int2)(x + 1, y), grid, smoothness, contrast));
     right_side[at] = (float4)(j.x * f.x + j.y * f.y - r.x, j.y * f.x + j.z * f.y - r.y,
                               flow_edge(flow, feature, at, (int2)(x, y + 1), grid, smoothness, contrast), 0.0f);

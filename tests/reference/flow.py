@@ -108,7 +108,6 @@ def edge(
 def flow_system(
     tensor: Array,
     right: Array,
-    base: Array,
     flow: Array,
     feature: Array,
     grid: Sequence[int],
@@ -117,8 +116,8 @@ def flow_system(
 ) -> tuple[Array, Array]:
     """J11, J12, J22, weight to the east; b1, b2, weight to the south, 0."""
     matrix = tensor[..., [0, 1, 1, 2]].reshape(*tensor.shape[:2], 2, 2).astype(np.float64)
-    target = np.einsum("yxij,yxj->yxi", matrix, base.astype(np.float64)) - right
     flow = flow.astype(np.float64)
+    target = np.einsum("yxij,yxj->yxi", matrix, flow) - right
     east, south = (edge(flow, feature, grid, *d, smoothness, contrast)[..., None] for d in ((1, 0), (0, 1)))
     return np.concatenate([tensor[..., :3], east], -1), np.concatenate([target, south, 0 * south], -1)
 

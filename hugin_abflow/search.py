@@ -1,0 +1,111 @@
+"""Large motion, found by trying (kernels/search.cl).
+
+On a coarse level every displacement within reach is tried; costs and smoothness are coupled and minimised in
+turns (Steinbrücker, Pock, Cremers, "Large displacement optical flow computation without warping", 2009). What
+both directions find and nothing else rivals is kept. There and on finer levels each pixel takes over a flow
+from beside it where that fits better (Barnes et al., "PatchMatch", 2009).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from hugin_abflow.opencl import Buffer, Device
+
+Grid = tuple[int, int, int, int]
+
+
+@dataclass(frozen=True)
+class SearchParameters:
+    """How large motion is searched. Costs are misfits of descriptors, 0 to 1."""
+
+    coarse: float = 9.0  # px: displacements are tried on the finest level on which reach is at most this
+    furthest: int = 32  # px: and nothing beyond this is tried
+    noise: float = 0.05  # amplitude of h that is no texture
+    outside: float = 0.5  # cost, on the coarse level, of what the other image does not show
+    couplings: tuple[float, ...] = (0.003, 0.01, 0.03, 0.1, 0.3)  # of a squared pixel, in turns
+    tolerance: float = 2.5  # px: by how much both directions may disagree
+    distinct: float = 0.2  # how much less the one found costs than any other more than 2 px away
+    own_outside: float = 0.25  # the same for a pixel's own flow, which is not given up for want of evidence
+    other_outside: float = 0.75  # and for a flow that it may take over
+    patience: float = 0.06  # by how much a flow from elsewhere must fit better
+    radius: int = 2  # px: of the window in which two flows are compared
+    focus: float = 2.0  # e-folds by which a pixel counts less there, for a difference of 1 from the middle
+    steps: tuple[int, ...] = (16, 8, 4, 2, 1)  # px from which flow is taken over, in turns
+
+
+def descriptor(device: Device, feature: Buffer, grid: Grid, parameters: SearchParameters) -> Buffer:
+    """Descriptors float32 (height, width, 4) of features of the same shape."""
+    result = device.empty(feature.shape)
+    device.run("search", "search_descriptor", grid[:2], feature, grid, parameters.noise, result)
+    return result
+
+
+def level(reach: float, levels: int, parameters: SearchParameters) -> int:
+    """The level, of `levels`, on which displacements of up to `reach` px of the finest are tried."""
+    return min(levels - 1, max(0, math.ceil(math.log2(max(reach, 1) / parameters.coarse))))
+
+
+def exhaustive(
+    device: Device, a: Buffer, b: Buffer, flows: Sequence[Buffer], grid: Grid, largest: float,
+    parameters: SearchParameters,
+) -> list[Buffer]:  # fmt: skip
+    """Both directions' flow: what is found within `largest` px and beyond doubt, elsewhere `flows`.
+
+    a, b: descriptors; flows, from a to b and from b to a, and the result: float32 (height, width, 2), px.
+    """
+    size, limit = grid[:2], min(math.ceil(largest), parameters.furthest)
+    reach = min(limit, size[0] // 2), min(limit, size[1] // 2)
+    count = (2 * reach[0] + 1) * (2 * reach[1] + 1)
+    cost = device.empty((count, size[1], size[0]))
+    device.run(
+        "search", "search_cost", (size[0], size[1] * count), a, b, grid, reach, parameters.outside, cost
+    )
+    found = [_coupled(device, cost, grid, reach, way, parameters) for way in (0, 1)]
+    agreed = [device.empty(flow.shape) for flow in flows]
+    for way, out in enumerate(agreed):
+        device.run(
+            "search", "search_agree", size, cost, found[way], found[1 - way], flows[way], grid, reach, way,
+            parameters.tolerance, parameters.distinct, out,
+        )  # fmt: skip
+    return agreed
+
+
+def _coupled(
+    device: Device, cost: Buffer, grid: Grid, reach: tuple[int, int], backward: int,
+    parameters: SearchParameters,
+) -> Buffer:  # fmt: skip
+    """The displacements of least cost, less and less free to differ from their smoothed selves."""
+    size = grid[:2]
+    smooth, best, median = (device.zeros((size[1], size[0], 2)) for _ in range(3))
+    for turn, coupling in enumerate((0.0, *parameters.couplings)):
+        if turn:
+            for _ in range(2):
+                device.run("flow", "flow_median", size, best, grid, median)
+                best, median = median, best
+            device.run("search", "search_mean", size, best, grid, smooth)
+        device.run(
+            "search", "search_best", size, cost, smooth, grid, reach, parameters.outside, coupling, backward,
+            best,
+        )  # fmt: skip
+    return best
+
+
+def choose(
+    device: Device, a: Buffer, b: Buffer, flow: Buffer, other: Buffer, grid: Grid,
+    parameters: SearchParameters,
+) -> Buffer:  # fmt: skip
+    """`flow` from a to b, with flow from beside or of `other` where that fits better.
+
+    a, b: descriptors; flows float32 (height, width, 2), px.
+    """
+    for step in parameters.steps:
+        chosen = device.empty(flow.shape)
+        device.run(
+            "search", "search_choose", grid[:2], a, b, flow, other, grid, step, parameters.radius,
+            parameters.focus, (parameters.own_outside, parameters.other_outside), parameters.patience, chosen,
+        )  # fmt: skip
+        flow = other = chosen
+    return flow

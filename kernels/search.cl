@@ -1,0 +1,244 @@
+/* Large motion: every displacement within reach is tried on a coarse level (after Steinbrücker, Pock, Cremers
+   2009: costs and smoothness are coupled by a quadratic term and minimised in turns); there and on finer levels
+   each pixel takes over a flow from beside it where that fits better (after Barnes et al. 2009).
+
+   A descriptor is (h, dh/dx, dh/dy, valid), divided by how strongly its neighbourhood varies: the same in bright
+   and dark, sharp and dull places. Flow is in pixels of the level's grid; grid = (width, height, wraps, 0).
+   A displacement has the index (d.y + reach.y) * (2 reach.x + 1) + d.x + reach.x. */
+
+#define SEARCH_SLOPE 1.5f /* weight of the derivatives beside h */
+
+/* Features over the root of their mean square in 7 x 7 pixels. */
+__kernel void search_descriptor(__global const float4 *feature, /* (grid.y, grid.x) kernels/flow.cl */
+                                int4 grid,                      /* run size */
+                                float noise,                    /* amplitude of h that is no texture */
+                                __global float4 *descriptor)    /* (grid.y, grid.x) */
+{
+    const int x = get_global_id(0), y = get_global_id(1);
+    if (x >= grid.x || y >= grid.y)
+        return;
+    float energy = 0.0f, weight = 0.0f;
+    for (int j = -3; j <= 3; ++j)
+        for (int i = -3; i <= 3; ++i) {
+            int2 p = (int2)(x + i, y + j);
+            if (!grid_border(&p, grid))
+                continue;
+            const float4 f = feature[p.y * grid.x + p.x];
+            energy += f.w * (f.x * f.x + SEARCH_SLOPE * SEARCH_SLOPE * (f.y * f.y + f.z * f.z));
+            weight += f.w;
+        }
+    const float4 f = feature[y * grid.x + x];
+    const float scale = 1.0f / (sqrt(energy / fmax(weight, 1.0f)) + noise);
+    descriptor[y * grid.x + x] = (float4)(f.x * scale, SEARCH_SLOPE * scale * f.yz, f.w);
+}
+
+/* How badly two descriptors fit, 0..1; `outside` where one is not known. */
+static inline float search_misfit(float4 a, float4 b, float outside) {
+    const float3 d = a.xyz - b.xyz;
+    const float e = dot(d, d);
+    return a.w * b.w > 0.0f ? e / (e + 0.5f) : outside;
+}
+
+/* Mean misfit of 3 x 3 pixels under each displacement. */
+__kernel void search_cost(__global const float4 *a, /* (grid.y, grid.x) descriptors */
+                          __global const float4 *b, /* (grid.y, grid.x) of the other image */
+                          int4 grid,                /* run size: (grid.x, grid.y x displacements) */
+                          int2 reach,               /* largest displacement, px */
+                          float outside,            /* misfit where one of both is not known */
+                          __global float *cost)     /* (displacements, grid.y, grid.x) */
+{
+    const int x = get_global_id(0), row = get_global_id(1);
+    const int index = row / grid.y, y = row - index * grid.y, span = 2 * reach.x + 1;
+    if (x >= grid.x || index >= span * (2 * reach.y + 1))
+        return;
+    const int2 d = (int2)(index % span, index / span) - reach;
+    float sum = 0.0f, weight = 0.0f;
+    for (int j = -1; j <= 1; ++j)
+        for (int i = -1; i <= 1; ++i) {
+            int2 p = (int2)(x + i, y + j), q = p + d;
+            if (!grid_border(&p, grid) || a[p.y * grid.x + p.x].w == 0.0f)
+                continue;
+            sum += grid_border(&q, grid) ? search_misfit(a[p.y * grid.x + p.x], b[q.y * grid.x + q.x], outside)
+                                         : outside;
+            weight += 1.0f;
+        }
+    cost[row * grid.x + x] = weight > 0.0f ? sum / weight : outside;
+}
+
+/* Index in `cost` of displacement d from a to b at pixel p, or from b to a if `backward`; -1 beyond the grid. */
+static inline int search_index(int2 p, int2 d, int4 grid, int2 reach, int backward) {
+    if (backward) { /* what b shows at q, a shows at q + d: the cost of -d there */
+        p += d;
+        d = -d;
+        if (!grid_border(&p, grid))
+            return -1;
+    }
+    return (((d.y + reach.y) * (2 * reach.x + 1) + d.x + reach.x) * grid.y + p.y) * grid.x + p.x;
+}
+
+/* The displacement that costs least, with what it is away from `flow`. */
+__kernel void search_best(__global const float *cost,  /* (displacements, grid.y, grid.x) from a to b */
+                          __global const float2 *flow, /* (grid.y, grid.x) px */
+                          int4 grid,                   /* run size */
+                          int2 reach,                  /* px */
+                          float outside,               /* cost of what lies beyond the grid */
+                          float coupling,              /* cost of a squared pixel away from flow */
+                          int backward,                /* 1: flow from b to a */
+                          __global float2 *best)       /* (grid.y, grid.x) px */
+{
+    const int x = get_global_id(0), y = get_global_id(1);
+    if (x >= grid.x || y >= grid.y)
+        return;
+    const float2 near = flow[y * grid.x + x];
+    float least = INFINITY;
+    float2 found = near;
+    for (int v = -reach.y; v <= reach.y; ++v)
+        for (int u = -reach.x; u <= reach.x; ++u) {
+            const float2 away = (float2)(u, v) - near;
+            const int index = search_index((int2)(x, y), (int2)(u, v), grid, reach, backward);
+            const float own = index >= 0 ? cost[index] : outside;
+            const float total = own + coupling * dot(away, away);
+            if (total < least) {
+                least = total;
+                found = (float2)(u, v);
+            }
+        }
+    best[y * grid.x + x] = found;
+}
+
+/* Mean of 3 x 3 pixels. */
+__kernel void search_mean(__global const float2 *flow, /* (grid.y, grid.x) */
+                          int4 grid,                   /* run size */
+                          __global float2 *mean)       /* (grid.y, grid.x) */
+{
+    const int x = get_global_id(0), y = get_global_id(1);
+    if (x >= grid.x || y >= grid.y)
+        return;
+    float2 sum = (float2)(0.0f);
+    float weight = 0.0f;
+    for (int j = -1; j <= 1; ++j)
+        for (int i = -1; i <= 1; ++i) {
+            int2 p = (int2)(x + i, y + j);
+            if (!grid_border(&p, grid))
+                continue;
+            sum += flow[p.y * grid.x + p.x];
+            weight += 1.0f;
+        }
+    mean[y * grid.x + x] = sum / weight;
+}
+
+/* What was found, where the other direction found the same and nothing else, more than 2 px away, fits nearly as
+   well (on what repeats); elsewhere what was there before. */
+__kernel void search_agree(__global const float *cost,   /* (displacements, grid.y, grid.x) from a to b */
+                           __global const float2 *found, /* (grid.y, grid.x) px, whole numbers within reach */
+                           __global const float2 *back,  /* (grid.y, grid.x) px, of the other direction, likewise */
+                           __global const float2 *flow,  /* (grid.y, grid.x) px */
+                           int4 grid,                    /* run size */
+                           int2 reach,                   /* px */
+                           int backward,                 /* 1: flow from b to a */
+                           float tolerance,              /* px */
+                           float distinct,               /* how much more any other displacement costs */
+                           __global float2 *agreed)      /* (grid.y, grid.x) px */
+{
+    const int x = get_global_id(0), y = get_global_id(1);
+    if (x >= grid.x || y >= grid.y)
+        return;
+    const int at = y * grid.x + x;
+    const int2 d = convert_int2(found[at]);
+    agreed[at] = flow[at];
+    int2 p = (int2)(x, y) + d;
+    if (!grid_border(&p, grid))
+        return;
+    const float2 away = found[at] + back[p.y * grid.x + p.x];
+    if (dot(away, away) > tolerance * tolerance)
+        return;
+    const float limit = cost[search_index((int2)(x, y), d, grid, reach, backward)] + distinct;
+    for (int v = -reach.y; v <= reach.y; ++v)
+        for (int u = -reach.x; u <= reach.x; ++u) {
+            if (max(abs(u - d.x), abs(v - d.y)) <= 2)
+                continue;
+            const int index = search_index((int2)(x, y), (int2)(u, v), grid, reach, backward);
+            if (index >= 0 && cost[index] < limit)
+                return;
+        }
+    agreed[at] = found[at];
+}
+
+/* Descriptor at a position between pixels, by its four neighbours; w is 0 unless all that count are known. */
+static inline float4 search_sample(__global const float4 *b, int2 corner, float2 t, int4 grid) {
+    float4 sum = (float4)(0.0f);
+    for (int j = 0; j < 2; ++j)
+        for (int i = 0; i < 2; ++i) {
+            int2 p = corner + (int2)(i, j);
+            if (grid_border(&p, grid))
+                sum += (i ? t.x : 1.0f - t.x) * (j ? t.y : 1.0f - t.y) * b[p.y * grid.x + p.x];
+        }
+    return sum.w > 0.999f ? sum : (float4)(0.0f);
+}
+
+/* Mean misfit of a window under one flow; pixels that look like the middle count most. */
+static inline float search_window(__global const float4 *a, __global const float4 *b, int2 at, float2 f, int4 grid,
+                                  int radius, float focus, float outside) {
+    const float2 base = floor(f), t = f - base;
+    const int2 shift = convert_int2(base);
+    const float4 middle = a[at.y * grid.x + at.x];
+    float sum = 0.0f, weight = 0.0f;
+    for (int j = -radius; j <= radius; ++j)
+        for (int i = -radius; i <= radius; ++i) {
+            int2 p = at + (int2)(i, j);
+            const int2 to = p + shift;
+            if (!grid_border(&p, grid))
+                continue;
+            const float4 own = a[p.y * grid.x + p.x];
+            if (own.w == 0.0f)
+                continue;
+            const float w = exp(-focus * fabs(own.x - middle.x));
+            sum += w * search_misfit(own, search_sample(b, to, t, grid), outside);
+            weight += w;
+        }
+    return weight > 0.0f ? sum / weight : 0.0f;
+}
+
+/* Each pixel keeps its flow, or takes over the other field's or one from `step` px beside it in either field, if
+   it fits better by more than `patience`. */
+__kernel void search_choose(__global const float4 *a,     /* (grid.y, grid.x) descriptors */
+                            __global const float4 *b,     /* (grid.y, grid.x) of the other image */
+                            __global const float2 *flow,  /* (grid.y, grid.x) px */
+                            __global const float2 *other, /* (grid.y, grid.x) px; may be flow itself */
+                            int4 grid,                    /* run size */
+                            int step,                     /* px */
+                            int radius,                   /* px, of the window compared */
+                            float focus,                  /* e-folds for a difference of 1 from the middle */
+                            float2 outside,               /* misfit where not known: own flow, another */
+                            float patience,               /* by how much another must fit better */
+                           
+                            __global float2 *chosen)      /* (grid.y, grid.x) px */
+{
+    const int x = get_global_id(0), y = get_global_id(1);
+    if (x >= grid.x || y >= grid.y)
+        return;
+    const int at = y * grid.x + x;
+    const float2 own = flow[at];
+    float2 best = own;
+    if (a[at].w > 0.0f) {
+        float least = -1.0f;
+        const int2 beside[5] = {(int2)(0, 0), (int2)(-1, 0), (int2)(1, 0), (int2)(0, -1), (int2)(0, 1)};
+        for (int k = 0; k < 10; ++k) {
+            int2 p = (int2)(x, y) + step * beside[k % 5];
+            if (!grid_border(&p, grid))
+                continue;
+            const float2 f = k < 5 ? flow[p.y * grid.x + p.x] : other[p.y * grid.x + p.x];
+            const float2 from_own = f - own, from_best = f - best;
+            if (dot(from_own, from_own) < 0.25f || dot(from_best, from_best) < 0.25f)
+                continue;
+            if (least < 0.0f) /* nothing is calculated where all agree */
+                least = search_window(a, b, (int2)(x, y), own, grid, radius, focus, outside.x) - patience;
+            const float cost = search_window(a, b, (int2)(x, y), f, grid, radius, focus, outside.y);
+            if (cost < least) {
+                least = cost;
+                best = f;
+            }
+        }
+    }
+    chosen[at] = best;
+}

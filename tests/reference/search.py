@@ -1,0 +1,131 @@
+"""Twins of kernels/search.cl. A descriptor is (h, dh/dx, dh/dy, valid); grid = (width, height, wraps, 0)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from reference.common import Array, bilinear, on_grid, pixels
+
+SLOPE = 1.5  # weight of the derivatives
+
+
+def windows(values: Array, grid: Sequence[int], radius: int) -> Array:
+    """(taps, height, width, ...): every pixel's square neighbourhood, 0 beyond the border."""
+    x, y = pixels(grid[0], grid[1])
+    span = range(-radius, radius + 1)
+    return np.stack([on_grid(values, grid, x + dx, y + dy)[0] for dy in span for dx in span])
+
+
+def displacements(reach: Sequence[int]) -> list[tuple[int, int]]:
+    """All (x, y) within reach, in the order of the cost array."""
+    return [(u, v) for v in range(-reach[1], reach[1] + 1) for u in range(-reach[0], reach[0] + 1)]
+
+
+def search_descriptor(feature: Array, grid: Sequence[int], noise: float) -> Array:
+    """Feature over the root of its mean energy in 7 x 7 pixels."""
+    scaled = feature * np.array([1, SLOPE, SLOPE, 1.0])
+    energy = (scaled[..., :3] ** 2).sum(-1) * feature[..., 3]
+    around = windows(np.stack([energy, feature[..., 3]], -1), grid, 3).sum(0)
+    strength = np.sqrt(around[..., 0] / np.maximum(around[..., 1], 1)) + noise
+    return np.concatenate([scaled[..., :3] / strength[..., None], feature[..., 3:]], -1)
+
+
+def misfit(a: Array, b: Array, outside: float) -> Array:
+    """0 where descriptors are equal, 1 where they are far apart; `outside` where one is missing."""
+    away = ((a[..., :3].astype(np.float64) - b[..., :3]) ** 2).sum(-1)
+    return np.where(a[..., 3] * b[..., 3] > 0, away / (away + 0.5), outside)
+
+
+def search_cost(a: Array, b: Array, grid: Sequence[int], reach: Sequence[int], outside: float) -> Array:
+    """(displacements, height, width): mean misfit over the valid of 3 x 3 pixels."""
+    x, y = pixels(grid[0], grid[1])
+    result = []
+    for u, v in displacements(reach):
+        there, _ = on_grid(b, grid, x + u, y + v)
+        known = (a[..., 3] > 0).astype(np.float64)
+        around = windows(np.stack([misfit(a, there, outside) * known, known], -1), grid, 1).sum(0)
+        mean = around[..., 0] / np.maximum(around[..., 1], 1)
+        result.append(np.where(around[..., 1] > 0, mean, outside))
+    return np.stack(result)
+
+
+def directed(cost: Array, grid: Sequence[int], reach: Sequence[int], outside: float, backward: int) -> Array:
+    """The costs of one direction; from b to a, what lies beyond the grid costs `outside`."""
+    if not backward:
+        return cost.astype(np.float64)
+    x, y = pixels(grid[0], grid[1])
+    result = []
+    for index, (u, v) in enumerate(displacements(reach)):
+        there, inside = on_grid(cost[len(cost) - 1 - index], grid, x + u, y + v)
+        result.append(np.where(inside, there, outside))
+    return np.stack(result)
+
+
+def search_best(
+    cost: Array, flow: Array, grid: Sequence[int], reach: Sequence[int], outside: float, coupling: float,
+    backward: int,
+) -> Array:  # fmt: skip
+    """The displacement of least cost and squared distance from flow."""
+    tried = np.array(displacements(reach), np.float64)
+    away = ((tried[:, None, None] - flow.astype(np.float64)) ** 2).sum(-1)
+    return tried[(directed(cost, grid, reach, outside, backward) + coupling * away).argmin(0)]
+
+
+def search_mean(flow: Array, grid: Sequence[int]) -> Array:
+    """Mean of those of 3 x 3 pixels that exist."""
+    return windows(flow, grid, 1).sum(0) / windows(np.ones(flow.shape), grid, 1).sum(0)
+
+
+def search_agree(
+    cost: Array, found: Array, back: Array, flow: Array, grid: Sequence[int], reach: Sequence[int],
+    backward: int, tolerance: float, distinct: float,
+) -> Array:  # fmt: skip
+    """`found` where `back` is its opposite and no other displacement rivals it, else `flow`."""
+    x, y = pixels(grid[0], grid[1])
+    whole = found.astype(int)
+    answer, inside = on_grid(back, grid, x + whole[..., 0], y + whole[..., 1])
+    agrees = inside & (np.linalg.norm(found + answer, axis=-1) <= tolerance)
+    every = directed(cost, grid, reach, np.inf, backward)
+    index = (whole[..., 1] + reach[1]) * (2 * reach[0] + 1) + whole[..., 0] + reach[0]
+    own = np.take_along_axis(every, index[None], 0)[0]
+    far = np.abs(np.array(displacements(reach))[:, None, None] - whole).max(-1) > 2
+    rival = np.where(far, every, np.inf).min(0)
+    return np.where((agrees & (rival >= own + distinct))[..., None], found, flow)
+
+
+def window_misfit(
+    a: Array, b: Array, flow: Array, grid: Sequence[int], radius: int, focus: float, outside: float
+) -> Array:
+    """Mean misfit of each pixel's window under its flow; what differs from the middle counts less."""
+    x, y = pixels(grid[0], grid[1])
+    flow = flow.astype(np.float64)
+    total, weight = np.zeros(x.shape), np.zeros(x.shape)
+    for dy in range(-radius, radius + 1):
+        for dx in range(-radius, radius + 1):
+            own, _ = on_grid(a, grid, x + dx, y + dy)
+            there, _ = bilinear(b, grid, x + dx + 0.5 + flow[..., 0], y + dy + 0.5 + flow[..., 1])
+            there = np.where(there[..., 3:] > 0.999, there, 0)
+            w = np.exp(-focus * np.abs(own[..., 0] - a[..., 0])) * (own[..., 3] > 0)
+            total += w * misfit(own, there, outside)
+            weight += w
+    return np.where(weight > 0, total / np.where(weight > 0, weight, 1), 0)
+
+
+def search_choose(
+    a: Array, b: Array, flow: Array, other: Array, grid: Sequence[int], step: int, radius: int, focus: float,
+    outside: Sequence[float], patience: float,
+) -> Array:  # fmt: skip
+    """Own flow, or the best of ten from here and `step` px beside that fits better by `patience`."""
+    x, y = pixels(grid[0], grid[1])
+    own, best = flow.astype(np.float64), flow.astype(np.float64)
+    least = window_misfit(a, b, own, grid, radius, focus, outside[0]) - patience
+    for field in (flow, other):
+        for dx, dy in ((0, 0), (-1, 0), (1, 0), (0, -1), (0, 1)):
+            there, inside = on_grid(field, grid, x + step * dx, y + step * dy)
+            differs = (((there - own) ** 2).sum(-1) >= 0.25) & (((there - best) ** 2).sum(-1) >= 0.25)
+            cost = window_misfit(a, b, there, grid, radius, focus, outside[1])
+            better = inside & differs & (a[..., 3] > 0) & (cost < least)
+            best, least = np.where(better[..., None], there, best), np.where(better, cost, least)
+    return best

@@ -1,0 +1,250 @@
+"""The search's kernels against twins, twins against brute force, and large motions whose truth is known."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from grids import patches
+from reference import common
+from reference import search as twin
+from scipy import ndimage
+from tolerances import DECISIONS, SUM, TRIGONOMETRY, assert_close
+
+from hugin_abflow import flow, search
+from hugin_abflow.opencl import Device
+from hugin_abflow.pyramid import Level
+
+GRIDS = {"plane": (37, 23, 0, 0), "cylinder": (38, 23, 1, 0), "odd cylinder": (37, 23, 1, 0)}
+REACH = (4, 3)
+
+
+def noise(seed: int, grid: tuple[int, int, int, int], channels: int, sigma: float) -> np.ndarray:
+    values = np.random.default_rng(seed).normal(size=(grid[1], grid[0], channels))
+    values = ndimage.gaussian_filter(values, (sigma, sigma, 0), mode=["nearest", "wrap", "nearest"])
+    return (values / values.std()).astype(np.float32)
+
+
+def descriptors(seed: int, grid: tuple[int, int, int, int]) -> tuple[np.ndarray, np.ndarray]:
+    """b is a, moved by (2, -1) and a little changed; each has a ragged mask of its own."""
+    a = noise(seed, grid, 4, 1.0)
+    b = np.roll(a, (-1, 2), (0, 1)) + 0.2 * noise(seed + 1, grid, 4, 1.0)
+    for index, image in enumerate((a, b)):
+        image[..., 3] = 1
+        image *= patches(seed + 2 + index, grid[0], grid[1], 0.85, 6)[..., None]
+    return a, b
+
+
+def run(device: Device, name: str, grid: tuple[int, int, int, int], *arguments: object, channels: int = 2):
+    """One output over the grid; arrays among the arguments are uploaded."""
+    sent = [device.upload(v.astype(np.float32)) if isinstance(v, np.ndarray) else v for v in arguments]
+    out = device.empty((grid[1], grid[0], channels))
+    device.run("search", name, grid[:2], *sent, out)
+    return out.get()
+
+
+def costs(device: Device, a: np.ndarray, b: np.ndarray, grid: tuple[int, int, int, int]) -> np.ndarray:
+    count = (2 * REACH[0] + 1) * (2 * REACH[1] + 1)
+    out = device.empty((count, grid[1], grid[0]))
+    size = (grid[0], grid[1] * count)
+    device.run("search", "search_cost", size, device.upload(a), device.upload(b), grid, REACH, 0.5, out)
+    return out.get()
+
+
+@pytest.mark.parametrize("name", list(GRIDS))
+def test_descriptor_equals_its_twin(device: Device, name: str) -> None:
+    grid = GRIDS[name]
+    feature, _ = descriptors(1, grid)
+    found = run(device, "search_descriptor", grid, feature, grid, 0.05, channels=4)
+    assert_close(found, twin.search_descriptor(feature, grid, 0.05), TRIGONOMETRY)
+
+
+def test_descriptor_is_blind_to_contrast(device: Device) -> None:
+    """But for the noise floor."""
+    grid = GRIDS["plane"]
+    feature, _ = descriptors(3, grid)
+    strong = feature * np.float32([5, 5, 5, 1])
+    both = [run(device, "search_descriptor", grid, f, grid, 0.0, channels=4) for f in (feature, strong)]
+    assert_close(both[0], both[1], TRIGONOMETRY)
+
+
+@pytest.mark.parametrize("name", list(GRIDS))
+def test_cost_equals_its_twin(device: Device, name: str) -> None:
+    grid = GRIDS[name]
+    a, b = descriptors(5, grid)
+    assert_close(costs(device, a, b, grid), twin.search_cost(a, b, grid, REACH, 0.5), SUM)
+
+
+def test_twin_of_cost_by_hand() -> None:
+    grid = GRIDS["plane"]
+    a, b = descriptors(7, grid)
+    cost = twin.search_cost(a, b, grid, REACH, 0.5)
+    for y, x, u, v in ((10, 12, 2, -1), (0, 0, -4, -3), (22, 36, 4, 3)):
+        seen = []
+        for q, p in np.ndindex(3, 3):
+            at, to = (y + q - 1, x + p - 1), (y + q - 1 + v, x + p - 1 + u)
+            if 0 <= at[0] < 23 and 0 <= at[1] < 37 and a[at][3]:
+                inside = 0 <= to[0] < 23 and 0 <= to[1] < 37 and b[to][3] > 0
+                e = float(((a[at][:3].astype(float) - b[to][:3]) ** 2).sum()) if inside else 0.0
+                seen.append(e / (e + 0.5) if inside else 0.5)
+        assert cost[(v + 3) * 9 + u + 4, y, x] == pytest.approx(np.mean(seen) if seen else 0.5)
+
+
+@pytest.mark.parametrize("name", list(GRIDS))
+@pytest.mark.parametrize("backward", [0, 1])
+@pytest.mark.parametrize("coupling", [0.0, 0.03])
+def test_best_equals_its_twin(device: Device, name: str, backward: int, coupling: float) -> None:
+    grid = GRIDS[name]
+    cost = twin.search_cost(*descriptors(9, grid), grid, REACH, 0.5).astype(np.float32)
+    near = 2 * noise(13, grid, 2, 3)
+    best = run(device, "search_best", grid, cost, near, grid, REACH, 0.5, coupling, backward)
+    expected = twin.search_best(cost, near, grid, REACH, 0.5, coupling, backward)
+    assert_close(best, expected, 0, DECISIONS)
+    true = np.array([2, -1]) * (1 - 2 * backward)
+    assert (best == true).all(-1).mean() > 0.3
+
+
+def test_backward_costs_are_those_of_the_exchanged_images() -> None:
+    """One array serves both directions, where masks are whole and nothing leaves the grid."""
+    grid = (38, 23, 1, 0)
+    a, b = (noise(seed, grid, 4, 1.0) for seed in (15, 16))
+    a[..., 3] = b[..., 3] = 1
+    forward = twin.search_cost(a, b, grid, REACH, 0.5)
+    backward = twin.directed(forward, grid, REACH, 0.5, 1)
+    assert np.allclose(backward[:, 5:-5], twin.search_cost(b, a, grid, REACH, 0.5)[:, 5:-5])
+
+
+@pytest.mark.parametrize("name", list(GRIDS))
+def test_mean_equals_its_twin_and_scipys(device: Device, name: str) -> None:
+    grid = GRIDS[name]
+    values = noise(17, grid, 2, 1)
+    expected = twin.search_mean(values, grid)
+    assert_close(run(device, "search_mean", grid, values, grid), expected, SUM)
+    plain = ndimage.uniform_filter(values.astype(np.float64), (3, 3, 0), mode="wrap")
+    assert np.allclose(expected[1:-1, 1:-1], plain[1:-1, 1:-1])
+    assert np.allclose(expected[0, 0], values[np.ix_([0, 1], [-1, 0, 1] if grid[2] else [0, 1])].mean((0, 1)))
+
+
+@pytest.mark.parametrize("name", list(GRIDS))
+@pytest.mark.parametrize("backward", [0, 1])
+def test_agree_equals_its_twin(device: Device, name: str, backward: int) -> None:
+    grid = GRIDS[name]
+    cost = twin.search_cost(*descriptors(19, grid), grid, REACH, 0.5).astype(np.float32)
+    zero = np.zeros((grid[1], grid[0], 2))
+    ways = [twin.search_best(cost, zero, grid, REACH, 0.5, 0.0, way) for way in (0, 1)]
+    before = noise(23, grid, 2, 2)
+    arguments = (cost, ways[backward], ways[1 - backward], before, grid, REACH, backward, 1.5, 0.05)
+    expected = twin.search_agree(*arguments)
+    kept = (expected == ways[backward]).all(-1).mean()
+    assert 0.2 < kept < 0.9
+    assert_close(run(device, "search_agree", grid, *arguments), expected, 1e-6, DECISIONS)
+
+
+def test_agree_refuses_what_repeats(device: Device) -> None:
+    """A pattern that repeats within reach says nothing: the flow before stays."""
+    grid = (40, 24, 1, 0)
+    x, y = common.pixels(40, 24)
+    waves = [np.sin(2 * np.pi * (x + shift) / 4) * np.cos(y / 2.0) for shift in (0, 1, 2)]
+    image = np.stack([*waves, np.ones(x.shape)], -1).astype(np.float32)
+    cost = twin.search_cost(image, image, grid, REACH, 0.5)
+    zero, before = np.zeros((24, 40, 2)), np.full((24, 40, 2), 0.25, np.float32)
+    arguments = (cost, zero, zero, before, grid, REACH, 0, 1.5, 0.05)
+    assert np.array_equal(run(device, "search_agree", grid, *arguments), before)
+
+
+@pytest.mark.parametrize("name", list(GRIDS))
+@pytest.mark.parametrize("step", [1, 4])
+def test_choose_equals_its_twin(device: Device, name: str, step: int) -> None:
+    grid = GRIDS[name]
+    a, b = descriptors(25, grid)
+    own = np.array([2, -1]) + 3 * noise(29, grid, 2, 2)
+    other = np.array([2, -1]) + 1.5 * noise(31, grid, 2, 2)
+    arguments = (a, b, own, other, grid, step, 2, 2.0, (0.25, 0.75), 0.06)
+    expected = twin.search_choose(*arguments)
+    assert 0.2 < (expected != own).any(-1).mean() < 0.95
+    assert_close(run(device, "search_choose", grid, *arguments), expected, 1e-6, 5 * DECISIONS)
+
+
+def test_twin_of_window_by_hand() -> None:
+    """One pixel's window under a whole displacement, and under half a pixel."""
+    grid = GRIDS["plane"]
+    a, b = descriptors(33, grid)
+    a[..., 3] = b[..., 3] = 1
+    for f in ((2.0, -1.0), (0.5, 1.0)):
+        total = weight = 0.0
+        for dy, dx in np.ndindex(5, 5):
+            own = a[10 + dy - 2, 15 + dx - 2].astype(float)
+            row = b[10 + dy - 2 + int(f[1])].astype(float)
+            left = 15 + dx - 2 + int(f[0])
+            there = (1 - f[0] % 1) * row[left] + (f[0] % 1) * row[left + 1]
+            e = float(((own - there)[:3] ** 2).sum())
+            w = np.exp(-2 * abs(own[0] - float(a[10, 15, 0])))
+            total, weight = total + w * e / (e + 0.5), weight + w
+        found = twin.window_misfit(a, b, np.full((23, 37, 2), f), grid, 2, 2.0, 0.5)
+        assert found[10, 15] == pytest.approx(total / weight)
+
+
+def texture(seed: int, width: int, height: int) -> np.ndarray:
+    """Brightness 0.1 to 1 with detail of all scales."""
+    random = np.random.default_rng(seed)
+    total = sum(
+        ndimage.gaussian_filter(random.normal(size=(height, width)), sigma) * sigma for sigma in (1.5, 4, 10)
+    )
+    return 0.55 + 0.45 * np.tanh(total / (1.5 * total.std()))
+
+
+def on_device(device: Device, brightness: np.ndarray, mask: np.ndarray) -> Level:
+    image = np.log(brightness + 0.05) * mask
+    return Level(device.upload(image.astype(np.float32)), device.upload(mask.astype(np.float32)), False)
+
+
+@pytest.mark.parametrize("by", [(37, 0), (-37, 6), (4, 30)])
+def test_motion_of_a_tenth_of_the_width_is_found(device: Device, by: tuple[int, int]) -> None:
+    """In both directions, where the other image shows it."""
+    wide, whole = texture(35, 500, 340), np.ones((217, 371))
+    a = wide[60:277, 60:431]
+    b = wide[60 - by[1] : 277 - by[1], 60 - by[0] : 431 - by[0]]
+    ways = flow.pair_flow(device, on_device(device, a, whole), on_device(device, b, whole))
+    y, x = np.mgrid[0:217, 0:371]
+    for field, way in zip(ways, (by, (-by[0], -by[1])), strict=True):
+        inside = (x + way[0] >= 2) & (x + way[0] < 369) & (y + way[1] >= 2) & (y + way[1] < 215)
+        error = np.linalg.norm(field.get() - np.array(way), axis=-1)[inside]
+        assert np.median(error) < 0.05
+        assert (error < 1).mean() > 0.97
+
+
+def test_a_small_thing_that_moves_far_is_found(device: Device) -> None:
+    """A board of 40 x 60 px moves by 33 px in front of a wall that stands."""
+    wall, board = texture(37, 371, 217), 1.05 - texture(38, 371, 217)
+    y, x = np.mgrid[0:217, 0:371]
+
+    def view(shift: int) -> tuple[np.ndarray, np.ndarray]:
+        there = (np.abs(x - shift - 160) < 20) & (np.abs(y - 100) < 30)
+        return np.where(there, np.roll(board, shift, 1), wall), there
+
+    (a, in_a), (b, _) = view(0), view(33)
+    whole = np.ones(a.shape)
+    forward, _ = flow.pair_flow(device, on_device(device, a, whole), on_device(device, b, whole))
+    error = np.linalg.norm(forward.get() - np.where(in_a[..., None], (33, 0), (0, 0)), axis=-1)
+    assert (error[ndimage.binary_erosion(in_a, iterations=6)] < 1).mean() > 0.9
+    still = ~ndimage.binary_dilation(in_a, iterations=6) & ~ndimage.binary_dilation(
+        np.roll(in_a, 33, 1), iterations=6
+    )
+    assert (error[still] < 0.5).mean() > 0.97
+
+
+def test_a_narrow_overlap_shows_all_of_its_motion(device: Device) -> None:
+    """17 px wide, moved by 4.5 px across: the whole of it, not a part."""
+    wide = ndimage.zoom(texture(39, 40, 160), 2, order=3)  # smooth enough to move by halves: 80 x 320
+    y, x = np.mgrid[0:300, 0:49].astype(np.float64)
+    a, b = (ndimage.map_coordinates(wide, [y + 8, x + 12 + shift], order=3) for shift in (0.0, 4.5))
+    left, right = (x < 33).astype(np.float64), (x >= 16).astype(np.float64)
+    forward, backward = flow.pair_flow(device, on_device(device, a, left), on_device(device, b, right))
+    seen = (x >= 21) & (x < 33)  # what a shows there, b shows too
+    assert np.median(forward.get()[seen][:, 0]) == pytest.approx(-4.5, abs=0.15)
+    assert np.median(backward.get()[(x >= 16) & (x < 28)][:, 0]) == pytest.approx(4.5, abs=0.15)
+
+
+def test_level_of_the_search() -> None:
+    how = search.SearchParameters(coarse=9.0)
+    assert [search.level(reach, 6, how) for reach in (0, 9, 9.1, 18, 70, 200)] == [0, 0, 1, 1, 3, 5]
+    assert search.level(200, 3, how) == 2
