@@ -151,7 +151,8 @@ def pair_flow(
 
     a, b: log brightness with masks, 0 outside them. start: its flows are worked on, not copied, and nothing
     else is searched. reach: the largest motion that is searched, px; if it is None, `parameters.reach` of the
-    longer side. Raises `DeviceError` if the device fails.
+    longer side. It is less where the masks overlap little: in a small corner of a floor of tiles every tile
+    fits. Raises `DeviceError` if the device fails.
     """
     parameters = parameters or FlowParameters()
     count = start.level + 1 if start else levels(a, parameters)
@@ -172,7 +173,7 @@ def pair_flow(
             flows = [device.zeros((grid[1], grid[0], 2)) for _ in range(2)]
         else:
             flows = [_expand(device, flow, grid) for flow in flows]
-        # a search on a level finer than choose_from is of small motion; its choice is made there alone
+        # a search on a level finer than choose_from (of a small image) is followed by no other choice
         if min(searched, parameters.choose_from) <= level <= searched:
             flows = _choose(device, features, flows, level, level == searched, reach or 0.0, parameters)
         flows = [

@@ -22,17 +22,17 @@ class SearchParameters:
     """How large motion is searched. Costs are misfits of descriptors, 0 to 1."""
 
     coarse: float = 9.0  # px: displacements are tried on the finest level on which reach is at most this
-    furthest: int = 32  # px: and nothing beyond this is tried
+    furthest: int = 10  # px: and nothing beyond this is tried, where the coarsest level is too fine for that
     noise: float = 0.05  # amplitude of h that is no texture
     outside: float = 0.5  # cost, on the coarse level, of what the other image does not show
-    couplings: tuple[float, ...] = (0.003, 0.01, 0.03, 0.1, 0.3)  # of a squared pixel, in turns
+    couplings: tuple[float, ...] = (0.001, 0.01, 0.03, 0.1, 0.3)  # of a squared pixel, in turns
     tolerance: float = 2.5  # px: by how much both directions may disagree
     distinct: float = 0.2  # how much less the one found costs than any other more than 2 px away
     own_outside: float = 0.25  # the same for a pixel's own flow, which is not given up for want of evidence
     other_outside: float = 0.75  # and for a flow that it may take over
     patience: float = 0.06  # by how much a flow from elsewhere must fit better
     radius: int = 2  # px: of the window in which two flows are compared
-    focus: float = 2.0  # e-folds by which a pixel counts less there, for a difference of 1 from the middle
+    focus: float = 4.0  # e-folds by which a pixel counts less there, for a difference of 1 from the middle
     steps: tuple[int, ...] = (16, 8, 4, 2, 1)  # px from which flow is taken over, in turns
 
 
@@ -59,11 +59,11 @@ def exhaustive(
     size, limit = grid[:2], min(math.ceil(largest), parameters.furthest)
     reach = min(limit, size[0] // 2), min(limit, size[1] // 2)
     count = (2 * reach[0] + 1) * (2 * reach[1] + 1)
-    cost = device.empty((count, size[1], size[0]))
-    device.run(
-        "search", "search_cost", (size[0], size[1] * count), a, b, grid, reach, parameters.outside, cost
-    )
-    found = [_coupled(device, cost, grid, reach, way, parameters) for way in (0, 1)]
+    pixel_cost, cost = (device.empty((count, size[1], size[0])) for _ in range(2))
+    every, outside = (size[0], size[1] * count), parameters.outside
+    device.run("search", "search_pixel_cost", every, a, b, grid, reach, outside, pixel_cost)
+    device.run("search", "search_cost", every, pixel_cost, a, grid, count, outside, cost)
+    found = [_coupled(device, cost, flows[way], grid, reach, way, parameters) for way in (0, 1)]
     agreed = [device.empty(flow.shape) for flow in flows]
     for way, out in enumerate(agreed):
         device.run(
@@ -74,21 +74,21 @@ def exhaustive(
 
 
 def _coupled(
-    device: Device, cost: Buffer, grid: Grid, reach: tuple[int, int], backward: int,
+    device: Device, cost: Buffer, flow: Buffer, grid: Grid, reach: tuple[int, int], backward: int,
     parameters: SearchParameters,
 ) -> Buffer:  # fmt: skip
-    """The displacements of least cost, less and less free to differ from their smoothed selves."""
+    """The displacements of least cost, ever less free to differ from `flow`, then from their own mean."""
     size = grid[:2]
-    smooth, best, median = (device.zeros((size[1], size[0], 2)) for _ in range(3))
-    for turn, coupling in enumerate((0.0, *parameters.couplings)):
+    smooth, best, median = (device.empty(flow.shape) for _ in range(3))
+    for turn, coupling in enumerate(parameters.couplings):
         if turn:
             for _ in range(2):
                 device.run("flow", "flow_median", size, best, grid, median)
                 best, median = median, best
             device.run("search", "search_mean", size, best, grid, smooth)
         device.run(
-            "search", "search_best", size, cost, smooth, grid, reach, parameters.outside, coupling, backward,
-            best,
+            "search", "search_best", size, cost, smooth if turn else flow, grid, reach, parameters.outside,
+            coupling, backward, best,
         )  # fmt: skip
     return best
 

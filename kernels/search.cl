@@ -39,41 +39,46 @@ static inline float search_misfit(float4 a, float4 b, float outside) {
     return a.w * b.w > 0.0f ? e / (e + 0.5f) : outside;
 }
 
-/* Mean misfit of 3 x 3 pixels under each displacement. */
-__kernel void search_cost(__global const float4 *a, /* (grid.y, grid.x) descriptors */
-                          __global const float4 *b, /* (grid.y, grid.x) of the other image */
-                          int4 grid,                /* run size: (grid.x, grid.y x displacements) */
-                          int2 reach,               /* largest displacement, px */
-                          float outside,            /* misfit where one of both is not known */
-                          __global float *cost)     /* (displacements, grid.y, grid.x) */
+/* Misfit of each pixel under each displacement. */
+__kernel void search_pixel_cost(__global const float4 *a, /* (grid.y, grid.x) descriptors */
+                                __global const float4 *b, /* (grid.y, grid.x) of the other image */
+                                int4 grid,                /* run size: (grid.x, grid.y x displacements) */
+                                int2 reach,               /* largest displacement, px */
+                                float outside,            /* misfit where one of both is not known */
+                                __global float *cost)     /* (displacements, grid.y, grid.x) */
 {
     const int x = get_global_id(0), row = get_global_id(1);
     const int index = row / grid.y, y = row - index * grid.y, span = 2 * reach.x + 1;
     if (x >= grid.x || index >= span * (2 * reach.y + 1))
         return;
-    const int2 d = (int2)(index % span, index / span) - reach;
+    int2 q = (int2)(x, y) + (int2)(index % span, index / span) - reach;
+    cost[row * grid.x + x] =
+        grid_border(&q, grid) ? search_misfit(a[y * grid.x + x], b[q.y * grid.x + q.x], outside) : outside;
+}
+
+/* Mean over the valid of 3 x 3 pixels, under each displacement. */
+__kernel void search_cost(__global const float *pixel_cost, /* (displacements, grid.y, grid.x) */
+                          __global const float4 *a,         /* (grid.y, grid.x) descriptors */
+                          int4 grid,                        /* run size: (grid.x, grid.y x displacements) */
+                          int displacements,
+                          float outside,                    /* cost where none is valid */
+                          __global float *cost)             /* (displacements, grid.y, grid.x) */
+{
+    const int x = get_global_id(0), row = get_global_id(1);
+    const int index = row / grid.y, y = row - index * grid.y;
+    if (x >= grid.x || index >= displacements)
+        return;
     float sum = 0.0f, weight = 0.0f;
     for (int j = -1; j <= 1; ++j)
         for (int i = -1; i <= 1; ++i) {
-            int2 p = (int2)(x + i, y + j), q = p + d;
-            if (!grid_border(&p, grid) || a[p.y * grid.x + p.x].w == 0.0f)
+            int2 p = (int2)(x + i, y + j);
+            if (!grid_border(&p, grid))
                 continue;
-            sum += grid_border(&q, grid) ? search_misfit(a[p.y * grid.x + p.x], b[q.y * grid.x + q.x], outside)
-                                         : outside;
-            weight += 1.0f;
+            const float valid = a[p.y * grid.x + p.x].w;
+            sum += valid * pixel_cost[(index * grid.y + p.y) * grid.x + p.x];
+            weight += valid;
         }
     cost[row * grid.x + x] = weight > 0.0f ? sum / weight : outside;
-}
-
-/* Index in `cost` of displacement d from a to b at pixel p, or from b to a if `backward`; -1 beyond the grid. */
-static inline int search_index(int2 p, int2 d, int4 grid, int2 reach, int backward) {
-    if (backward) { /* what b shows at q, a shows at q + d: the cost of -d there */
-        p += d;
-        d = -d;
-        if (!grid_border(&p, grid))
-            return -1;
-    }
-    return (((d.y + reach.y) * (2 * reach.x + 1) + d.x + reach.x) * grid.y + p.y) * grid.x + p.x;
 }
 
 /* The displacement that costs least, with what it is away from `flow`. */
@@ -89,21 +94,32 @@ __kernel void search_best(__global const float *cost,  /* (displacements, grid.y
     const int x = get_global_id(0), y = get_global_id(1);
     if (x >= grid.x || y >= grid.y)
         return;
-    const float2 near = flow[y * grid.x + x];
+    const int at = y * grid.x + x, plane = grid.x * grid.y;
+    const float2 near = flow[at];
     float least = INFINITY;
     float2 found = near;
-    for (int v = -reach.y; v <= reach.y; ++v)
-        for (int u = -reach.x; u <= reach.x; ++u) {
-            const float2 away = (float2)(u, v) - near;
-            const int index = search_index((int2)(x, y), (int2)(u, v), grid, reach, backward);
-            const float own = index >= 0 ? cost[index] : outside;
-            const float total = own + coupling * dot(away, away);
-            if (total < least) {
-                least = total;
-                found = (float2)(u, v);
+    if (backward) { /* what b shows at q, a shows at q + d: the cost of -d there, the last first */
+        int start = ((2 * reach.x + 1) * (2 * reach.y + 1) - 1) * plane;
+        for (int v = -reach.y; v <= reach.y; ++v)
+            for (int u = -reach.x; u <= reach.x; ++u, start -= plane) {
+                const float2 away = (float2)(u, v) - near;
+                int2 p = (int2)(x + u, y + v);
+                const float own = grid_border(&p, grid) ? cost[start + p.y * grid.x + p.x] : outside;
+                const float total = own + coupling * dot(away, away);
+                found = total < least ? (float2)(u, v) : found;
+                least = total < least ? total : least;
             }
-        }
-    best[y * grid.x + x] = found;
+    } else {
+        int start = at;
+        for (int v = -reach.y; v <= reach.y; ++v)
+            for (int u = -reach.x; u <= reach.x; ++u, start += plane) {
+                const float2 away = (float2)(u, v) - near;
+                const float total = cost[start] + coupling * dot(away, away);
+                found = total < least ? (float2)(u, v) : found;
+                least = total < least ? total : least;
+            }
+    }
+    best[at] = found;
 }
 
 /* Mean of 3 x 3 pixels. */
@@ -125,6 +141,17 @@ __kernel void search_mean(__global const float2 *flow, /* (grid.y, grid.x) */
             weight += 1.0f;
         }
     mean[y * grid.x + x] = sum / weight;
+}
+
+/* Index in `cost` of displacement d from a to b at pixel p, or from b to a if `backward`; -1 beyond the grid. */
+static inline int search_index(int2 p, int2 d, int4 grid, int2 reach, int backward) {
+    if (backward) { /* what b shows at q, a shows at q + d: the cost of -d there */
+        p += d;
+        d = -d;
+        if (!grid_border(&p, grid))
+            return -1;
+    }
+    return (((d.y + reach.y) * (2 * reach.x + 1) + d.x + reach.x) * grid.y + p.y) * grid.x + p.x;
 }
 
 /* What was found, where the other direction found the same and nothing else, more than 2 px away, fits nearly as

@@ -42,14 +42,6 @@ def run(device: Device, name: str, grid: tuple[int, int, int, int], *arguments: 
     return out.get()
 
 
-def costs(device: Device, a: np.ndarray, b: np.ndarray, grid: tuple[int, int, int, int]) -> np.ndarray:
-    count = (2 * REACH[0] + 1) * (2 * REACH[1] + 1)
-    out = device.empty((count, grid[1], grid[0]))
-    size = (grid[0], grid[1] * count)
-    device.run("search", "search_cost", size, device.upload(a), device.upload(b), grid, REACH, 0.5, out)
-    return out.get()
-
-
 @pytest.mark.parametrize("name", list(GRIDS))
 def test_descriptor_equals_its_twin(device: Device, name: str) -> None:
     grid = GRIDS[name]
@@ -68,16 +60,22 @@ def test_descriptor_is_blind_to_contrast(device: Device) -> None:
 
 
 @pytest.mark.parametrize("name", list(GRIDS))
-def test_cost_equals_its_twin(device: Device, name: str) -> None:
+def test_costs_equal_their_twins(device: Device, name: str) -> None:
     grid = GRIDS[name]
     a, b = descriptors(5, grid)
-    assert_close(costs(device, a, b, grid), twin.search_cost(a, b, grid, REACH, 0.5), SUM)
+    count = (2 * REACH[0] + 1) * (2 * REACH[1] + 1)
+    pixel_cost, cost = (device.empty((count, grid[1], grid[0])) for _ in range(2))
+    size, sent = (grid[0], grid[1] * count), device.upload(a)
+    device.run("search", "search_pixel_cost", size, sent, device.upload(b), grid, REACH, 0.5, pixel_cost)
+    device.run("search", "search_cost", size, pixel_cost, sent, grid, count, 0.5, cost)
+    assert_close(pixel_cost.get(), twin.search_pixel_cost(a, b, grid, REACH, 0.5), SUM)
+    assert_close(cost.get(), twin.costs(a, b, grid, REACH, 0.5), SUM)
 
 
 def test_twin_of_cost_by_hand() -> None:
     grid = GRIDS["plane"]
     a, b = descriptors(7, grid)
-    cost = twin.search_cost(a, b, grid, REACH, 0.5)
+    cost = twin.costs(a, b, grid, REACH, 0.5)
     for y, x, u, v in ((10, 12, 2, -1), (0, 0, -4, -3), (22, 36, 4, 3)):
         seen = []
         for q, p in np.ndindex(3, 3):
@@ -94,7 +92,7 @@ def test_twin_of_cost_by_hand() -> None:
 @pytest.mark.parametrize("coupling", [0.0, 0.03])
 def test_best_equals_its_twin(device: Device, name: str, backward: int, coupling: float) -> None:
     grid = GRIDS[name]
-    cost = twin.search_cost(*descriptors(9, grid), grid, REACH, 0.5).astype(np.float32)
+    cost = twin.costs(*descriptors(9, grid), grid, REACH, 0.5).astype(np.float32)
     near = 2 * noise(13, grid, 2, 3)
     best = run(device, "search_best", grid, cost, near, grid, REACH, 0.5, coupling, backward)
     expected = twin.search_best(cost, near, grid, REACH, 0.5, coupling, backward)
@@ -108,9 +106,9 @@ def test_backward_costs_are_those_of_the_exchanged_images() -> None:
     grid = (38, 23, 1, 0)
     a, b = (noise(seed, grid, 4, 1.0) for seed in (15, 16))
     a[..., 3] = b[..., 3] = 1
-    forward = twin.search_cost(a, b, grid, REACH, 0.5)
+    forward = twin.costs(a, b, grid, REACH, 0.5)
     backward = twin.directed(forward, grid, REACH, 0.5, 1)
-    assert np.allclose(backward[:, 5:-5], twin.search_cost(b, a, grid, REACH, 0.5)[:, 5:-5])
+    assert np.allclose(backward[:, 5:-5], twin.costs(b, a, grid, REACH, 0.5)[:, 5:-5])
 
 
 @pytest.mark.parametrize("name", list(GRIDS))
@@ -128,7 +126,7 @@ def test_mean_equals_its_twin_and_scipys(device: Device, name: str) -> None:
 @pytest.mark.parametrize("backward", [0, 1])
 def test_agree_equals_its_twin(device: Device, name: str, backward: int) -> None:
     grid = GRIDS[name]
-    cost = twin.search_cost(*descriptors(19, grid), grid, REACH, 0.5).astype(np.float32)
+    cost = twin.costs(*descriptors(19, grid), grid, REACH, 0.5).astype(np.float32)
     zero = np.zeros((grid[1], grid[0], 2))
     ways = [twin.search_best(cost, zero, grid, REACH, 0.5, 0.0, way) for way in (0, 1)]
     before = noise(23, grid, 2, 2)
@@ -145,7 +143,7 @@ def test_agree_refuses_what_repeats(device: Device) -> None:
     x, y = common.pixels(40, 24)
     waves = [np.sin(2 * np.pi * (x + shift) / 4) * np.cos(y / 2.0) for shift in (0, 1, 2)]
     image = np.stack([*waves, np.ones(x.shape)], -1).astype(np.float32)
-    cost = twin.search_cost(image, image, grid, REACH, 0.5)
+    cost = twin.costs(image, image, grid, REACH, 0.5)
     zero, before = np.zeros((24, 40, 2)), np.full((24, 40, 2), 0.25, np.float32)
     arguments = (cost, zero, zero, before, grid, REACH, 0, 1.5, 0.05)
     assert np.array_equal(run(device, "search_agree", grid, *arguments), before)

@@ -38,17 +38,23 @@ def misfit(a: Array, b: Array, outside: float) -> Array:
     return np.where(a[..., 3] * b[..., 3] > 0, away / (away + 0.5), outside)
 
 
-def search_cost(a: Array, b: Array, grid: Sequence[int], reach: Sequence[int], outside: float) -> Array:
-    """(displacements, height, width): mean misfit over the valid of 3 x 3 pixels."""
+def search_pixel_cost(a: Array, b: Array, grid: Sequence[int], reach: Sequence[int], outside: float) -> Array:
+    """(displacements, height, width): misfit of every pixel and what b has there."""
     x, y = pixels(grid[0], grid[1])
-    result = []
-    for u, v in displacements(reach):
-        there, _ = on_grid(b, grid, x + u, y + v)
-        known = (a[..., 3] > 0).astype(np.float64)
-        around = windows(np.stack([misfit(a, there, outside) * known, known], -1), grid, 1).sum(0)
-        mean = around[..., 0] / np.maximum(around[..., 1], 1)
-        result.append(np.where(around[..., 1] > 0, mean, outside))
-    return np.stack(result)
+    return np.stack([misfit(a, on_grid(b, grid, x + u, y + v)[0], outside) for u, v in displacements(reach)])
+
+
+def search_cost(pixel_cost: Array, a: Array, grid: Sequence[int], outside: float) -> Array:
+    """(displacements, height, width): mean over those of 3 x 3 pixels that are valid."""
+    known = (a[..., 3] > 0).astype(np.float64)
+    weight = windows(known, grid, 1).sum(0)
+    sums = np.stack([windows(one * known, grid, 1).sum(0) for one in pixel_cost])
+    return np.where(weight > 0, sums / np.maximum(weight, 1), outside)
+
+
+def costs(a: Array, b: Array, grid: Sequence[int], reach: Sequence[int], outside: float) -> Array:
+    """Both of the above."""
+    return search_cost(search_pixel_cost(a, b, grid, reach, outside), a, grid, outside)
 
 
 def directed(cost: Array, grid: Sequence[int], reach: Sequence[int], outside: float, backward: int) -> Array:
