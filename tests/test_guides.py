@@ -10,7 +10,7 @@ from grids import GRIDS, on_device
 from pictures import masked, one_device, pixel_places
 from test_flow_truth import scene
 
-from hugin_abflow import geometry
+from hugin_abflow import flow, geometry
 from hugin_abflow.chart import pair_chart
 from hugin_abflow.guidance import on_chart
 from hugin_abflow.guides import Guide, by_pair, doubts
@@ -20,6 +20,13 @@ from hugin_abflow.opencl import Device
 from hugin_abflow.settings import Settings
 
 pytestmark = pytest.mark.usefixtures(one_device.__name__)
+
+
+@pytest.fixture(autouse=True)
+def no_search(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Flow by warping alone: the search finds by itself what these scenes need guides for."""
+    monkeypatch.setattr(flow.search, "level", lambda *arguments: -1)
+
 
 # Doubts
 
