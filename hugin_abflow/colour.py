@@ -12,7 +12,6 @@ no difference it is exactly zero.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -79,18 +78,15 @@ def correction(
     cells = colour_grid(grid)
     if not settings.exposure:
         return Correction(cells, (None,) * len(layers))
-    integer = layers[0].layer.dtype.kind == "u"
     measured = []
     for pair in pairs:
-        values = difference(
-            device, layers, fields, pair, grid, cells, _CLIPPED if integer else math.inf, _SPREAD
-        )
+        values = _difference(device, layers, fields, pair, grid, cells)
         if ignored is not None:
-            values[cells_reached(ignored[None], cells)[0], 3] = 0
+            values[_cells_reached(ignored[None], cells)[0], 3] = 0
         measured.append((pair.a, pair.b, values))
     if not any(np.any(d[..., :3] * d[..., 3:]) for _, _, d in measured):
         return Correction(cells, (None,) * len(layers))
-    inside = cells_reached(covered, cells)
+    inside = _cells_reached(covered, cells)
     gains = solve(measured, inside, cells, _STRICT if strict else _ROUNDS)
     gains = np.sign(gains) * np.maximum(np.abs(gains) - _NEGLIGIBLE, 0)
     result: list[Buffer | None] = []
@@ -104,32 +100,31 @@ def correction(
     return Correction(cells, tuple(result))
 
 
-def difference(
+def _difference(
     device: Device,
     layers: Sequence[WorkingLayer],
     fields: Sequence[Buffer],
     pair: PairFlow,
     grid: Grid,
     cells: Grid,
-    clipped: float = math.inf,
-    spread: float = math.inf,
 ) -> npt.NDArray[np.float64]:
     """Difference a - b of a pair's aligned layers on the exposure scale, per cell of the grid `cells`.
 
-    (height, width, 4): r, g, b and a weight 0..1: the share of the cell's pixels that both layers show no
-    brighter than `clipped` of full scale, less where their differences scatter by `spread` or more.
+    (height, width, 4): r, g, b and a weight 0..1: the share of the cell's pixels that both layers show
+    unclipped, less where their differences scatter.
     """
     a, b = layers[pair.a], layers[pair.b]
+    integer = a.layer.dtype.kind == "u"
     values = device.empty((*cells.shape, 4))
     device.run(
         "colour", "colour_difference", cells.border[:2],
         a.pixels, fields[pair.a], a.box, b.pixels, fields[pair.b], b.box, grid.border, grid.lens,
-        cells.border, int(a.layer.dtype.kind == "u"), min(clipped, 1e30), min(spread, 1e15), values,
+        cells.border, int(integer), _CLIPPED if integer else 1e30, _SPREAD, values,
     )  # fmt: skip
     return values.get().astype(np.float64)
 
 
-def cells_reached(covered: npt.NDArray[np.bool_], cells: Grid) -> npt.NDArray[np.bool_]:
+def _cells_reached(covered: npt.NDArray[np.bool_], cells: Grid) -> npt.NDArray[np.bool_]:
     """Which cells masks (n, height, width) of any finer grid over the region reach into."""
     for axis, count in ((1, cells.height), (2, cells.width)):
         starts = np.arange(count) * covered.shape[axis] // count

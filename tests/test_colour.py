@@ -253,7 +253,7 @@ def test_gains_reach_two_cells_beyond_a_layer() -> None:
 def test_cells_that_a_layer_reaches_into() -> None:
     covered = np.zeros((2, 53, 77), bool)
     covered[0, 12, 20] = covered[1, 52, 76] = True
-    inside = colour.cells_reached(covered, CELLS["plane"])
+    inside = colour._cells_reached(covered, CELLS["plane"])
     assert inside.sum((1, 2)).tolist() == [1, 1]
     assert inside[0, 1, 2]
     assert inside[1, 4, 8]
