@@ -204,6 +204,12 @@ _information = partial(click.option, cls=_Option, group="Information")
     help="Let the project's control points lead the flow where it goes astray. off: leave them aside.",
 )
 @_blending(
+    "--large-motion",
+    type=click.Choice(["on", "off"]),
+    default="on" if _DEFAULTS.large_motion else "off",
+    help="Search for motion of up to a tenth of the canvas's width: very near things; grids may mislead it.",
+)
+@_blending(
     "--seam",
     type=click.Choice(["auto", "off"]),
     default="auto" if _DEFAULTS.seam else "off",
@@ -267,6 +273,7 @@ def command(
     merge: MergeMode,
     exposure: str,
     guides: str,
+    large_motion: str,
     seam: str,
     softmax_sharpness: float,
     flow_magnitude: float,
@@ -298,6 +305,7 @@ def command(
         exposure=exposure == "auto",
         guides=guides == "auto",
         seam=seam == "auto",
+        large_motion=large_motion == "on",
         device=device,
     )
     merge_one = partial(

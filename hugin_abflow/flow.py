@@ -150,9 +150,9 @@ def pair_flow(
     """Flow from a to b and from b to a: two float32 (height, width, 2) in px of the grid.
 
     a, b: log brightness with masks, 0 outside them. start: its flows are worked on, not copied, and nothing
-    else is searched. reach: the largest motion that is searched, px; if it is None, `parameters.reach` of the
-    longer side. It is less where the masks overlap little: in a small corner of a floor of tiles every tile
-    fits. Raises `DeviceError` if the device fails.
+    else is searched. reach: the largest motion that is searched, px, 0: none; if it is None,
+    `parameters.reach` of the longer side. It is less where the masks overlap little: in a small corner of a
+    floor of tiles every tile fits. Raises `DeviceError` if the device fails.
     """
     parameters = parameters or FlowParameters()
     count = start.level + 1 if start else levels(a, parameters)
@@ -161,7 +161,7 @@ def pair_flow(
         reach = parameters.reach * max(a.grid[:2]) if reach is None else reach
         common = np.count_nonzero(a.mask.get() * b.mask.get())
         reach = min(reach, parameters.overlap * math.sqrt(common))
-        searched = search.level(reach, count, parameters.search)
+        searched = search.level(reach, count, parameters.search) if reach > 0 else -1
     pyramids = [pyramid.build(device, image, count + 1) for image in (a, b)]
     flows: list[Buffer] | None = None
     for level in reversed(range(count)):

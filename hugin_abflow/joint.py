@@ -128,7 +128,9 @@ def prepare(
     numbers = [order[id(one.layer)] for one in reduced]
     parameters = quality.flow_parameters(settings.flow_quality)
     its_guides = by_pair(guides if settings.guides else ())
-    flows = _flows(device, reduced, masks, grid, progress, parameters, its_guides, numbers)
+    largest = _REACH * (grid.canvas_width or grid.region.width) * grid.width / grid.region.width
+    reach = largest if settings.large_motion else 0.0
+    flows = _flows(device, reduced, masks, grid, progress, parameters, reach, its_guides, numbers)
     fields, correction = _align(device, reduced, coefficients, flows, masks, grid, settings)
     final = [
         BlendLayer(layer, field, geometry.reach(device, layer, field, grid), gain)
@@ -205,6 +207,7 @@ def _flows(
     grid: Grid,
     progress: Progress,
     parameters: FlowParameters,
+    reach: float,
     guides: Mapping[tuple[int, int], Sequence[Guide]],
     numbers: Sequence[int],
 ) -> list[PairFlow]:
@@ -217,7 +220,6 @@ def _flows(
     ]
     overlaps = [entry for entry in overlaps if np.count_nonzero(entry[2]) >= _LEAST_OVERLAP]
     result = []
-    reach = _REACH * (grid.canvas_width or grid.region.width) * grid.width / grid.region.width
     with progress("flow", len(overlaps)) as advance:
         for a, b, overlap in overlaps:
             pair = (layers[a], layers[b])

@@ -24,6 +24,8 @@ class Settings:
     softmax_sharpness   kSoftmaxSharpness of the paper (Code 1); 0..1000, no unit.
     flow_magnitude      kFlowMagCoef of the paper (Code 1); 0..10000, no unit.
     flow_quality        how much time the flow may take: "fast", "normal" or "best".
+    large_motion        search for motion of up to a tenth of the canvas's width, for very near things; what
+                        repeats (grids, tiles) may mislead it.
     exposure            match exposure and colour of the layers where they overlap, and spread it smoothly.
     seam                take from one layer, whole, what flow cannot explain (people who moved, occlusions).
     transition_strain   how much changing over from one layer's geometry to the next may stretch it, where
@@ -45,6 +47,7 @@ class Settings:
     softmax_sharpness: float = 10.0
     flow_magnitude: float = 100.0
     flow_quality: FlowQuality = "normal"
+    large_motion: bool = False
     exposure: bool = True
     seam: bool = True
     transition_strain: float = 0.06
@@ -83,7 +86,7 @@ class Settings:
             if not isinstance(value, str) or value not in choices:
                 expected = " or ".join(map(repr, choices))
                 raise SettingsError(f"{name} is {value!r}; choose {expected}")
-        for name in ("exposure", "seam"):
+        for name in ("exposure", "seam", "large_motion"):
             if not isinstance(getattr(self, name), bool):
                 raise SettingsError(f"{name} is {getattr(self, name)!r}; choose True or False")
         if self.device is not None and not isinstance(self.device, str):
