@@ -156,9 +156,8 @@ def pair_flow(
     """
     parameters = parameters or FlowParameters()
     count = start.level + 1 if start else levels(a, parameters)
-    searched = -1
-    if not start:
-        reach = parameters.reach * max(a.grid[:2]) if reach is None else reach
+    searched, reach = -1, parameters.reach * max(a.grid[:2]) if reach is None else reach
+    if reach > 0 and not start:
         common = np.count_nonzero(a.mask.get() * b.mask.get())
         reach = min(reach, parameters.overlap * math.sqrt(common))
         searched = search.level(reach, count, parameters.search) if reach > 0 else -1
@@ -175,7 +174,7 @@ def pair_flow(
             flows = [_expand(device, flow, grid) for flow in flows]
         # a search on a level finer than choose_from (of a small image) is followed by no other choice
         if min(searched, parameters.choose_from) <= level <= searched:
-            flows = _choose(device, features, flows, level, level == searched, reach or 0.0, parameters)
+            flows = _choose(device, features, flows, level, level == searched, reach, parameters)
         flows = [
             _refine(
                 device,
