@@ -158,9 +158,9 @@ def _align(
     coefficients = transition.narrow(device, layers, coefficients, pairs, grid, settings)
     correct = partial(colour.correction, device, layers)
     fields = geometry.fields(device, layers, coefficients, pairs, grid, settings)
+    # exposure explains a difference whether it is corrected or not
+    exposure = replace(settings, exposure=True)
     for _ in range(_SEAM_ROUNDS if settings.seam else 0):
-        # exposure explains a difference whether it is corrected or not
-        exposure = replace(settings, exposure=True)
         strict = correct(fields, pairs, grid, masks.host, exposure, regions, strict=True)
         found = seam.regions(device, layers, fields, pairs, strict, grid)
         grown = found if regions is None else found | regions
