@@ -131,7 +131,7 @@ def test_environment_that_may_hide_devices_is_named(
 def test_environment_that_hides_devices_is_named_by_the_program(name: str) -> None:
     """These variables really do what the message says; they are read when OpenCL is loaded."""
     if "Portable" not in Device().device.platform.name:
-        pytest.skip("another driver may take no notice")
+        pytest.skip("another driver may take no notice")  # POCL_DEVICES is PoCL's own
     command = [sys.executable, "-m", "hugin_abflow", "--list-devices"]
     environment = os.environ | {name: "/nowhere"}
     done = subprocess.run(command, capture_output=True, text=True, env=environment, check=False)

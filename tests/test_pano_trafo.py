@@ -131,7 +131,7 @@ def test_pano_trafo_that_fails_is_reported_and_done_without(
     make_project, monkeypatch, tmp_path, caplog, script
 ) -> None:
     if os.name == "nt":
-        pytest.skip("a shell script")
+        pytest.skip("a shell script")  # Windows runs none in place of a program
     program = tmp_path / "bin" / "pano_trafo"
     program.parent.mkdir()
     program.write_text(f"#!/bin/sh\n{script}\n")
