@@ -86,7 +86,7 @@ class Settings:
             if not isinstance(value, str) or value not in choices:
                 expected = " or ".join(map(repr, choices))
                 raise SettingsError(f"{name} is {value!r}; choose {expected}")
-        for name in ("exposure", "seam", "large_motion"):
+        for name in ("large_motion", "exposure", "seam", "guides"):
             if not isinstance(getattr(self, name), bool):
                 raise SettingsError(f"{name} is {getattr(self, name)!r}; choose True or False")
         if self.device is not None and not isinstance(self.device, str):
