@@ -54,7 +54,7 @@ class Correction:
 
 def colour_grid(grid: Grid) -> Grid:
     """The coarse grid over the working grid's region."""
-    return grid.resized(max(1, round(grid.width / _CELL)), max(1, round(grid.height / _CELL)))
+    return grid.coarser(_CELL)
 
 
 def correction(

@@ -48,7 +48,7 @@ _UNIT = 1000
 
 def seam_grid(grid: Grid) -> Grid:
     """The grid of the regions, over the working grid's region."""
-    return grid.resized(max(1, round(grid.width / _CELL)), max(1, round(grid.height / _CELL)))
+    return grid.coarser(_CELL)
 
 
 def regions(

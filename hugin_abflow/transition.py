@@ -45,7 +45,7 @@ def narrow(
     """Coefficients as steep as `settings.transition_strain` allows; as they are where that is 0."""
     if settings.transition_strain == 0 or not flows:
         return coefficients
-    cells = grid.resized(max(1, round(grid.width / _CELL)), max(1, round(grid.height / _CELL)))
+    cells = grid.coarser(_CELL)
     strain = device.zeros((*cells.shape, 2))
     displacements = geometry.displacements(device, layers, coefficients, flows, grid, settings)
     for layer, coefficient, displacement in zip(layers, coefficients, displacements, strict=True):

@@ -91,6 +91,10 @@ class Grid:
         """Pixels of the grid per full-resolution pixel."""
         return self.width / self.region.width, self.height / self.region.height
 
+    def coarser(self, pixels: int) -> Grid:
+        """A grid over the same region, of cells of about `pixels` x `pixels` of this one's."""
+        return self.resized(max(1, round(self.width / pixels)), max(1, round(self.height / pixels)))
+
     def resized(self, width: int, height: int) -> Grid:
         """The same region on another number of pixels."""
         lon, dlon, lat, dlat = self.lens
