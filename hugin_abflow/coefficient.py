@@ -46,6 +46,16 @@ class Masks:
         return Masks(self.grid, tuple(self.buffers[i] for i in indices), self.host[list(indices)])
 
 
+def on_cells(masks_: npt.NDArray[np.bool_], cells: Grid, rule: np.ufunc) -> npt.NDArray[np.bool_]:
+    """Masks (n, height, width) of any finer grid over the region of `cells`, per cell: `np.logical_or` for
+    cells that they reach into, `np.logical_and` for those that they cover whole.
+    """
+    for axis, count in ((1, cells.height), (2, cells.width)):
+        starts = np.arange(count) * masks_.shape[axis] // count
+        masks_ = rule.reduceat(masks_, starts, axis)
+    return masks_
+
+
 def masks(device: Device, layers: Sequence[WorkingLayer], grid: Grid) -> Masks:
     """The layers' masks; a mask pixel is covered if every working pixel under it is."""
     factor = 1 if grid.width * grid.height <= _FINE_PIXELS else 2

@@ -18,6 +18,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from hugin_abflow.coefficient import on_cells
 from hugin_abflow.geometry import PairFlow
 from hugin_abflow.opencl import Buffer, Device
 from hugin_abflow.settings import Settings
@@ -82,11 +83,11 @@ def correction(
     for pair in pairs:
         values = _difference(device, layers, fields, pair, grid, cells)
         if ignored is not None:
-            values[_cells_reached(ignored[None], cells)[0], 3] = 0
+            values[on_cells(ignored[None], cells, np.logical_or)[0], 3] = 0
         measured.append((pair.a, pair.b, values))
     if not any(np.any(d[..., :3] * d[..., 3:]) for _, _, d in measured):
         return Correction(cells, (None,) * len(layers))
-    inside = _cells_reached(covered, cells)
+    inside = on_cells(covered, cells, np.logical_or)
     gains = solve(measured, inside, cells, _STRICT if strict else _ROUNDS)
     gains = np.sign(gains) * np.maximum(np.abs(gains) - _NEGLIGIBLE, 0)
     result: list[Buffer | None] = []
@@ -122,14 +123,6 @@ def _difference(
         cells.border, int(integer), _CLIPPED if integer else 1e30, _SPREAD, values,
     )  # fmt: skip
     return values.get().astype(np.float64)
-
-
-def _cells_reached(covered: npt.NDArray[np.bool_], cells: Grid) -> npt.NDArray[np.bool_]:
-    """Which cells masks (n, height, width) of any finer grid over the region reach into."""
-    for axis, count in ((1, cells.height), (2, cells.width)):
-        starts = np.arange(count) * covered.shape[axis] // count
-        covered = np.logical_or.reduceat(covered, starts, axis)
-    return covered
 
 
 def solve(

@@ -24,7 +24,7 @@ from scipy import ndimage
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import breadth_first_order, maximum_flow
 
-from hugin_abflow.coefficient import Masks
+from hugin_abflow.coefficient import Masks, on_cells
 from hugin_abflow.colour import Correction
 from hugin_abflow.geometry import PairFlow
 from hugin_abflow.opencl import Buffer, Device
@@ -80,9 +80,9 @@ def cut(
     """
     cells = seam_grid(grid)
     residual = _residual(device, layers, fields, pairs, correction, grid, cells)
-    cover = _cells_whole(masks.host, cells)
+    cover = on_cells(masks.host, cells, np.logical_and)
     shares = np.stack(
-        [_on_cells(f.get()[..., 3], k.box, grid, cells) for f, k in zip(fields, layers, strict=True)]
+        [_at_centres(f.get()[..., 3], k.box, grid, cells) for f, k in zip(fields, layers, strict=True)]
     )
     shares /= np.maximum(shares.sum(0), 1e-12)
     yields = np.zeros(cover.shape, np.float32)
@@ -244,15 +244,7 @@ def _expand(
     return np.where(takes[:count], alpha, current)
 
 
-def _cells_whole(covered: npt.NDArray[np.bool_], cells: Grid) -> npt.NDArray[np.bool_]:
-    """Which cells a layer covers whole; `covered` is (layers, height, width) on any finer grid."""
-    for axis, count in ((1, cells.height), (2, cells.width)):
-        starts = np.arange(count) * covered.shape[axis] // count
-        covered = np.logical_and.reduceat(covered, starts, axis)
-    return covered
-
-
-def _on_cells(
+def _at_centres(
     weights: npt.NDArray[np.float32], box: tuple[int, int, int, int], grid: Grid, cells: Grid
 ) -> npt.NDArray[np.float64]:
     """Weights at the cells' centres; 0 outside the layer's box."""

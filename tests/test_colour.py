@@ -14,6 +14,7 @@ from tolerances import POSITION, assert_close
 
 from hugin_abflow import colour
 from hugin_abflow.chart import pair_chart
+from hugin_abflow.coefficient import on_cells
 from hugin_abflow.geometry import PairFlow
 from hugin_abflow.opencl import Device
 from hugin_abflow.settings import Settings
@@ -253,7 +254,7 @@ def test_gains_reach_two_cells_beyond_a_layer() -> None:
 def test_cells_that_a_layer_reaches_into() -> None:
     covered = np.zeros((2, 53, 77), bool)
     covered[0, 12, 20] = covered[1, 52, 76] = True
-    inside = colour._cells_reached(covered, CELLS["plane"])
+    inside = on_cells(covered, CELLS["plane"], np.logical_or)
     assert inside.sum((1, 2)).tolist() == [1, 1]
     assert inside[0, 1, 2]
     assert inside[1, 4, 8]

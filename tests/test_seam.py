@@ -14,6 +14,7 @@ from scipy import ndimage
 from tolerances import POSITION, SUM, assert_close
 
 from hugin_abflow import seam
+from hugin_abflow.coefficient import on_cells
 from hugin_abflow.opencl import Device
 
 WRAPS = [False, True]
@@ -286,5 +287,5 @@ def test_outlines_are_blurred_over_a_cell(wraps: bool) -> None:
 def test_cells_that_a_layer_covers_whole() -> None:
     covered = np.ones((2, 53, 77), bool)
     covered[0, 12, 20] = covered[1, 52, 76] = False
-    whole = seam._cells_whole(covered, plane(110, 70).resized(9, 5))
+    whole = on_cells(covered, plane(110, 70).resized(9, 5), np.logical_and)
     assert np.argwhere(~whole).tolist() == [[0, 1, 2], [1, 4, 8]]
