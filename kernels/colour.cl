@@ -22,13 +22,9 @@ __kernel void colour_difference(__global const float4 *layer_a, __global const f
     for (int y = top; y < bottom; y += 2)
         for (int x = left; x < right; x += 2) {
             tried += 1.0f;
-            const int2 p = (int2)(x, y);
-            const int at_a = box_index(p, box_a), at_b = box_index(p, box_b);
-            if (at_a < 0 || at_b < 0 || layer_a[at_a].w == 0.0f || layer_b[at_b].w == 0.0f)
-                continue;
-            const float4 a = layer_sample(layer_a, box_a, layer_position(p, field_a[at_a].xyz, lens), border);
-            const float4 b = layer_sample(layer_b, box_b, layer_position(p, field_b[at_b].xyz, lens), border);
-            if (a.w == 0.0f || b.w == 0.0f || any(a.xyz > clipped) || any(b.xyz > clipped))
+            float4 a, b;
+            if (!layer_pair(layer_a, field_a, box_a, layer_b, field_b, box_b, (int2)(x, y), border, lens, &a, &b) ||
+                any(a.xyz > clipped) || any(b.xyz > clipped))
                 continue;
             const float3 d = exposure_scale(a.xyz, integer) - exposure_scale(b.xyz, integer);
             sum += d;

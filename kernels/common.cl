@@ -133,6 +133,18 @@ static inline float2 layer_position(int2 p, float3 d, float4 lens) {
     return canvas_position(canvas_point(q, lens) + d, lens);
 }
 
+/* What two aligned layers show for working pixel p; false where they do not both show something. */
+static inline bool layer_pair(__global const float4 *layer_a, __global const float4 *field_a, int4 box_a,
+                              __global const float4 *layer_b, __global const float4 *field_b, int4 box_b,
+                              int2 p, int4 border, float4 lens, float4 *a, float4 *b) {
+    const int at_a = box_index(p, box_a), at_b = box_index(p, box_b);
+    if (at_a < 0 || at_b < 0 || layer_a[at_a].w == 0.0f || layer_b[at_b].w == 0.0f)
+        return false;
+    *a = layer_sample(layer_a, box_a, layer_position(p, field_a[at_a].xyz, lens), border);
+    *b = layer_sample(layer_b, box_b, layer_position(p, field_b[at_b].xyz, lens), border);
+    return a->w != 0.0f && b->w != 0.0f;
+}
+
 /* The scale on which exposure differences are smooth fields, c in 0..1 of full scale. Integer images: log odds,
    floats: log. The floor keeps dark noise, and what is nearly white, calm where differences are measured. */
 #define EXPOSURE_FLOOR 0.02f

@@ -238,7 +238,6 @@ __kernel void search_choose(__global const float4 *a,     /* (grid.y, grid.x) de
                             float focus,                  /* e-folds for a difference of 1 from the middle */
                             float2 outside,               /* misfit where not known: own flow, another */
                             float patience,               /* by how much another must fit better */
-                           
                             __global float2 *chosen)      /* (grid.y, grid.x) px */
 {
     const int x = get_global_id(0), y = get_global_id(1);
