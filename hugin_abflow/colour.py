@@ -6,8 +6,8 @@ through each layer, smoothly, and fades out. It is the minimum of
 
     sum_pairs c (g_a - g_b + d_ab)^2  +  sum_k |grad g_k|^2  +  g_k^2 / fade^2
 
-with d_ab the measured difference of the aligned layers, found by conjugate gradients. Where there is
-no difference it is exactly zero.
+with d_ab the measured difference of the aligned layers: a sparse linear system, solved directly. Where there
+is no difference it is exactly zero.
 """
 
 from __future__ import annotations
@@ -17,6 +17,8 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
+from scipy.sparse import csr_array, diags_array
+from scipy.sparse.linalg import splu
 
 from hugin_abflow.coefficient import on_cells
 from hugin_abflow.geometry import PairFlow
@@ -26,6 +28,9 @@ from hugin_abflow.working import Grid, WorkingLayer
 
 # Working pixels per cell of the colour grid.
 _CELL = 16
+# Layers that lie on each other, by their cubic mean: from here on cells grow with them, because the solution
+# takes time by cells^1.5 and layers^3.
+_DEEP = 4.0
 # Samples brighter than this, of full scale, may be clipped and measure nothing (integer images only).
 _CLIPPED = 0.98
 # Standard deviation of the differences within a cell that halves its trust, on the exposure scale.
@@ -39,8 +44,6 @@ _STRICT = ((0.01, 4.0), (0.03, 2.5), (0.3, 1.6), (3.0, 1.2), (100.0, 1.0))
 _FADE, _TREND_FADE = 0.12, 1.0
 # All gains shrink towards 0 by this, at most a quarter of an 8-bit level, so that small ones are exactly 0.
 _NEGLIGIBLE = 1e-3
-# Of the residual, relative: the gains are then right to a level of 255, where layers differ to a quarter.
-_TOLERANCE, _ITERATIONS = 2e-4, 400
 
 
 @dataclass(frozen=True)
@@ -53,9 +56,10 @@ class Correction:
     gains: tuple[Buffer | None, ...]
 
 
-def colour_grid(grid: Grid) -> Grid:
-    """The coarse grid over the working grid's region."""
-    return grid.coarser(_CELL)
+def colour_grid(grid: Grid, covered: npt.NDArray[np.bool_]) -> Grid:
+    """The coarse grid over the region of `grid`; covered: (layers, height, width), of any grid over it."""
+    depth = np.cbrt(np.mean(covered.sum(0, dtype=np.float64) ** 3))
+    return grid.coarser(max(_CELL, round(_CELL * depth / _DEEP)))
 
 
 def correction(
@@ -76,7 +80,7 @@ def correction(
     strict: leave out what may not be exposure, to see it.
     With `settings.exposure` off there is no correction.
     """
-    cells = colour_grid(grid)
+    cells = colour_grid(grid, covered)
     if not settings.exposure:
         return Correction(cells, (None,) * len(layers))
     measured = []
@@ -140,73 +144,45 @@ def solve(
         east[:, :, -1] = 0
     south = np.zeros(inside.shape)
     south[:, :-1] = (inside[:, :-1] & inside[:, 1:]) * np.sqrt(area[:-1] * area[1:])
+    number = np.cumsum(inside).reshape(inside.shape) - 1  # of a layer's cell among the unknowns
+    count = int(np.count_nonzero(inside))
+    step, stiffness = _steps(
+        [(number, np.roll(number, -1, 2), east), (number, np.roll(number, -1, 1), south)], count
+    )
+    # what a layer is measured to be beside its own cells binds nothing else
+    evidence = [d[..., 3] * area * (inside[a] & inside[b]) for a, b, d in measured]
+    link, weight = _steps(
+        [(number[a], number[b], e) for (a, b, _), e in zip(measured, evidence, strict=True)], count
+    )
+    difference = np.concatenate([d[e > 0, :3] for (_, _, d), e in zip(measured, evidence, strict=True)])
+    smooth = step.T @ diags_array(stiffness) @ step
     round_ = cells.circumference / (cells.lens[1] or 1.0)  # cells
-    solution = np.zeros((*inside.shape, 3))
+    solution = np.zeros((count, 3))
     for data, limit in rounds:
         fade = _TREND_FADE if rounds is _STRICT and data < rounds[-1][0] else _FADE
-        hold = inside * area / max(1.0, fade * round_) ** 2
-        links = []
-        for a, b, d in measured:
-            off = np.linalg.norm(solution[a] - solution[b] + d[..., :3], axis=-1) if solution.any() else 0.0
-            trust = np.maximum(0.0, 1 - (off / limit) ** 2) ** 2  # Tukey's biweight
-            links.append((a, b, data * area * d[..., 3] * trust, d[..., :3]))
-        solution = _minimise(links, hold, east, south, solution)
-    return solution
+        hold = (inside * area)[inside] / max(1.0, fade * round_) ** 2
+        off = np.linalg.norm(link @ solution + difference, axis=1) if solution.any() else 0.0
+        trusted = data * weight * np.maximum(0.0, 1 - (off / limit) ** 2) ** 2  # Tukey's biweight
+        matrix = diags_array(hold) + smooth + link.T @ diags_array(trusted) @ link
+        factors = splu(matrix.tocsc(), "MMD_AT_PLUS_A", diag_pivot_thresh=0, options={"SymmetricMode": True})
+        solution = factors.solve(-(link.T @ (trusted[:, None] * difference)))
+    result = np.zeros((*inside.shape, 3))
+    result[inside] = solution
+    return result
 
 
-def _minimise(
-    links: Sequence[tuple[int, int, npt.NDArray[np.float64], npt.NDArray[np.float64]]],
-    hold: npt.NDArray[np.float64],
-    east: npt.NDArray[np.float64],
-    south: npt.NDArray[np.float64],
-    start: npt.NDArray[np.float64],
-) -> npt.NDArray[np.float64]:
-    """Conjugate gradients, preconditioned by the diagonal, from `start`."""
+def _steps(
+    weighted: Sequence[tuple[npt.NDArray[np.intp], npt.NDArray[np.intp], npt.NDArray[np.float64]]], count: int
+) -> tuple[csr_array, npt.NDArray[np.float64]]:
+    """A matrix (n, count) that takes differences of `count` unknowns, and the weights (n,) of these.
 
-    # channels first in here: a last axis of 3 makes NumPy several times slower
-    def apply(g: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
-        out = hold * g
-        step = east * (g - np.roll(g, -1, -1))
-        out += step
-        out -= np.roll(step, 1, -1)
-        step = south * (g - np.roll(g, -1, -2))
-        out += step
-        out -= np.roll(step, 1, -2)
-        for a, b, weight, _ in links:
-            step = weight * (g[:, a] - g[:, b])
-            out[:, a] += step
-            out[:, b] -= step
-        return out
-
-    solution = np.ascontiguousarray(np.moveaxis(start, -1, 0))
-    right = np.zeros_like(solution)
-    diagonal = hold + east + np.roll(east, 1, 2) + south + np.roll(south, 1, 1)
-    for a, b, weight, difference in links:
-        step = weight * np.moveaxis(difference, -1, 0)
-        right[:, a] -= step
-        right[:, b] += step
-        diagonal[a] += weight
-        diagonal[b] += weight
-    scale = np.where(diagonal > 0, 1 / np.maximum(diagonal, 1e-12), 0)
-    residual = right - apply(solution)
-    z = scale * residual
-    direction = z.copy()
-    rho = float(np.vdot(residual, z))
-    enough = _TOLERANCE**2 * float(np.vdot(right, scale * right))
-    for _ in range(_ITERATIONS):
-        if rho <= enough:
-            break
-        image = apply(direction)
-        curvature = float(np.vdot(direction, image))
-        if curvature <= 0:  # what is left is rounding
-            break
-        length = rho / curvature
-        solution += length * direction
-        residual -= length * image
-        z = scale * residual
-        rho, last = float(np.vdot(residual, z)), rho
-        direction = z + (rho / last) * direction
-    return np.moveaxis(solution, 0, -1)
+    weighted    arrays of one shape: the unknown to take, the one to subtract, the weight; 0: no row.
+    """
+    taken, less, weights = (np.concatenate([entry[k][entry[2] > 0] for entry in weighted]) for k in range(3))
+    rows = np.arange(weights.size)
+    signs = np.repeat([1.0, -1.0], rows.size)
+    places = np.tile(rows, 2), np.concatenate([taken, less])
+    return csr_array((signs, places), shape=(rows.size, count)), weights
 
 
 def _extend(
