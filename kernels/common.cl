@@ -31,20 +31,45 @@ static inline int box_index(int2 p, int4 box) {
     return x >= 0 && y >= 0 && x < box.z && y < box.w ? y * box.z + x : -1;
 }
 
+/* Sine, and by its address cosine, of an angle of a few turns at most, to 1e-7: positions are calculated several
+   times for each pixel, and PoCL's own functions, good for any angle, take four times as long. */
+static inline float angle_sincos(float angle, float *cosine) {
+    const float quarter = rint(angle * M_2_PI_F);
+    /* pi / 2 in two parts, so that nothing is lost */
+    const float r = (angle - quarter * 1.5707962513f) - quarter * 7.5497894e-8f, r2 = r * r;
+    const float s = r + r * r2 * (-0.166666502f + r2 * (0.00833195158f - r2 * 0.000194922077f));
+    const float c = 1.0f - 0.5f * r2 + r2 * r2 * (0.0416666463f + r2 * (-0.00138873371f + r2 * 2.44348453e-5f));
+    const int turn = convert_int(quarter);
+    const float first = turn & 1 ? c : s, second = turn & 1 ? s : c;
+    *cosine = (turn + 1) & 2 ? -second : second;
+    return turn & 2 ? -first : first;
+}
+
+/* atan2 likewise; 0 where both are 0. */
+static inline float angle_of(float y, float x) {
+    const float ax = fabs(x), ay = fabs(y), longer = fmax(ax, ay);
+    const float t = longer > 0.0f ? fmin(ax, ay) / longer : 0.0f, t2 = t * t;
+    const float far = 0.0964219166f + t2 * (-0.055912249f + t2 * (0.0218629038f - t2 * 0.00405455219f));
+    const float near = -0.333298607f + t2 * (0.199465652f + t2 * (-0.139086273f + t2 * far));
+    float angle = t * (0.999999336f + t2 * near);
+    angle = ay > ax ? M_PI_2_F - angle : angle;
+    return copysign(x < 0.0f ? M_PI_F - angle : angle, y);
+}
+
 /* The lens of a canvas grid: lens = (lon of x = 0, radians per column, lat of y = 0, radians per row);
    radians per column 0 means a plane. */
 static inline float3 canvas_point(float2 p, float4 lens) {
     if (lens.y == 0.0f)
         return (float3)(p.x, p.y, 0.0f);
-    const float lon = lens.x + p.x * lens.y, lat = lens.z - p.y * lens.w;
-    const float c = cos(lat);
-    return (float3)(c * sin(lon), c * cos(lon), sin(lat));
+    float cl, cp;
+    const float sl = angle_sincos(lens.x + p.x * lens.y, &cl), sp = angle_sincos(lens.z - p.y * lens.w, &cp);
+    return (float3)(cp * sl, cp * cl, sp);
 }
 
 static inline float2 canvas_position(float3 q, float4 lens) {
     if (lens.y == 0.0f)
         return q.xy;
-    const float lon = atan2(q.x, q.y), lat = atan2(q.z, hypot(q.x, q.y));
+    const float lon = angle_of(q.x, q.y), lat = angle_of(q.z, sqrt(q.x * q.x + q.y * q.y));
     return (float2)((lon - lens.x) / lens.y, (lens.z - lat) / lens.w);
 }
 
@@ -57,8 +82,9 @@ static inline float2 canvas_position(float3 q, float4 lens) {
 static inline float3 chart_point(float2 u, const float16 *chart) {
     if (chart->sd == 0.0f)
         return (float3)((u.x - chart->sb) / chart->s9, (u.y - chart->sc) / chart->sa, 0.0f);
-    const float lon = (u.x - chart->sb) / chart->s9, lat = (chart->sc - u.y) / chart->sa;
-    const float c = cos(lat), x = c * sin(lon), y = c * cos(lon), z = sin(lat);
+    float cl, cp;
+    const float sl = angle_sincos((u.x - chart->sb) / chart->s9, &cl);
+    const float z = angle_sincos((chart->sc - u.y) / chart->sa, &cp), x = cp * sl, y = cp * cl;
     return (float3)(chart->s0 * x + chart->s3 * y + chart->s6 * z, chart->s1 * x + chart->s4 * y + chart->s7 * z,
                     chart->s2 * x + chart->s5 * y + chart->s8 * z);
 }
@@ -73,7 +99,8 @@ static inline float2 chart_position(float3 q, const float16 *chart) {
     const float x = chart->s0 * q.x + chart->s1 * q.y + chart->s2 * q.z;
     const float y = chart->s3 * q.x + chart->s4 * q.y + chart->s5 * q.z;
     const float z = chart->s6 * q.x + chart->s7 * q.y + chart->s8 * q.z;
-    return (float2)(atan2(x, y) * chart->s9 + chart->sb, chart->sc - atan2(z, hypot(x, y)) * chart->sa);
+    const float lon = angle_of(x, y), lat = angle_of(z, sqrt(x * x + y * y));
+    return (float2)(lon * chart->s9 + chart->sb, chart->sc - lat * chart->sa);
 }
 
 /* Bilinear reading of a grid at position q, over the taps that lie on it; 0 where none does. */
