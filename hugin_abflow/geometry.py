@@ -77,13 +77,17 @@ def displacements(
     flows: Sequence[PairFlow],
     grid: Grid,
     settings: Settings,
+    every: int = 1,
 ) -> list[Buffer]:
-    """The displacement alone, as in `fields`; the fourth component is 0."""
+    """The displacement alone, as in `fields`; the fourth component is 0.
+
+    every   columns and rows of a layer's box from one to the next: (height / every, width / every, 4).
+    """
     result = []
     for index in range(len(layers)):
-        field = _displacement(device, index, layers, coefficients, flows, grid, None)
+        field = _displacement(device, index, layers, coefficients, flows, grid, every, None)
         for _ in range(settings.fixed_point_steps):
-            field = _displacement(device, index, layers, coefficients, flows, grid, field)
+            field = _displacement(device, index, layers, coefficients, flows, grid, every, field)
         result.append(field)
     return result
 
@@ -95,10 +99,12 @@ def _displacement(
     coefficients: Sequence[Coefficients],
     flows: Sequence[PairFlow],
     grid: Grid,
+    every: int,
     guess: Buffer | None,
 ) -> Buffer:
     layer = layers[index]
-    field = device.zeros(layer.pixels.shape)
+    size = tuple(-(-n // every) for n in layer.box[2:])
+    field = device.zeros((*size[::-1], 4))
     for pair in flows:
         if index not in (pair.a, pair.b):
             continue
@@ -106,9 +112,9 @@ def _displacement(
         flow = pair.between(other if guess is None else index)
         chart_grid = (pair.chart.width, pair.chart.height, int(pair.chart.wraps), 0)
         device.run(
-            "geometry", "geometry_add", layer.box[2:], coefficients[other].blend, layers[other].box,
-            layer.pixels, layer.box, grid.border, grid.lens, flow, chart_grid, pair.chart.transform,
-            int(guess is not None), guess or field, field,
+            "geometry", "geometry_add", size, coefficients[other].blend, layers[other].box,
+            layer.pixels, layer.box, every, grid.border, grid.lens, flow, chart_grid, pair.chart.transform,
+            int(guess is not None), guess or field, field, size,
         )  # fmt: skip
     return field
 

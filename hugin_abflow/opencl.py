@@ -209,6 +209,14 @@ class Device:
         """A copy of a host array."""
         return self.empty(host.shape, dtype or host.dtype).set(host)
 
+    def copy(self, source: Buffer) -> Buffer:
+        """A copy of an array on the device."""
+        result = self.empty(source.shape, source.dtype)
+        if source.nbytes:
+            with _device_errors("copying a buffer"):
+                cl.enqueue_copy(self.queue, result.data, source.data, byte_count=source.nbytes)
+        return result
+
     def kernel(self, module: str, name: str, options: str = "") -> cl.Kernel:
         """Kernel `name` of ``kernels/<module>.cl``, built once per set of options."""
         key = (module, name, options)

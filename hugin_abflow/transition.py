@@ -28,6 +28,8 @@ from hugin_abflow.working import Grid, WorkingLayer
 
 # Working pixels per cell of the transition grid.
 _CELL = 16
+# Working pixels from one that the strain is measured at to the next: it is averaged over thousands.
+_EVERY = 4
 # Cells over which the strain is averaged (by its fourth power), and the exponent again.
 _SIGMA = 3.0
 # A transition is at least this part of the published one.
@@ -47,17 +49,17 @@ def narrow(
         return coefficients
     cells = grid.coarser(_CELL)
     strain = device.zeros((*cells.shape, 2))
-    displacements = geometry.displacements(device, layers, coefficients, flows, grid, settings)
+    displacements = geometry.displacements(device, layers, coefficients, flows, grid, settings, _EVERY)
     for layer, coefficient, displacement in zip(layers, coefficients, displacements, strict=True):
         device.run(
             "transition", "transition_strain", cells.border[:2], displacement, coefficient.blend,
-            layer.pixels, layer.box, grid.border, grid.lens, cells.border, strain,
+            layer.pixels, layer.box, grid.border, grid.lens, _EVERY, cells.border, strain,
         )  # fmt: skip
     power = device.upload(exponent(strain.get().astype(np.float64), settings.transition_strain, cells.wraps))
     total = device.zeros(grid.shape)
     result = []
     for layer, coefficient in zip(layers, coefficients, strict=True):
-        blend = device.upload(coefficient.blend.get())
+        blend = device.copy(coefficient.blend)
         device.run(
             "transition", "transition_sharpen", layer.box[2:], blend, layer.box, grid.border, power,
             cells.border, total,

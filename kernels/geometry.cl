@@ -2,29 +2,34 @@
    of the working grid, (displacement, colour weight); the displacement is a difference of points, so that it
    is continuous over the poles. */
 
+/* Coefficients below this move nothing by as much as a thousandth of a pixel. */
+#define GEOMETRY_NEGLIGIBLE 1e-5f
+
 /* Add one other layer's part. guess = 0: read F_jk at p (first order, as published). Otherwise F_kj is read at
    the place that `guess` says layer k is sampled, whose way to p it is: x_k = p - sum_j w_j F_kj(x_k). */
 __kernel void geometry_add(__global const float *blend_j,   /* (box_j.w, box_j.z) */
                            int4 box_j,                      /* place on the working grid */
                            __global const float4 *layer_k,  /* (box_k.w, box_k.z) r, g, b, valid */
-                           int4 box_k,                      /* place on the working grid; run size */
+                           int4 box_k,                      /* place on the working grid */
+                           int every,                       /* columns and rows from one to the next */
                            int4 border, float4 lens,        /* working grid */
                            __global const float2 *flow,     /* chart grid, px */
                            int4 grid, float16 chart,        /* chart */
                            int use_guess,
-                           __global const float4 *guess,    /* (box_k.w, box_k.z) displacement */
-                           __global float4 *field)          /* (box_k.w, box_k.z) displacement is added */
+                           __global const float4 *guess,    /* (size.y, size.x) displacement */
+                           __global float4 *field,          /* (size.y, size.x) displacement is added */
+                           int2 size)                       /* box_k.zw / every, rounded up; run size */
 {
-    const int x = get_global_id(0), y = get_global_id(1);
-    if (x >= box_k.z || y >= box_k.w)
+    const int i = get_global_id(0), j = get_global_id(1);
+    if (i >= size.x || j >= size.y)
         return;
-    const int at = y * box_k.z + x;
+    const int x = i * every, y = j * every, at = j * size.x + i;
     const int2 p = (int2)(x + box_k.x, y + box_k.y);
     const int at_j = box_index(p, box_j);
-    if (at_j < 0 || layer_k[at].w == 0.0f)
+    if (at_j < 0 || layer_k[y * box_k.z + x].w == 0.0f)
         return;
     const float w = blend_j[at_j];
-    if (w == 0.0f)
+    if (w < GEOMETRY_NEGLIGIBLE)
         return;
     float3 q = canvas_point((float2)(p.x + 0.5f, p.y + 0.5f), lens);
     if (use_guess) {

@@ -2,11 +2,12 @@
 
 /* Strain of a layer where it changes over, |grad w_k| |F_k|, in cells of the transition grid: sums of
    w (1 - w) strain^4 and of w (1 - w) are added, so that the middle of the transition counts most, and in it the
-   largest strain. Only every second pixel in x and y is read. */
-__kernel void transition_strain(__global const float4 *displacement, /* (box.w, box.z) of geometry.cl */
+   largest strain. Only every few columns and rows of the layer are read. */
+__kernel void transition_strain(__global const float4 *displacement, /* (box.w / every, box.z / every), rounded up */
                                 __global const float *blend,         /* (box.w, box.z) w_k */
                                 __global const float4 *layer,        /* (box.w, box.z) r, g, b, valid */
                                 int4 box, int4 border, float4 lens,  /* place on the working grid; the grid */
+                                int every,                           /* columns and rows from one read to the next */
                                 int4 cells,                          /* transition grid, run size */
                                 __global float2 *strain)             /* (cells.y, cells.x) */
 {
@@ -17,11 +18,12 @@ __kernel void transition_strain(__global const float4 *displacement, /* (box.w, 
     const int left = max(cx * border.x / cells.x - box.x, 1), top = max(cy * border.y / cells.y - box.y, 1);
     const int right = min((cx + 1) * border.x / cells.x - box.x, box.z - 1);
     const int bottom = min((cy + 1) * border.y / cells.y - box.y, box.w - 1);
+    const int columns = (box.z + every - 1) / every;
     const float unit = lens.y == 0.0f ? 1.0f : 1.0f / lens.y;
     float2 sum = (float2)(0.0f);
-    for (int y = top; y < bottom; y += 2) {
+    for (int y = (top + every - 1) / every * every; y < bottom; y += every) {
         const float across = lens.y == 0.0f ? 1.0f : fmax(cos(lens.z - (y + box.y + 0.5f) * lens.w), 0.02f);
-        for (int x = left; x < right; x += 2) {
+        for (int x = (left + every - 1) / every * every; x < right; x += every) {
             const int at = y * box.z + x;
             const float w = blend[at];
             if (w <= 0.0f || w >= 1.0f || layer[at].w == 0.0f || layer[at - 1].w == 0.0f ||
@@ -29,7 +31,7 @@ __kernel void transition_strain(__global const float4 *displacement, /* (box.w, 
                 continue;
             const float2 slope = 0.5f * (float2)((blend[at + 1] - blend[at - 1]) / across,
                                                  blend[at + box.z] - blend[at - box.z]);
-            const float flow = unit * length(displacement[at].xyz) / fmax(1.0f - w, 0.05f);
+            const float flow = unit * length(displacement[y / every * columns + x / every].xyz) / fmax(1.0f - w, 0.05f);
             const float s = length(slope) * flow, weight = w * (1.0f - w);
             sum += weight * (float2)(s * s * s * s, 1.0f);
         }
@@ -51,7 +53,8 @@ __kernel void transition_sharpen(__global float *blend,           /* (box.w, box
     float w = blend[at];
     if (w > 0.0f && w < 1.0f) {
         const float2 ratio = (float2)((float)cells.x / border.x, (float)cells.y / border.y);
-        w = pow(w, bilinear_scalar(power, ((float2)(x + box.x, y + box.y) + 0.5f) * ratio, cells));
+        /* pow, which is good for any numbers, takes several times as long */
+        w = exp(log(w) * bilinear_scalar(power, ((float2)(x + box.x, y + box.y) + 0.5f) * ratio, cells));
     }
     blend[at] = w;
     total[(y + box.y) * border.x + x + box.x] += w;

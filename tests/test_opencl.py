@@ -207,6 +207,14 @@ def test_buffers_carry_arrays_of_any_size(device: Device) -> None:
     assert device.zeros((0, 3)).get().shape == (0, 3)
 
 
+def test_a_copy_is_another_array(device: Device) -> None:
+    host = np.arange(15, dtype=np.float32).reshape(3, 5)
+    source = device.upload(host)
+    copy = device.copy(source)
+    source.fill(7)
+    assert np.array_equal(copy.get(), host)
+
+
 def test_vectors_are_of_their_numbers_kind() -> None:
     """(1, 1) equals (1.0, 1.0), but a kernel reads other bits."""
     for values in ((1, 1), (1.0, 1.0), (1, 2, 3, 4), (1.0, 2.0, 3.0, 4.0), np.arange(16, dtype=np.float32)):

@@ -8,6 +8,9 @@ import numpy as np
 
 from reference.common import Array, Numbers, bilinear, canvas_point, chart_point, chart_position, pixels, take
 
+# Coefficients below this move nothing.
+NEGLIGIBLE = 1e-5
+
 
 def flow_at(flow: Array, u: Array, v: Array, grid: Sequence[int]) -> Array:
     """Flow at chart positions, from the pixels that exist; 0 beyond the chart."""
@@ -21,6 +24,7 @@ def geometry_add(
     box_j: Sequence[int],
     layer_k: Array,
     box_k: Sequence[int],
+    every: int,
     lens: Numbers,
     flow: Array,
     grid: Sequence[int],
@@ -29,9 +33,10 @@ def geometry_add(
     guess: Array,
     field: Array,
 ) -> Array:
-    """Field of layer k, (height, width, 4), with the part of layer j added to its displacement."""
-    x, y = pixels(box_k[2], box_k[3], box_k[0], box_k[1])
-    weight = np.where(layer_k[..., 3] != 0, take(blend_j, box_j, x, y), 0.0)
+    """Field of layer k at every n-th column and row, with the part of layer j added to its displacement."""
+    x, y = (at[::every, ::every] for at in pixels(box_k[2], box_k[3], box_k[0], box_k[1]))
+    weight = np.where(layer_k[::every, ::every, 3] != 0, take(blend_j, box_j, x, y), 0.0)
+    weight[weight < NEGLIGIBLE] = 0
     point = canvas_point(x + 0.5, y + 0.5, lens)
     if use_guess:
         point = point + guess[..., :3]

@@ -16,9 +16,13 @@ def transition_strain(
     box: Sequence[int],
     border: Sequence[int],
     lens: Numbers,
+    every: int,
     cells: Sequence[int],
 ) -> Array:
-    """Sums of w (1 - w) strain^4 and w (1 - w) over every second pixel of each cell, (height, width, 2)."""
+    """Sums of w (1 - w) strain^4 and w (1 - w) in each cell, (height, width, 2).
+
+    Of the layer's pixels every n-th column and row is read; `displacement` has no others.
+    """
     left, top, _, height = box
     lens = np.asarray(lens, np.float64)
     w = blend.astype(np.float64)
@@ -28,7 +32,8 @@ def transition_strain(
         across = np.maximum(np.cos(lens[2] - (np.arange(height) + top + 0.5) * lens[3]), 0.02)
         unit = 1 / lens[1]
     down, right = np.gradient(w)
-    length = unit * np.linalg.norm(displacement[..., :3].astype(np.float64), axis=-1)
+    length = np.zeros(w.shape)
+    length[::every, ::every] = unit * np.linalg.norm(displacement[..., :3].astype(np.float64), axis=-1)
     strain = np.hypot(right / across[:, None], down) * length / np.maximum(1 - w, 0.05)
     valid = layer[..., 3] != 0
     usable = valid & (w > 0) & (w < 1)
@@ -42,7 +47,8 @@ def transition_strain(
             max(k * b // c - o, 1) for k, b, c, o in zip((i, j), border, cells, (left, top), strict=False)
         ]
         last = [(k + 1) * b // c - o for k, b, c, o in zip((i, j), border, cells, (left, top), strict=False)]
-        part = np.s_[first[1] : max(last[1], 0) : 2, first[0] : max(last[0], 0) : 2]
+        start = [-(-at // every) * every for at in first]
+        part = np.s_[start[1] : max(last[1], 0) : every, start[0] : max(last[0], 0) : every]
         weight = (w * (1 - w) * usable)[part]
         result[j, i] = (weight * strain[part] ** 4).sum(), weight.sum()
     return result
