@@ -105,8 +105,7 @@ def _refine(
         half = ((size[0] + 1) // 2, size[1])
         calls = [(system_left, system_right, grid, colour, parameters.relaxation, flow) for colour in (0, 1)]
         device.repeat("flow", "flow_relax", half, calls, sweeps)
-        device.run("flow", "flow_median", size, flow, grid, median)
-        flow, median = median, flow
+        flow, median = search.filtered(device, flow, grid, median), flow
     return flow
 
 

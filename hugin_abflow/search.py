@@ -43,6 +43,13 @@ def descriptor(device: Device, feature: Buffer, grid: Grid, parameters: SearchPa
     return result
 
 
+def filtered(device: Device, flow: Buffer, grid: Grid, result: Buffer) -> Buffer:
+    """`result`, filled with the median of `flow`: both float32 (height, width, 2)."""
+    four_at_a_time = (-(-grid[0] // 4), grid[1])
+    device.run("flow", "flow_median", four_at_a_time, flow, grid, result)
+    return result
+
+
 def level(reach: float, levels: int, parameters: SearchParameters) -> int:
     """The level, of `levels`, on which displacements of up to `reach` px of the finest are tried."""
     return min(levels - 1, max(0, math.ceil(math.log2(max(reach, 1) / parameters.coarse))))
@@ -83,8 +90,7 @@ def _coupled(
     for turn, coupling in enumerate(parameters.couplings):
         if turn:
             for _ in range(2):
-                device.run("flow", "flow_median", size, best, grid, median)
-                best, median = median, best
+                best, median = filtered(device, best, grid, median), best
             device.run("search", "search_mean", size, best, grid, smooth)
         device.run(
             "search", "search_best", size, cost, smooth if turn else flow, grid, reach, parameters.outside,

@@ -63,7 +63,7 @@ __kernel void coefficient_flood(__global const int *seed,    /* (grid.y, grid.x)
             if (!grid_border(&p, grid))
                 continue;
             const int s = seed[p.y * grid.x + p.x];
-            if (s < 0)
+            if (s < 0 || s == best)
                 continue;
             const float d = coefficient_measure((int2)(x, y), (int2)(s & 0xffff, s >> 16), grid, table);
             if (d < nearest || (d == nearest && s < best)) {

@@ -198,33 +198,14 @@ __kernel void flow_relax(__global const float4 *left_side,  /* (grid.y, grid.x) 
     if (x >= grid.x || y >= grid.y)
         return;
     const int at = y * grid.x + x;
+    /* across a border that does not wrap the weights are 0, so that any place will do */
+    const int east = x + 1 < grid.x ? at + 1 : at + 1 - grid.x, west = x > 0 ? at - 1 : at - 1 + grid.x;
+    const int south = y + 1 < grid.y ? at + grid.x : x, north = y > 0 ? at - grid.x : at + (grid.y - 1) * grid.x;
     const float4 j = left_side[at], b = right_side[at];
-    const float2 old = flow[at];
-    float2 sum = (float2)(0.0f);
-    float weight = 0.0f;
-    int2 p = (int2)(x + 1, y);
-    if (grid_border(&p, grid)) {
-        sum += j.w * flow[p.y * grid.x + p.x];
-        weight += j.w;
-    }
-    p = (int2)(x, y + 1);
-    if (grid_border(&p, grid)) {
-        sum += b.z * flow[p.y * grid.x + p.x];
-        weight += b.z;
-    }
-    p = (int2)(x - 1, y);
-    if (grid_border(&p, grid)) {
-        const float w = left_side[p.y * grid.x + p.x].w;
-        sum += w * flow[p.y * grid.x + p.x];
-        weight += w;
-    }
-    p = (int2)(x, y - 1);
-    if (grid_border(&p, grid)) {
-        const float w = right_side[p.y * grid.x + p.x].z;
-        sum += w * flow[p.y * grid.x + p.x];
-        weight += w;
-    }
-    float2 f = old;
+    const float from_west = left_side[west].w, from_north = right_side[north].z;
+    const float2 sum = j.w * flow[east] + b.z * flow[south] + from_west * flow[west] + from_north * flow[north];
+    const float weight = j.w + b.z + from_west + from_north;
+    float2 f = flow[at];
     const float dx = j.x + weight, dy = j.z + weight;
     if (dx > 0.0f)
         f.x += relaxation * ((sum.x + b.x - j.y * f.y) / dx - f.x);
@@ -233,24 +214,38 @@ __kernel void flow_relax(__global const float4 *left_side,  /* (grid.y, grid.x) 
     flow[at] = f;
 }
 
-static inline void flow_sort(float2 *a, float2 *b) {
-    const float2 low = fmin(*a, *b);
+/* The median takes this many pixels of a row at a time: compilers for CPUs do not find such work on their own. */
+#define FLOW_CHUNK 4
+
+static inline void flow_sort(float8 *a, float8 *b) {
+    const float8 low = fmin(*a, *b);
     *b = fmax(*a, *b);
     *a = low;
 }
 
 /* 3 x 3 median of each component: removes outliers, keeps edges of motion. */
 __kernel void flow_median(__global const float2 *flow, /* (grid.y, grid.x) */
-                          int4 grid,                   /* run size */
+                          int4 grid,                   /* run size: grid.x / FLOW_CHUNK, rounded up, grid.y */
                           __global float2 *median)     /* (grid.y, grid.x) */
 {
-    const int x = get_global_id(0), y = get_global_id(1);
-    if (x >= grid.x || y >= grid.y)
+    const int y = get_global_id(1), first = get_global_id(0) * FLOW_CHUNK;
+    if (first >= grid.x || y >= grid.y)
         return;
-    float2 v[9];
+    const bool inner = first > 0 && first + FLOW_CHUNK < grid.x && y > 0 && y + 1 < grid.y;
+    const int count = min(FLOW_CHUNK, grid.x - first);
+    float8 v[9];
     for (int k = 0; k < 9; ++k) {
-        int2 p = (int2)(x + k % 3 - 1, y + k / 3 - 1);
-        v[k] = grid_border(&p, grid) ? flow[p.y * grid.x + p.x] : flow[y * grid.x + x];
+        const int x = first + k % 3 - 1, row = y + k / 3 - 1;
+        if (inner) {
+            v[k] = vload8(0, (__global const float *)(flow + row * grid.x + x));
+            continue;
+        }
+        float2 values[FLOW_CHUNK];
+        for (int i = 0; i < FLOW_CHUNK; ++i) {
+            int2 p = (int2)(x + min(i, count - 1), row);
+            values[i] = flow[grid_border(&p, grid) ? p.y * grid.x + p.x : y * grid.x + first + min(i, count - 1)];
+        }
+        v[k] = vload8(0, (const float *)values);
     }
     /* the median of nine by 19 exchanges */
     flow_sort(v + 1, v + 2); flow_sort(v + 4, v + 5); flow_sort(v + 7, v + 8);
@@ -260,7 +255,14 @@ __kernel void flow_median(__global const float2 *flow, /* (grid.y, grid.x) */
     flow_sort(v + 3, v + 6); flow_sort(v + 1, v + 4); flow_sort(v + 2, v + 5);
     flow_sort(v + 4, v + 7); flow_sort(v + 4, v + 2); flow_sort(v + 6, v + 4);
     flow_sort(v + 4, v + 2);
-    median[y * grid.x + x] = v[4];
+    if (count == FLOW_CHUNK) {
+        vstore8(v[4], 0, (__global float *)(median + y * grid.x + first));
+        return;
+    }
+    float2 values[FLOW_CHUNK];
+    vstore8(v[4], 0, (float *)values);
+    for (int i = 0; i < count; ++i)
+        median[y * grid.x + first + i] = values[i];
 }
 
 /* Carry the flow of the coarser level to the next finer one: bilinear, doubled. */
