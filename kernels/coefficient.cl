@@ -55,6 +55,10 @@ __kernel void coefficient_flood(__global const int *seed,    /* (grid.y, grid.x)
     const int x = get_global_id(0), y = get_global_id(1);
     if (x >= grid.x || y >= grid.y)
         return;
+    if (seed[y * grid.x + x] == x + (y << 16)) { /* a seed itself: nothing is nearer */
+        flooded[y * grid.x + x] = x + (y << 16);
+        return;
+    }
     int best = -1;
     float nearest = INFINITY;
     for (int j = -step; j <= step; j += step)
