@@ -1,53 +1,61 @@
-"""The full-resolution pass: band by band, every layer sampled once, softmax-weighted (kernels/blend.cl)."""
+"""The full-resolution pass: band by band, every layer sampled once, softmax-weighted (kernels/blend.cl).
+
+Rows of the next band are decoded, several layers at a time, while the device calculates this one.
+"""
 
 from __future__ import annotations
 
 import math
+import os
 from collections.abc import Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from hugin_abflow.layer import Box
+from hugin_abflow.layer import Box, Layer
 from hugin_abflow.opencl import Buffer, Device, DeviceMemoryError
 from hugin_abflow.progress import Advance
 from hugin_abflow.settings import Settings
-from hugin_abflow.working import Grid, WorkingLayer, device_rows, pixel_options
+from hugin_abflow.working import Grid, device_dtype, device_rows, pixel_options
 
 # Bands of about this many output pixels, where the settings leave the choice.
-_BAND_PIXELS = 1 << 22
+_BAND_PIXELS = 1 << 20
 _LEAST_ROWS = 16
+# A layer with less than this share of a pixel's weight changes it by less than a quarter of a level, and need
+# not be sampled; of a level of 16 bits for floats.
+_QUARTER_LEVEL = {np.dtype(np.uint8): 0.25 / 255}
+_QUARTER_FINE_LEVEL = 0.25 / 65535
+
+Span = tuple[int, int]
 
 
 @dataclass(frozen=True)
 class BlendLayer:
     """What the full-resolution pass knows of one layer.
 
-    field   displacement and colour weight on the layer's box of the working grid.
-    reach   per row of that box, the largest vertical displacement, working px.
+    box     place of `field` on the working grid: left, top, width, height.
+    field   displacement and colour weight, float32 (height, width, 4).
+    reach   per row of `field`, the largest vertical displacement, working px.
     gain    on the exposure scale and the colour grid, float32 (height, width, 4); None: no correction.
     """
 
-    working: WorkingLayer
+    layer: Layer
+    box: tuple[int, int, int, int]
     field: Buffer
     reach: Sequence[float]
     gain: Buffer | None
 
 
-def _rows_needed(layer: BlendLayer, full: Grid, grid: Grid, top: int, bottom: int) -> tuple[int, int]:
-    """Layer rows (from, to) that region rows [top, bottom) may sample; equal if none."""
-    box, place = layer.working.layer.box, layer.working.box
-    scale = full.height / grid.height
-    first = max(0, math.floor(top / scale) - 1 - place[1])
-    last = min(place[3], math.ceil(bottom / scale) + 2 - place[1])
-    beyond = math.ceil(max(layer.reach[first:last], default=0.0) * scale) + 3  # 3: bicubic taps, rounding
-    offset = box.top - full.region.top
-    start, end = max(0, top - beyond - offset), min(box.height, bottom + beyond - offset)
-    if bottom <= offset or top >= offset + box.height:
-        return 0, 0
-    return start, max(start, end)
+@dataclass(frozen=True)
+class _Band:
+    """part: the band, in pixels of the region. rows: of each layer, what it may sample; equal if none."""
+
+    part: Box
+    rows: tuple[Span, ...]
 
 
 def bands(
@@ -63,62 +71,185 @@ def bands(
     """Rows of the panorama, from the crop's top to its bottom: (rows, crop width, channels + 1) in the
     layers' dtype, alpha last. `crop` is in canvas pixels; `advance` counts rows.
     """
-    first = layers[0].working.layer
     height = settings.band_rows or max(_LEAST_ROWS, _BAND_PIXELS // crop.width)
     top = crop.top
     while top < crop.bottom:
-        part = Box(crop.left, top, crop.right, min(crop.bottom, top + height))
+        rest = Box(crop.left, top, crop.right, crop.bottom)
         try:
-            out = _band(device, layers, full, grid, gain_grid, part, settings)
+            for out in _bands(device, layers, full, grid, gain_grid, rest, height, settings):
+                yield out
+                advance(len(out))
+                top += len(out)
         except DeviceMemoryError:
             if height <= _LEAST_ROWS:
                 raise
             height = max(_LEAST_ROWS, height // 2)  # the device is smaller than it says
-            continue
-        yield out.astype(first.dtype) if first.dtype == np.float16 else out
-        advance(part.height)
-        top = part.bottom
 
 
-def _band(
+def _bands(
     device: Device,
     layers: Sequence[BlendLayer],
     full: Grid,
     grid: Grid,
     gain_grid: Grid,
-    part: Box,
+    crop: Box,
+    height: int,
     settings: Settings,
-) -> npt.NDArray[Any]:
-    region = full.region
-    band = (part.left - region.left, part.top - region.top, part.width, part.height)
-    size = band[2:]
-    pixel, white = pixel_options(layers[0].working.layer)
-    integer = int(layers[0].working.layer.dtype.kind == "u")
-    options = f"{pixel} -DWHITE={white:.1f}f -DINTEGER={integer}"
-    shape = (part.height, part.width)
-    count = device.zeros(shape, np.uint8)
-    reference, total = device.zeros((*shape, 4)), device.zeros((*shape, 4))
-    stored: list[tuple[BlendLayer, Buffer, tuple[int, int, int, int]]] = []
-    for layer in layers:
-        start, end = _rows_needed(layer, full, grid, band[1], band[1] + band[3])
-        if start == end:
-            continue
-        box = layer.working.layer.box
-        rows = device.upload(device_rows(layer.working.layer, start, end))
-        place = (box.left - region.left, box.top - region.top + start, box.width, end - start)
-        device.run("blend", "blend_count", size, rows, place, band, count, options=options)
-        stored.append((layer, rows, place))
-    nothing = device.empty((1, 1, 4))
-    for layer, rows, place in stored:
-        device.run(
-            "blend", "blend_add", size, rows, place, band, full.border, full.lens,
-            layer.field, layer.working.box, grid.border,
-            layer.gain or nothing, gain_grid.border, int(layer.gain is not None),
-            int(settings.interpolation == "nearest"), count, reference, total, options=options,
-        )  # fmt: skip
-    samples = layers[0].working.layer.channels + 1
-    dtype = np.float32 if layers[0].working.layer.dtype == np.float16 else layers[0].working.layer.dtype
-    out = device.empty((*shape, samples), dtype)
-    origin = (region.left, region.top)
-    device.run("blend", "blend_finish", size, reference, total, band, origin, out, options=options)
-    return out.get()
+) -> Iterator[npt.NDArray[Any]]:
+    """Bands of `height` rows."""
+    region, first = full.region, layers[0].layer
+    pixel, white = pixel_options(first)
+    options = f"{pixel} -DWHITE={white:.1f}f -DINTEGER={int(first.dtype.kind == 'u')}"
+    share = _QUARTER_LEVEL.get(first.dtype, _QUARTER_FINE_LEVEL)
+    whole = (0, 0, gain_grid.width, gain_grid.height)
+    fields = [(layer.box, layer.field) for layer in layers]
+    gains = [(whole, layer.gain) for layer in layers if layer.gain is not None]
+    columns = _turn(device, full.lens[0], full.lens[1], crop.left - region.left, crop.width)
+    plan = _plan(layers, full, grid, crop, height)
+    with _Store(device, [layer.layer for layer in layers], [band.rows for band in plan]) as store:
+        for band in plan:
+            part = band.part
+            size = part.width, part.height
+            rows, row_starts = store.next()
+            ways, way_starts = _lines(device, fields, part, full, grid, share)
+            gained, gain_starts = _lines(device, gains, part, full, gain_grid, 0.0)
+            table = np.zeros((len(layers), 16), np.int32)
+            for k, (layer, (start, end)) in enumerate(zip(layers, band.rows, strict=True)):
+                box = layer.layer.box
+                table[k, :4] = box.left - region.left, box.top - region.top + start, box.width, end - start
+                table[k, 4:8] = layer.box[0], layer.box[2], whole[0], whole[2]
+                table[k, 8:10] = row_starts[k], way_starts[k]
+                table[k, 10] = -1 if layer.gain is None else gain_starts.pop(0)
+            used = [k for k, (start, end) in enumerate(band.rows) if start < end]
+            lines = _turn(device, full.lens[2], -full.lens[3], part.top, part.height)
+            out = device.empty((part.height, part.width, first.channels + 1), device_dtype(first))
+            device.run(
+                "blend", "blend_band", size, rows, device.upload(table[used]), len(used), ways, gained,
+                columns, lines, full.border, full.lens, grid.border, gain_grid.border,
+                (part.left, part.top, *size), (region.left, region.top),
+                int(settings.interpolation == "nearest"), share, out, options=options,
+            )  # fmt: skip
+            yield out.get().astype(first.dtype, copy=False)
+
+
+def _turn(device: Device, angle: float, step: float, first: int, count: int) -> Buffer:
+    """Sine and cosine at the centres of pixels, float32 (n, 2); angle: of the border of pixel 0."""
+    angles = angle + (np.arange(first, first + count) + 0.5) * step
+    return device.upload(np.stack([np.sin(angles), np.cos(angles)], -1).astype(np.float32))
+
+
+def _lines(
+    device: Device,
+    arrays: Sequence[tuple[tuple[int, int, int, int], Buffer]],
+    part: Box,
+    full: Grid,
+    grid: Grid,
+    share: float,
+) -> tuple[Buffer, list[int]]:
+    """Arrays on boxes of a coarse grid at the rows of a band: float32 (n, 4), and where each begins."""
+    scale = full.height / grid.height
+    table, values, lines = np.zeros((len(arrays), 8), np.int32), 0, 0
+    for entry, (box, _) in zip(table, arrays, strict=True):
+        first, last = _coarse_rows(box, part, scale)
+        entry[:6] = box[0], first, box[2], last - first, values, lines
+        values += box[2] * (last - first)
+        lines += box[2] * part.height
+    packed, result = device.empty((values, 4)), device.empty((lines, 4))
+    for (_, first, width, height, start, _, _, _), (box, array) in zip(table.tolist(), arrays, strict=True):
+        packed.copy(start, array, (first - box[1]) * width, height * width)
+    device.run(
+        "blend", "blend_rows", (grid.width, part.height), packed, device.upload(table), len(table),
+        (grid.width, part.height), part.top, scale, share, result,
+        options="-DPIXEL=float -DSAMPLES=4 -DWHITE=1.0f -DINTEGER=0",
+    )  # fmt: skip
+    return result, table[:, 5].tolist()
+
+
+def _coarse_rows(box: tuple[int, int, int, int], part: Box, scale: float) -> Span:
+    """Rows of a coarse grid in `box` that a band reads, at least one; scale: band rows per coarse row."""
+    _, top, _, height = box
+    first = min(max(math.floor(part.top / scale) - 1, top), top + height - 1)
+    return first, min(max(math.ceil(part.bottom / scale) + 2, first + 1), top + height)
+
+
+def _rows_needed(layer: BlendLayer, full: Grid, part: Box, scale: float) -> Span:
+    """Layer rows (from, to) that a band may sample; equal if none."""
+    box = layer.layer.box
+    offset = box.top - full.region.top
+    if part.bottom <= offset or part.top >= offset + box.height:
+        return 0, 0
+    first, last = (row - layer.box[1] for row in _coarse_rows(layer.box, part, scale))
+    beyond = math.ceil(max(layer.reach[first:last]) * scale) + 3  # 3: bicubic taps, rounding
+    return max(0, part.top - beyond - offset), min(box.height, part.bottom + beyond - offset)
+
+
+def _plan(layers: Sequence[BlendLayer], full: Grid, grid: Grid, crop: Box, height: int) -> list[_Band]:
+    """The bands from top to bottom. No band needs a row that the one before it has let go of."""
+    left, top = full.region.left, full.region.top
+    parts = [
+        Box(crop.left - left, start - top, crop.right - left, min(start + height, crop.bottom) - top)
+        for start in range(crop.top, crop.bottom, height)
+    ]
+    scale = full.height / grid.height
+    spans = [[_rows_needed(layer, full, part, scale) for layer in layers] for part in parts]
+    for k in range(len(layers)):
+        touched = [i for i, rows in enumerate(spans) if rows[k][0] < rows[k][1]]
+        for before, after in pairwise(touched):
+            spans[after][k] = spans[after][k][0], max(spans[before][k][1], spans[after][k][1])
+        for before, after in reversed(list(pairwise(touched))):
+            spans[before][k] = min(spans[before][k][0], spans[after][k][0]), spans[before][k][1]
+    return [_Band(part, tuple(rows)) for part, rows in zip(parts, spans, strict=True)]
+
+
+class _Store:
+    """Rows of all layers on the device, those that a band needs. Each row is decoded and uploaded once.
+
+    spans   for each band, the rows of each layer; from band to band neither end goes back.
+    """
+
+    def __init__(self, device: Device, layers: Sequence[Layer], spans: Sequence[Sequence[Span]]) -> None:
+        self._layers = layers
+        self._spans = iter(spans)
+        most = max(
+            sum((end - start) * layer.box.width for layer, (start, end) in zip(layers, band, strict=True))
+            for band in spans
+        )
+        dtype, samples = device_dtype(layers[0]), layers[0].channels + 1
+        self._buffers = [device.empty((most, samples), dtype) for _ in range(2)]
+        self._held: list[Span] = [(0, 0)] * len(layers)
+        self._starts = [0] * len(layers)
+        self._decoders = ThreadPoolExecutor(os.cpu_count())
+        self._coming = self._decode()
+
+    def __enter__(self) -> _Store:
+        return self
+
+    def __exit__(self, *reason: object) -> None:
+        self._decoders.shutdown(cancel_futures=True)
+
+    def _decode(self) -> tuple[Sequence[Span], list[Future[npt.NDArray[Any]]]]:
+        """Begin to decode what the next band needs beyond what is held."""
+        spans = next(self._spans, self._held)
+        return spans, [
+            self._decoders.submit(device_rows, layer, min(max(start, held), end), end)
+            for layer, (start, end), (_, held) in zip(self._layers, spans, self._held, strict=True)
+        ]
+
+    def next(self) -> tuple[Buffer, list[int]]:
+        """Rows of the next band: stored samples (n, channels + 1), and where each layer's begin."""
+        spans, coming = self._coming
+        before, now = self._buffers
+        starts, total = [], 0
+        for k, ((start, end), fresh) in enumerate(zip(spans, coming, strict=True)):
+            first, last = self._held[k]
+            width = self._layers[k].box.width
+            kept = max(0, min(last, end) - start)
+            now.copy(total, before, self._starts[k] + (start - first) * width, kept * width)
+            rows = fresh.result()
+            now.put(total + kept * width, rows.reshape(-1, rows.shape[2]))
+            starts.append(total)
+            total += (end - start) * width
+        self._buffers.reverse()
+        self._held, self._starts = list(spans), starts
+        self._coming = self._decode()
+        return now, starts

@@ -120,14 +120,16 @@ def _displacement(
 
 
 def shown_at(
-    layer: WorkingLayer, field: Buffer, grid: Grid, places: npt.NDArray[np.float64]
+    box: tuple[int, int, int, int], field: Buffer, grid: Grid, places: npt.NDArray[np.float64]
 ) -> npt.NDArray[np.float64]:
-    """Where the panorama shows what the layer has at `places`: both float64 (n, 2), canvas px.
+    """Where the panorama shows what a layer has at `places`: both float64 (n, 2), canvas px.
+
+    box     place of the layer's field on the working grid.
 
     x_k(p) = q, solved for p by a fixed point, which is good where displacements are smooth.
     """
     displacements = field.get()[..., :3].astype(np.float64)
-    left, top, width, height = layer.box
+    left, top, width, height = box
     points = grid.points(places)
     scale = np.array([grid.width / grid.region.width, grid.height / grid.region.height])
     shown = places

@@ -133,7 +133,7 @@ def prepare(
     flows = _flows(device, reduced, masks, grid, progress, parameters, reach, its_guides, numbers)
     fields, correction = _align(device, reduced, coefficients, flows, masks, grid, settings)
     final = [
-        BlendLayer(layer, field, geometry.reach(device, layer, field, grid), gain)
+        BlendLayer(layer.layer, layer.box, field, geometry.reach(device, layer, field, grid), gain)
         for layer, field, gain in zip(reduced, fields, correction.gains, strict=True)
     ]
     final += [_unblended(device, everything[i]) for i in range(len(everything)) if i not in used]
@@ -196,8 +196,7 @@ def _redundant(index: int, layers: Sequence[WorkingLayer], masks: Masks) -> bool
 def _unblended(device: Device, layer: WorkingLayer) -> BlendLayer:
     """A layer without weight: it shows only where no other layer is."""
     left, top = layer.box[:2]
-    place = replace(layer, box=(left, top, 1, 1))
-    return BlendLayer(place, device.zeros((1, 1, 4)), [0.0], None)
+    return BlendLayer(layer.layer, (left, top, 1, 1), device.zeros((1, 1, 4)), [0.0], None)
 
 
 def _flows(

@@ -175,6 +175,29 @@ class Buffer:
                 cl.enqueue_copy(self._queue, self.data, np.ascontiguousarray(host, self.dtype))
         return self
 
+    def put(self, start: int, host: npt.NDArray[Any]) -> None:
+        """Copy from the host to this buffer's pixels from `start` on; the last axis is one pixel."""
+        if host.size:
+            with _device_errors("copying from the host"):
+                cl.enqueue_copy(
+                    self._queue, self.data, np.ascontiguousarray(host, self.dtype),
+                    dst_offset=start * self._pixel,
+                )  # fmt: skip
+
+    def copy(self, start: int, source: Buffer, first: int, count: int) -> None:
+        """Copy `count` pixels of another buffer, from its `first` on, to this one's from `start` on."""
+        if count:
+            with _device_errors("copying on the device"):
+                cl.enqueue_copy(
+                    self._queue, self.data, source.data, byte_count=count * self._pixel,
+                    src_offset=first * self._pixel, dst_offset=start * self._pixel,
+                )  # fmt: skip
+
+    @property
+    def _pixel(self) -> int:
+        """Bytes of the last axis."""
+        return self.shape[-1] * self.dtype.itemsize
+
     def fill(self, value: float) -> Buffer:
         """Set every element."""
         if self.nbytes:

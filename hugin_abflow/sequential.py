@@ -97,11 +97,11 @@ def _merge_two(
 
 def _moved(guides: Sequence[Guide], numbers: Sequence[int], layer: Layer, prepared: Prepared) -> list[Guide]:
     """The guides, with the ends on `layer` (one of `numbers`) where the mosaic shows them."""
-    (placed,) = (one for one in prepared.layers if one.working.layer is layer)
+    (placed,) = (one for one in prepared.layers if one.layer is layer)
     ends = [end for g in guides for end, number in ((g.at_a, g.a), (g.at_b, g.b)) if number in numbers]
     if not ends:
         return list(guides)
-    shown = iter(geometry.shown_at(placed.working, placed.field, prepared.grid, np.array(ends)).tolist())
+    shown = iter(geometry.shown_at(placed.box, placed.field, prepared.grid, np.array(ends)).tolist())
     return [
         replace(
             g,

@@ -11,6 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 from zlib import crc32
 
 import numpy as np
@@ -145,16 +146,20 @@ def working_grid(full: Grid, settings: Settings) -> Grid:
     return full.resized(min(width, full.width), min(height, full.height))
 
 
+def device_dtype(layer: Layer) -> np.dtype[Any]:
+    """The type of a layer's samples on the device (half as float32)."""
+    return np.dtype(np.float32) if layer.dtype == np.float16 else layer.dtype
+
+
 def pixel_options(layer: Layer) -> tuple[str, float]:
     """Build options and full-scale value for a layer's rows on the device."""
-    name, white = PIXEL["float32" if layer.dtype == np.float16 else layer.dtype.name]
+    name, white = PIXEL[device_dtype(layer).name]
     return f"-DPIXEL={name} -DSAMPLES={layer.channels + 1}", white
 
 
 def device_rows(layer: Layer, top: int, bottom: int) -> np.ndarray:
-    """Rows of a layer in a type that kernels read (half as float32)."""
-    rows = layer.read(top, bottom)
-    return rows.astype(np.float32) if rows.dtype == np.float16 else rows
+    """Rows of a layer in a type that kernels read."""
+    return layer.read(top, bottom).astype(device_dtype(layer), copy=False)
 
 
 def _span(low: int, high: int, start: int, ratio: tuple[int, int]) -> tuple[int, int]:

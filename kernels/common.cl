@@ -181,12 +181,16 @@ static inline float3 exposure_scale(float3 c, int integer) {
     return integer ? log(low / (fmax(1.0f - c, 0.0f) + EXPOSURE_FLOOR)) : log(low);
 }
 
-/* Add a gain on that scale: the odds of an integer image's colour, or a float's value, times exp(gain). Black
-   and an integer image's white stay, so that nothing clips or turns grey; exactly c where the gain is 0. */
+/* Multiply by 1 + rise the odds of an integer image's colour, or a float's value. Black and an integer image's
+   white stay, so that nothing clips or turns grey; exactly c where the rise is 0. */
+static inline float3 exposure_raise(float3 c, float3 rise, float white, int integer) {
+    const float3 low = c < white ? c : white;
+    return c + c * rise * (integer ? (white - low) / (white + low * rise) : 1.0f);
+}
+
+/* Add a gain on the exposure scale. */
 static inline float3 exposure_shift(float3 c, float3 gain, int integer) {
-    const float3 factor = exp(gain);
-    const float3 shifted = integer ? c * factor / (1.0f + fmin(c, 1.0f) * (factor - 1.0f)) : c * factor;
-    return select(shifted, c, gain == 0.0f);
+    return exposure_raise(c, expm1(gain), 1.0f, integer);
 }
 
 /* Catmull-Rom weights of the four taps around fraction t: exactly (0, 1, 0, 0) at t = 0. */

@@ -58,7 +58,7 @@ def blend_layer(
         field = field[: reduced.box[3], : reduced.box[2]]
     buffer = device.upload(field)
     reach = geometry.reach(device, reduced, buffer, grid)
-    return BlendLayer(reduced, buffer, reach, None if gain is None else device.upload(gain))
+    return BlendLayer(layer, reduced.box, buffer, reach, None if gain is None else device.upload(gain))
 
 
 def merged(

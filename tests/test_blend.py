@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -11,13 +12,12 @@ from grids import patches, plane, sphere
 from reference import blend as twin
 from reference import common
 from scipy import ndimage
-from tolerances import DECISIONS, POSITION, TRIGONOMETRY, assert_close
+from tolerances import DECISIONS, POSITION, SUM, assert_close
 
 from hugin_abflow import working
-from hugin_abflow.blend import BlendLayer
 from hugin_abflow.layer import Box, Layer
 from hugin_abflow.opencl import Device
-from hugin_abflow.working import Grid, WorkingLayer
+from hugin_abflow.working import Grid
 
 STORED = [(dtype, channels) for dtype in (np.uint8, np.uint16, np.float32) for channels in (1, 3)]
 GRIDS = {"plane": plane(), "cylinder": plane(wraps=True), "sphere": sphere(), "odd sphere": sphere(77, 39)}
@@ -88,64 +88,124 @@ def test_twin_of_position_turns_by_an_angle() -> None:
     )
 
 
+@pytest.mark.parametrize("name", list(GRIDS))
+@pytest.mark.parametrize("share", [0.0, 0.1])
+def test_rows_equal_their_twin(device: Device, name: str, share: float) -> None:
+    """Arrays of parts of the grid, which end above and below the band; small weights turn negative."""
+    full = GRIDS[name]
+    grid = full.resized(48, 25)
+    boxes = [(2, 0, 31, 24), (0, 3, 48, 9), (40, 20, 5, 4)]
+    fields = [field_of(7 + i, grid, box, 1.5) for i, box in enumerate(boxes)]
+    lines, found = blended_rows(device, fields, boxes, full, grid, (2, 1, 71, 36), share)
+    for line, expected in zip(lines, found, strict=True):
+        assert_close(line, expected, SUM, scale=grid.lens[1] or 1)
+    assert any((expected[..., 3] < 0).any() for expected in found) == (share > 0)
+
+
+def blended_rows(
+    device: Device, fields: list, boxes: list, full: Grid, grid: Grid, band: tuple, share: float
+) -> tuple[list[np.ndarray], list[np.ndarray]]:
+    """What the kernel makes of fields for a band, and what its twin does."""
+    begins = np.cumsum([0, *(box[2] * box[3] for box in boxes)])
+    starts = np.cumsum([0, *(box[2] * band[3] for box in boxes)])
+    arrays = [(*box, begin, start, 0, 0) for box, begin, start in zip(boxes, begins, starts, strict=False)]
+    scale, size = full.height / grid.height, (grid.width, band[3])
+    out = device.empty((starts[-1], 4))
+    device.run(
+        "blend", "blend_rows", size, device.upload(np.concatenate([f.reshape(-1, 4) for f in fields])),
+        device.upload(np.array(arrays, np.int32)), len(boxes), size, band[1], scale, share, out,
+        options="-DPIXEL=float -DSAMPLES=4 -DWHITE=1.0f -DINTEGER=0",
+    )  # fmt: skip
+    parts = zip(np.split(out.get(), starts[1:-1]), boxes, strict=True)
+    lines = [part.reshape(band[3], box[2], 4) for part, box in parts]
+    return lines, twin.blend_rows(fields, boxes, size, band[1], scale, share)
+
+
 @pytest.mark.parametrize(("dtype", "channels"), STORED)
 @pytest.mark.parametrize("name", list(GRIDS))
 @pytest.mark.parametrize("nearest", [0, 1])
-def test_a_band_of_two_layers_equals_its_twin(
+def test_a_band_of_three_layers_equals_its_twin(
     device: Device, dtype: type, channels: int, name: str, nearest: int
 ) -> None:
-    """Every kernel in turn; the layers overlap in part, reach across the border, and differ in exposure."""
+    """They overlap in part, reach across the border, and differ in exposure; some is hidden."""
     full = GRIDS[name]
-    grid = full.resized(48, 25)
-    places = ((3, 0, 50, 37), (0, 5, full.width, 34))
-    band = (2, 1, 71, 36)
-    cells = full.resized(7, 5)
-    options, white = options_of(Layer.from_array("a", stored_pixels(4, 5, 5, dtype, channels, 1)))
-    count, total = np.zeros((36, 71), np.uint8), np.zeros((36, 71, 4))
-    reference = np.zeros((36, 71, 4))
-    counts, sums = device.upload(count), device.upload(total, np.float32)
-    references = device.upload(reference, np.float32)
+    grid, cells = full.resized(48, 25), full.resized(7, 5)
+    places = [(3, 0, 50, 37), (0, 5, full.width, 34), (20, 2, 40, 30)]
+    boxes = [(2, 0, 31, 24), (0, 3, 48, 22), (12, 1, 26, 20)]
+    band, origin, share = (2, 1, 71, 36), (1301, 77), 0.05
+    fields = [field_of(7 + i, grid, box, 1.5) for i, box in enumerate(boxes)]
+    fields[2][..., 3] *= 0.02
+    gains: list[np.ndarray | None] = [None]
+    for seed in (9, 10):
+        gain = np.random.default_rng(seed).normal(size=(5, 7, 4)).astype(np.float32) * 0.2
+        gain[:, :3] = 0
+        gains.append(gain)
     stored = [stored_pixels(5 + i, p[2], p[3], dtype, channels, 0.95) for i, p in enumerate(places)]
-    buffers = [device.upload(rows) for rows in stored]
-    for rows, buffer, box in zip(stored, buffers, places, strict=True):
-        device.run("blend", "blend_count", band[2:], buffer, box, band, counts, options=options)
-        count = twin.blend_count(rows, box, band, count, white)
-    assert np.array_equal(counts.get(), count)
-    assert {0, 1, 2} == set(count.ravel())
-    for i, (rows, buffer, box) in enumerate(zip(stored, buffers, places, strict=True)):
-        field_box = (2, 0, 31, 24) if i == 0 else (0, 3, 48, 22)
-        field = field_of(7 + i, grid, field_box, 1.5)
-        gain = np.random.default_rng(9).normal(size=(5, 7, 4)).astype(np.float32) * 0.2 if i else None
-        if gain is not None:
-            gain[:, :3, :3] = 0
-        device.run(
-            "blend", "blend_add", band[2:], buffer, box, band, full.border, full.lens,
-            device.upload(field), field_box, grid.border,
-            device.upload(gain) if gain is not None else counts, cells.border, int(gain is not None),
-            nearest, counts, references, sums, options=options,
-        )  # fmt: skip
-        reference, total = twin.blend_add(
-            rows, box, band, full.border, full.lens, field, field_box, grid.border, gain, cells.border,
-            nearest, count, reference, total, white,
-        )  # fmt: skip
-    assert_close(references.get(), reference, TRIGONOMETRY, scale=white)
-    # smooth pixels change by a third of full scale from one to the next; nearest ones by a step
-    assert_close(sums.get(), total, 10 * POSITION, DECISIONS, scale=white)
-    assert 0.3 < (total[..., 3] > 0).mean() < 0.9
+    options, white = options_of(Layer.from_array("a", stored[0]))
+    ways, _ = blended_rows(device, fields, boxes, full, grid, band, share)
+    gained, _ = blended_rows(device, gains[1:], [(0, 0, 7, 5)] * 2, full, cells, band, 0.0)
+
+    table = np.zeros((3, 16), np.int32)
+    table[:, :4] = places
+    table[:, 4:6] = [(box[0], box[2]) for box in boxes]
+    table[:, 6:8] = 0, 7
+    table[:, 8] = np.cumsum([0, *(p[2] * p[3] for p in places)])[:3]
+    table[:, 9] = np.cumsum([0, *(box[2] * band[3] for box in boxes)])[:3]
+    table[:, 10] = -1, 0, 7 * band[3]
+    x, y = (a + 0.5 for a in (np.arange(2, 73), np.arange(1, 37)))
+    angles = full.lens[0] + x * full.lens[1], full.lens[2] - y * full.lens[3]
+    turns = [device.upload(np.stack([np.sin(a), np.cos(a)], -1).astype(np.float32)) for a in angles]
     out = device.empty((36, 71, channels + 1), dtype)
-    references.set(reference)
-    sums.set(total)
-    origin = (1301, 77)
-    device.run("blend", "blend_finish", band[2:], references, sums, band, origin, out, options=options)
-    integer = int(np.dtype(dtype).kind == "u")
-    expected = twin.blend_finish(reference, total, band, origin, channels + 1, white, integer)
-    assert {0, 1, 2} == set(reference[..., 3].ravel())
-    assert np.array_equal(out.get()[..., -1] > 0, count > 0)
-    if integer:  # halves may be rounded either way
-        assert np.abs(out.get() - expected).max() <= 1
-        assert (out.get() != expected).mean() <= (DECISIONS if white == 255 else 0.05)
-    else:
-        assert_close(out.get(), expected, TRIGONOMETRY)
+    packed = [
+        np.concatenate([a.reshape(-1, a.shape[-1]) for a in arrays]) for arrays in (stored, ways, gained)
+    ]
+    rows, lines, factors = (device.upload(a) for a in packed)
+    device.run(
+        "blend", "blend_band", band[2:], rows, device.upload(table), 3, lines, factors, *turns,
+        full.border, full.lens, grid.border, cells.border, band, origin, nearest, share, out, options=options,
+    )  # fmt: skip
+    lefts = [box[0] for box in boxes]
+    expected = twin.blend_band(
+        stored, places, ways, lefts, [None, *gained], full.border, full.lens, grid.border, cells.border,
+        band, origin, nearest, share, white,
+    )  # fmt: skip
+    result = out.get()
+    assert 0.6 < (expected[..., -1] > 0).mean() < 1
+    assert np.array_equal(result[..., -1] > 0, expected[..., -1] > 0)
+    # smooth pixels change by a third of full scale from one to the next; nearest ones by a step
+    if white == 1:
+        assert_close(result, expected, 10 * POSITION, 2 * DECISIONS)
+    else:  # what is halfway between two levels may go to either
+        off = np.abs(result - expected)
+        assert (off > max(1, 10 * POSITION * white)).mean() <= 2 * DECISIONS
+        assert (off > 0).mean() <= (5 * DECISIONS if white == 255 else 0.3)
+
+
+def test_what_nobody_sees_changes_nothing(device: Device) -> None:
+    """A share below a quarter of a level; one that is seen counts in full."""
+    full = plane()
+    grid = full.resized(31, 17)
+    dark, bright = (np.full((53, 77, 4), value, np.uint16) for value in (20_000, 60_000))
+    for pixels in dark, bright:
+        pixels[..., 3] = 65535
+    for share, expected in ((3e-6, 20_000), (1e-4, 20_004)):
+        field = np.zeros((17, 31, 4), np.float32)
+        field[..., 3] = 1
+        layers = [blend_layer(device, dark, 0, 0, full, grid, field)]
+        layers.append(blend_layer(device, bright, 0, 0, full, grid, field * share))
+        assert (merged(device, layers, full, grid)[..., 0] == expected).all()
+
+
+def test_what_is_hidden_shows_where_nothing_else_does(device: Device) -> None:
+    """The layer that counts is sampled outside itself: there the one under it is seen, moved as it says."""
+    full = plane()
+    grid = full.resized(77, 53)
+    pixels = [stored_pixels(40 + i, 77, 53, np.uint8, 3, 1) for i in (0, 1)]
+    lost, under = (np.zeros((53, 77, 4), np.float32) for _ in range(2))
+    lost[...] = 500, 0, 0, 1
+    under[...] = 3, 0, 0, 1e-5
+    layers = [blend_layer(device, p, 0, 0, full, grid, f) for p, f in zip(pixels, (lost, under), strict=True)]
+    np.testing.assert_array_equal(merged(device, layers, full, grid)[:, :73], pixels[1][:, 3:76])
 
 
 @pytest.mark.parametrize("name", list(GRIDS))
@@ -183,24 +243,27 @@ def test_a_band_sees_the_next_rows_displacements(device: Device) -> None:
         assert np.array_equal(merged(device, [layer, layer], full, grid, rows=rows), whole)
 
 
-def test_a_band_reads_only_rows_that_it_needs(device: Device) -> None:
-    """Memory grows with the band, not with the picture."""
+@pytest.mark.parametrize("far", [0.0, 9.0])
+def test_a_band_reads_only_rows_that_it_needs(device: Device, far: float) -> None:
+    """Memory grows with the band, not with the picture; and no row is read twice, where one band reaches far
+    back either."""
     full = plane(77, 300)
     grid = full.resized(39, 150)
     pixels = stored_pixels(14, 77, 300, np.uint8, 3, 1)
     asked: list[tuple[int, int]] = []
-    layer = blend_layer(device, pixels, 0, 0, full, grid)
+    field = np.zeros((150, 39, 4), np.float32)
+    field[..., 3] = 1
+    field[70, :, 1] = -far
+    layer = blend_layer(device, pixels, 0, 0, full, grid, field)
     watched = Layer(
-        "w", layer.working.layer.box, np.dtype(np.uint8), 3,
+        "w", layer.layer.box, np.dtype(np.uint8), 3,
         lambda top, bottom: (asked.append((top, bottom)), pixels[top:bottom])[1],
     )  # fmt: skip
-    layer = BlendLayer(
-        WorkingLayer(watched, layer.working.box, layer.working.pixels, 0), layer.field, layer.reach, None
-    )
-    assert np.array_equal(merged(device, [layer, layer], full, grid, rows=10), pixels)
-    assert max(bottom - top for top, bottom in asked) <= 10 + 2 * 3
-    assert min(top for top, _ in asked) == 0
-    assert max(bottom for _, bottom in asked) == 300
+    layers = [replace(layer, layer=watched)] * 2
+    assert np.array_equal(merged(device, layers, full, grid, rows=10), pixels) == (far == 0)
+    assert max(bottom - top for top, bottom in asked) <= 10 + 2 * (3 + 2 * far)
+    rows = [row for top, bottom in asked for row in range(top, bottom)]
+    assert sorted(rows) == sorted([*range(300)] * 2)
 
 
 @pytest.mark.parametrize(("dtype", "channels"), [*STORED, (np.float16, 3)])

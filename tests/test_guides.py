@@ -140,7 +140,7 @@ def test_panorama_shows_a_layers_places_where_it_says(device: Device, name: str)
     field = np.zeros((height, width, 4), np.float32)
     field[..., :3] = (grid.points(sampled) - grid.points(shown)).reshape(height, width, 3)
     inner = ((x > 4) & (x < 33) & (y > 4) & (y < 24)).ravel()
-    found = geometry.shown_at(layer, device.upload(field), grid, sampled[inner])
+    found = geometry.shown_at(layer.box, device.upload(field), grid, sampled[inner])
     assert np.abs(found - shown[inner]).max() < 0.25  # the field is read without interpolation
 
 

@@ -354,7 +354,7 @@ def test_memory_too_small_for_the_smallest_band_is_an_error(small_memory, monkey
     def too_small(*arguments):
         raise opencl.DeviceMemoryError("no memory for a band")
 
-    monkeypatch.setattr(blend, "_band", too_small)
+    monkeypatch.setattr(blend, "_bands", too_small)
     with pytest.raises(DeviceError, match="no memory for a band"):
         merged(with_parallax(CANVASES["plane"]), CANVASES["plane"])
 

@@ -215,6 +215,19 @@ def test_a_copy_is_another_array(device: Device) -> None:
     assert np.array_equal(copy.get(), host)
 
 
+def test_parts_of_buffers_are_copied(device: Device) -> None:
+    values = np.arange(40 * 3, dtype=np.uint16).reshape(40, 3)
+    source, target = device.upload(values.reshape(4, 10, 3)), device.zeros((20, 3), np.uint16)
+    target.copy(2, source, 25, 9)
+    target.put(11, values[:5, ::-1].reshape(1, 5, 3))
+    expected = np.zeros((20, 3), np.uint16)
+    expected[2:11], expected[11:16] = values[25:34], values[:5, ::-1]
+    assert np.array_equal(target.get(), expected)
+    target.copy(20, source, 40, 0)
+    target.put(20, values[:0])
+    assert np.array_equal(target.get(), expected)
+
+
 def test_vectors_are_of_their_numbers_kind() -> None:
     """(1, 1) equals (1.0, 1.0), but a kernel reads other bits."""
     for values in ((1, 1), (1.0, 1.0), (1, 2, 3, 4), (1.0, 2.0, 3.0, 4.0), np.arange(16, dtype=np.float32)):

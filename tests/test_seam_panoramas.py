@@ -184,7 +184,7 @@ def test_weights_outside_the_regions_stay(device: Device, monkeypatch: pytest.Mo
     reach = np.kron(reach, np.ones((8, 8), bool))
     changed = 0
     for layer, before, after in zip(found.layers, seen["before"], seen["after"], strict=True):
-        left, top, width, height = layer.working.box
+        left, top, width, height = layer.box
         there = reach[top : top + height, left : left + width]
         assert np.array_equal(before[~there], after[~there])
         assert np.array_equal(before[..., :3], after[..., :3])

@@ -28,12 +28,6 @@ def opaque(rows: Array, white: float) -> Array:
     return np.where(valid[..., None], pixels_, 0.0)
 
 
-def blend_count(rows: Array, box: Sequence[int], band: Sequence[int], count: Array, white: float) -> Array:
-    """How many layers cover each pixel of the band, this one included."""
-    x, y = pixels(band[2], band[3], band[0], band[1])
-    return np.minimum(count + take(opaque(rows, white)[..., 3], box, x, y), 2).astype(np.uint8)
-
-
 def sample(
     pixels_: Array, box: Sequence[int], x: Array, y: Array, border: Sequence[int], nearest: int
 ) -> Array:
@@ -88,45 +82,101 @@ def correct(colour: Array, gain: Array, white: float) -> Array:
     return np.where(gain == 0, colour, exposure_shift(colour / white, gain, int(white > 1)) * white)
 
 
-def blend_add(
-    rows: Array,
-    box: Sequence[int],
-    band: Sequence[int],
+def blend_rows(
+    arrays: Sequence[Array],
+    boxes: Sequence[Sequence[int]],
+    size: Sequence[int],
+    top: int,
+    scale: float,
+    share: float,
+) -> list[Array]:
+    """Arrays on parts of a grid at the heights of a band's rows; weights below a share turn negative."""
+    lines, total = [], np.zeros((size[1], size[0]))
+    y = (top + np.arange(size[1])[:, None] + 0.5) / scale
+    for values, box in zip(arrays, boxes, strict=True):
+        columns = np.s_[:, box[0] : box[0] + box[2]]
+        x = box[0] + np.arange(box[2])[None] + 0.5
+        lines.append(read_field(values, box, *np.broadcast_arrays(x, y), (size[0], 0, 0, 0)))
+        total[columns] += np.maximum(lines[-1][..., 3], 0)
+    for line, box in zip(lines, boxes, strict=True):
+        least, w = share * total[:, box[0] : box[0] + box[2]], line[..., 3].copy()
+        line[..., 3] -= np.where(w > least, least**2 / np.where(w > least, w, 1), least)
+    return lines
+
+
+def read_line(lines: Array, left: int, x: Array, border: Sequence[int]) -> Array:
+    """Lines (rows, width, 4) that begin at column `left` of a coarse grid, at x (rows, n), linear."""
+    rows, width = lines.shape[:2]
+    y = np.broadcast_to(np.arange(rows)[:, None] + 0.5, x.shape)
+    return read_field(lines, (left, 0, width, rows), x, y, (border[0], rows, border[2], 0))
+
+
+def blend_band(
+    stored: Sequence[Array],
+    places: Sequence[Sequence[int]],
+    ways: Sequence[Array],
+    lefts: Sequence[int],
+    gains: Sequence[Array | None],
     border: Sequence[int],
     lens: Numbers,
-    field: Array,
-    field_box: Sequence[int],
     field_border: Sequence[int],
-    gain: Array | None,
     gain_border: Sequence[int],
+    band: Sequence[int],
+    origin: Sequence[int],
     nearest: int,
-    count: Array,
-    reference: Array,
-    total: Array,
+    share: float,
     white: float,
-) -> tuple[Array, Array]:
-    """Reference and sum of the band with one layer added."""
-    stored = opaque(rows, white)
-    columns, lines = pixels(band[2], band[3], band[0], band[1])
-    own = take(stored, box, columns, lines)
-    covered = own[..., 3] != 0
-    x, y = columns + 0.5, lines + 0.5
-    exposure = np.zeros((*x.shape, 3))
-    if gain is not None:
-        place = x * gain_border[0] / border[0], y * gain_border[1] / border[1]
-        exposure = read_field(gain, (0, 0, *gain_border[:2]), *place, gain_border)[..., :3]
-    state = np.where((exposure != 0).any(-1), 2.0, 1.0)
-    first = np.concatenate([correct(own[..., :3], exposure, white), state[..., None]], -1)
-    fresh = covered & (reference[..., 3] == 0)
-    reference = np.where(fresh[..., None], first, reference)
+) -> Array:
+    """Samples of the band, float64 but rounded and within 0..white for integer layers.
+
+    stored, places      rows of each layer and their box. ways, lefts: of `blend_rows`, first column.
+    """
+    columns, rows = pixels(band[2], band[3], band[0], band[1])
+    x, y = columns + 0.5, rows + 0.5
     scale = border[0] / field_border[0], border[1] / field_border[1]
-    f = read_field(field, field_box, x / scale[0], y / scale[1], field_border)
-    colour = sample(stored, box, *position(x, y, f[..., :3], scale, lens), border, nearest)
-    weight = np.where(covered & (count >= 2), np.maximum(f[..., 3], 0) * colour[..., 3] ** 2, 0.0)
-    difference = correct(colour[..., :3], exposure, white) - reference[..., :3]
-    state = np.where(weight > 0, np.maximum(state, reference[..., 3]), reference[..., 3])
-    reference = np.concatenate([reference[..., :3], state[..., None]], -1)
-    return reference, total + np.concatenate([difference * weight[..., None], weight[..., None]], -1)
+    seen = []
+    for pixels_, place, way, left, gain in zip(stored, places, ways, lefts, gains, strict=True):
+        opaque_ = opaque(pixels_, white)
+        f = read_line(way, left, x / scale[0], field_border)
+        exposure = np.zeros((*x.shape, 3))
+        if gain is not None:
+            exposure = read_line(gain, 0, x * gain_border[0] / border[0], gain_border)[..., :3]
+        own = take(opaque_, place, columns, rows)
+        colour = sample(opaque_, place, *position(x, y, f[..., :3], scale, lens), border, nearest)
+        colour = np.where(f[..., :3].any(-1, keepdims=True), colour, own)
+        looks = [correct(c[..., :3], exposure, white) for c in (own, colour)]
+        seen.append((own[..., 3] > 0, looks, f[..., 3], colour[..., 3], (exposure != 0).any(-1)))
+    count = sum(layer[0].astype(int) for layer in seen)
+    reference, corrected, known = np.zeros((*x.shape, 3)), np.zeros(x.shape, bool), np.zeros(x.shape, bool)
+    for covered, looks, _, _, exposed in seen:
+        fresh = covered & ~known
+        reference = np.where(fresh[..., None], looks[0], reference)
+        corrected, known = corrected | (fresh & exposed), known | covered
+
+    def mean(hidden: Array) -> tuple[Array, Array, Array, Array]:
+        total, weight, difference, touched = (np.zeros((*x.shape, n)) for n in (1, 1, 3, 1))
+        for covered, looks, wanted, valid, exposed in seen:
+            w = np.where(covered & (count > 1), np.maximum(wanted + hidden, 0), 0)[..., None]
+            total, w = total + w, w * valid[..., None] ** 2
+            weight, difference = weight + w, difference + (looks[1] - reference) * w
+            touched = touched + ((w > 0) & exposed[..., None])
+        return total[..., 0], weight, difference, touched[..., 0] > 0
+
+    total, weight, difference, touched = mean(np.zeros(x.shape))
+    again = weight[..., 0] < 0.5 * total
+    _, *second = mean(share * total)
+    weight = np.where(again[..., None], second[0], weight)
+    difference = np.where(again[..., None], second[1], difference)
+    corrected |= touched | (again & second[2])
+    colour = reference + np.where(weight > 1e-12, difference / np.where(weight > 1e-12, weight, 1), 0.0)
+    alpha = np.where(known, white, 0.0)[..., None]
+    out = np.concatenate([colour if stored[0].shape[-1] == 4 else colour[..., :1], alpha], -1)
+    if white == 1:
+        return out
+    out = np.clip(out, 0, white)
+    thresholds = [threshold(columns + origin[0], rows + origin[1], k) for k in range(out.shape[-1])]
+    dithered = dither(out, np.stack(thresholds, -1), white)
+    return np.where(corrected[..., None], dithered, np.rint(out))
 
 
 def threshold(x: Array, y: Array, channel: int) -> Array:
@@ -143,25 +193,3 @@ def dither(values: Array, thresholds: Array, white: float) -> Array:
     whole, below = np.rint(values), np.floor(values)
     up = below + (values - below > thresholds)
     return np.where(np.abs(values - whole) <= 2e-7 * white, whole, up)
-
-
-def blend_finish(
-    reference: Array,
-    total: Array,
-    band: Sequence[int],
-    origin: Sequence[int],
-    samples: int,
-    white: float,
-    integer: int,
-) -> Array:
-    """Samples of the band, float64 but rounded and within 0..white for integer layers."""
-    weight = total[..., 3:]
-    known = weight > 1e-12
-    colour = reference[..., :3] + np.where(known, total[..., :3] / np.where(known, weight, 1), 0.0)
-    alpha = np.minimum(reference[..., 3:], 1) * white
-    out = np.concatenate([colour if samples == 4 else colour[..., :1], alpha], -1)
-    if not integer:
-        return out
-    x, y = pixels(band[2], band[3], band[0] + origin[0], band[1] + origin[1])
-    dithered = np.stack([dither(out[..., k], threshold(x, y, k), white) for k in range(samples)], -1)
-    return np.clip(np.where(reference[..., 3:] > 1, dithered, np.rint(out)), 0, white)
