@@ -234,6 +234,13 @@ _information = partial(click.option, cls=_Option, group="Information")
     f"[default: {_DEFAULTS.flow_magnitude:g}]",
 )
 @_blending(
+    "--no-flow",
+    is_flag=True,
+    show_default=False,  # click would write False
+    help="Do not bring the photos together by optical flow: match brightness and colour, and cut where it "
+    "shows least.",
+)
+@_blending(
     "--flow-quality",
     type=click.Choice(get_args(FlowQuality)),
     default=_DEFAULTS.flow_quality,
@@ -277,6 +284,7 @@ def command(
     seam: str,
     softmax_sharpness: float,
     flow_magnitude: float,
+    no_flow: bool,
     flow_quality: FlowQuality,
     device: str | None,
     quiet: bool,
@@ -301,6 +309,7 @@ def command(
         merge=merge,
         softmax_sharpness=softmax_sharpness,
         flow_magnitude=flow_magnitude,
+        flow=not no_flow,
         flow_quality=flow_quality,
         exposure=exposure == "auto",
         guides=guides == "auto",

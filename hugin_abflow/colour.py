@@ -21,7 +21,7 @@ from scipy.sparse import csr_array, diags_array
 from scipy.sparse.linalg import splu
 
 from hugin_abflow.coefficient import on_cells
-from hugin_abflow.geometry import PairFlow
+from hugin_abflow.geometry import Pair
 from hugin_abflow.opencl import Buffer, Device
 from hugin_abflow.settings import Settings
 from hugin_abflow.working import Grid, WorkingLayer
@@ -66,7 +66,7 @@ def correction(
     device: Device,
     layers: Sequence[WorkingLayer],
     fields: Sequence[Buffer],
-    pairs: Sequence[PairFlow],
+    pairs: Sequence[Pair],
     grid: Grid,
     covered: npt.NDArray[np.bool_],
     settings: Settings,
@@ -109,7 +109,7 @@ def _difference(
     device: Device,
     layers: Sequence[WorkingLayer],
     fields: Sequence[Buffer],
-    pair: PairFlow,
+    pair: Pair,
     grid: Grid,
     cells: Grid,
 ) -> npt.NDArray[np.float64]:

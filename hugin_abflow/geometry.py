@@ -24,14 +24,20 @@ _FOLLOWING_STEPS = 8
 
 
 @dataclass(frozen=True)
-class PairFlow:
-    """Flow between layers a and b (indices) on their chart: float32 (height, width, 2), chart px.
+class Pair:
+    """Layers a and b (indices) that overlap and differ there."""
+
+    a: int
+    b: int
+
+
+@dataclass(frozen=True)
+class PairFlow(Pair):
+    """Flow between the layers of a pair on their chart: float32 (height, width, 2), chart px.
 
     `forward` is F_ab: what a shows at q, b shows at q + F_ab(q); `backward` is F_ba.
     """
 
-    a: int
-    b: int
     chart: Chart
     forward: Buffer
     backward: Buffer

@@ -6,6 +6,7 @@ import logging
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from itertools import combinations
 from typing import Any
 
 import numpy as np
@@ -29,7 +30,7 @@ from hugin_abflow.blend import BlendLayer
 from hugin_abflow.coefficient import Coefficients, Masks
 from hugin_abflow.colour import Correction
 from hugin_abflow.flow import FlowParameters
-from hugin_abflow.geometry import PairFlow
+from hugin_abflow.geometry import Pair, PairFlow
 from hugin_abflow.guides import Guide, by_pair
 from hugin_abflow.layer import Canvas, Layer
 from hugin_abflow.opencl import Buffer, Device, DeviceMemoryError
@@ -130,8 +131,14 @@ def prepare(
     its_guides = by_pair(guides if settings.guides else ())
     largest = _REACH * (grid.canvas_width or grid.region.width) * grid.width / grid.region.width
     reach = largest if settings.large_motion else 0.0
-    flows = _flows(device, reduced, masks, grid, progress, parameters, reach, its_guides, numbers)
-    fields, correction = _align(device, reduced, coefficients, flows, masks, grid, settings)
+    overlaps = _overlaps(device, reduced, masks)
+    flows = (
+        _flows(device, reduced, masks, grid, overlaps, progress, parameters, reach, its_guides, numbers)
+        if settings.flow
+        else []
+    )
+    pairs = [pair for pair, _ in overlaps]
+    fields, correction = _align(device, reduced, coefficients, pairs, flows, masks, grid, settings)
     final = [
         BlendLayer(layer.layer, layer.box, field, geometry.reach(device, layer, field, grid), gain)
         for layer, field, gain in zip(reduced, fields, correction.gains, strict=True)
@@ -144,6 +151,7 @@ def _align(
     device: Device,
     layers: Sequence[WorkingLayer],
     coefficients: Sequence[Coefficients],
+    pairs: Sequence[Pair],
     flows: Sequence[PairFlow],
     masks: Masks,
     grid: Grid,
@@ -151,13 +159,15 @@ def _align(
 ) -> tuple[list[Buffer], Correction]:
     """Geometry and colour that make the layers agree; where nothing does, one layer whole.
 
+    Without flow nothing does but colour.
+
     What flow cannot explain spoils the exposure around it, which is found again without it.
     """
     regions: npt.NDArray[np.bool_] | None = None
-    pairs = [consistency.mend(device, pair) for pair in flows]
-    coefficients = transition.narrow(device, layers, coefficients, pairs, grid, settings)
+    flows = [consistency.mend(device, pair) for pair in flows]
+    coefficients = transition.narrow(device, layers, coefficients, flows, grid, settings)
     correct = partial(colour.correction, device, layers)
-    fields = geometry.fields(device, layers, coefficients, pairs, grid, settings)
+    fields = geometry.fields(device, layers, coefficients, flows, grid, settings)
     # exposure explains a difference whether it is corrected or not
     exposure = replace(settings, exposure=True)
     for _ in range(_SEAM_ROUNDS if settings.seam else 0):
@@ -167,7 +177,10 @@ def _align(
         if not grown.any() or (regions is not None and np.array_equal(grown, regions)):
             break
         regions = grown
-    if regions is not None:
+    if settings.seam and not settings.flow:
+        # exposures have to agree where the eye compares them; elsewhere unaligned layers tell little
+        regions = ~seam.divide(device, layers, fields, pairs, strict, masks, grid)
+    elif regions is not None:
         seam.cut(device, layers, fields, pairs, strict, regions, masks, grid)
     return fields, correct(fields, pairs, grid, masks.host, settings, regions)
 
@@ -199,39 +212,51 @@ def _unblended(device: Device, layer: WorkingLayer) -> BlendLayer:
     return BlendLayer(layer.layer, (left, top, 1, 1), device.zeros((1, 1, 4)), [0.0], None)
 
 
+def _overlaps(
+    device: Device, layers: Sequence[WorkingLayer], masks: Masks
+) -> list[tuple[Pair, npt.NDArray[np.bool_]]]:
+    """The pairs of layers that overlap and differ there, and where they overlap, on the grid of the masks."""
+    result = []
+    for a, b in combinations(range(len(layers)), 2):
+        overlap = masks.host[a] & masks.host[b]
+        if np.count_nonzero(overlap) < _LEAST_OVERLAP:
+            continue
+        # without it, the borders of the masks would differ from the middle by rounding
+        if not working.same_where_both(device, layers[a], layers[b]):
+            result.append((Pair(a, b), overlap))
+    return result
+
+
 def _flows(
     device: Device,
     layers: Sequence[WorkingLayer],
     masks: Masks,
     grid: Grid,
+    overlaps: Sequence[tuple[Pair, npt.NDArray[np.bool_]]],
     progress: Progress,
     parameters: FlowParameters,
     reach: float,
     guides: Mapping[tuple[int, int], Sequence[Guide]],
     numbers: Sequence[int],
 ) -> list[PairFlow]:
-    """Flow of every pair of layers that overlap, on the pair's own chart.
+    """Flow of every pair of layers, on the pair's own chart.
 
+    overlaps    the pairs, and where they overlap on the grid of `masks`.
     guides      of each two layers, by their numbers; numbers: what guides call each of `layers`.
     """
-    overlaps = [
-        (a, b, masks.host[a] & masks.host[b]) for a in range(len(layers)) for b in range(a + 1, len(layers))
-    ]
-    overlaps = [entry for entry in overlaps if np.count_nonzero(entry[2]) >= _LEAST_OVERLAP]
     result = []
     with progress("flow", len(overlaps)) as advance:
-        for a, b, overlap in overlaps:
-            pair = (layers[a], layers[b])
-            # without it, the borders of the masks would differ from the middle by rounding
-            if not working.same_where_both(device, *pair):
-                its_chart = chart.pair_chart(overlap, masks.grid, grid)
-                image_a, image_b = (chart.sample(device, layer, grid, its_chart) for layer in pair)
-                found = flow.pair_flow(device, image_a, image_b, parameters, reach=reach)
-                its_guides = guides.get((min(numbers[a], numbers[b]), max(numbers[a], numbers[b])))
-                if its_guides:
-                    placed = guidance.on_chart(its_guides, numbers[a], its_chart, grid)
-                    found = guidance.lead(device, (image_a, image_b), found, placed, its_chart.around(grid))
-                result.append(PairFlow(a, b, its_chart, *found))
+        for pair, overlap in overlaps:
+            its_layers = (layers[pair.a], layers[pair.b])
+            its_chart = chart.pair_chart(overlap, masks.grid, grid)
+            image_a, image_b = (chart.sample(device, layer, grid, its_chart) for layer in its_layers)
+            found = flow.pair_flow(device, image_a, image_b, parameters, reach=reach)
+            first, second = numbers[pair.a], numbers[pair.b]
+            its_guides = guides.get((min(first, second), max(first, second)))
+            if its_guides:
+                placed = guidance.on_chart(its_guides, first, its_chart, grid)
+                found = guidance.lead(device, (image_a, image_b), found, placed, its_chart.around(grid))
+            result.append(PairFlow(pair.a, pair.b, its_chart, *found))
             advance(1)
         device.finish()  # kernels are only queued: the last pair's time would be told as that of what follows
     return result

@@ -113,7 +113,7 @@ def _bands(
 
 def _guides(plan: Plan, layers: Sequence[Layer], settings: Settings) -> list[Guide]:
     """The project's control points between the layers."""
-    if not settings.guides or len(layers) < 2:
+    if not (settings.flow and settings.guides) or len(layers) < 2:
         return []
     images = images_of(plan, layers)
     return read_guides(plan, {image: index for index, image in enumerate(images) if image is not None})

@@ -10,6 +10,10 @@ borders, where they show least. This is a labelling of least energy,
 with r the residual, s_k the share of the softmax and c the price of a cut, found by graph cuts (alpha
 expansion: Boykov, Veksler, Zabih, "Fast approximate energy minimization via graph cuts", 2001). Regions keep
 to themselves: elsewhere the softmax stays as it is, and the transition lies where the layers agree.
+
+Where there is no flow, layers are not aligned, and each overlap is such a region, whole: on finer cells, with
+the mean square of the difference in place of r, since fine texture is as much in the way of a cut, and with
+narrow transitions. Low frequencies are not blended across them: the gains of colour.py make them agree there.
 """
 
 from __future__ import annotations
@@ -26,12 +30,14 @@ from scipy.sparse.csgraph import breadth_first_order, maximum_flow
 
 from hugin_abflow.coefficient import Masks, on_cells
 from hugin_abflow.colour import Correction
-from hugin_abflow.geometry import PairFlow
+from hugin_abflow.geometry import Pair
 from hugin_abflow.opencl import Buffer, Device
 from hugin_abflow.working import Grid, WorkingLayer
 
 # Working pixels per cell of the seam grid.
 _CELL = 8
+# Without flow.
+_FINE_CELL = 4
 # Cells over which differences are averaged: texture that is a little off is no reason to cut.
 _SIGMA = 1.0
 # Residual, of full scale, that makes a region one layer's, and that of its outskirts.
@@ -40,6 +46,12 @@ _STRONG, _WEAK = 0.2, 0.045
 _LEAST = 6.0
 # Price of a cut, in cells: what is cut off must be favoured by the softmax over this depth.
 _CUT = 20.0
+# The same without flow, where the softmax has little to say: overlaps are some hundred cells wide.
+_FINE_CUT = 120.0
+# Cells to each side of a cut whose exposure counts.
+_BESIDE = 4
+# Residual of layers that agree, without flow: of two cuts that nobody sees the shorter one is taken.
+_SHORTER = 0.005
 # No layer is taken where it is not.
 _FORBIDDEN = 1e4
 # Capacities are integers; residuals are around 1.
@@ -55,7 +67,7 @@ def regions(
     device: Device,
     layers: Sequence[WorkingLayer],
     fields: Sequence[Buffer],
-    pairs: Sequence[PairFlow],
+    pairs: Sequence[Pair],
     correction: Correction,
     grid: Grid,
 ) -> npt.NDArray[np.bool_]:
@@ -69,7 +81,7 @@ def cut(
     device: Device,
     layers: Sequence[WorkingLayer],
     fields: Sequence[Buffer],
-    pairs: Sequence[PairFlow],
+    pairs: Sequence[Pair],
     correction: Correction,
     whole: npt.NDArray[np.bool_],
     masks: Masks,
@@ -80,49 +92,130 @@ def cut(
     """
     cells = seam_grid(grid)
     residual = _residual(device, layers, fields, pairs, correction, grid, cells)
+    owner = _owners(layers, fields, residual, whole, masks, grid, cells, _CUT)
+    yields = [_soften((whole & (owner != k)).astype(np.float32), cells.wraps) for k in range(len(layers))]
+    _yield(device, layers, fields, yields, grid, cells)
+
+
+def divide(
+    device: Device,
+    layers: Sequence[WorkingLayer],
+    fields: Sequence[Buffer],
+    pairs: Sequence[Pair],
+    correction: Correction,
+    masks: Masks,
+    grid: Grid,
+) -> npt.NDArray[np.bool_]:
+    """Give each cell of every overlap of layers that are not aligned to one layer, as `cut` does.
+
+    Returns where the cuts are, with some cells beside them: (height, width) on a grid over the same region.
+    """
+    cells = grid.coarser(_FINE_CELL)
+    residual = np.zeros(cells.shape)
+    for pair in pairs:
+        found = _difference(device, layers, fields, pair, correction, grid, cells, squared=True)
+        residual = np.maximum(residual, np.where(found[..., 3] > 0, _SHORTER + found[..., :3].max(-1), 0))
+    whole = residual > 0
+    owner = _owners(layers, fields, residual, whole, masks, grid, cells, _FINE_CUT)
+    yields = [(whole & (owner != k)).astype(np.float32) for k in range(len(layers))]
+    _yield(device, layers, fields, yields, grid, cells)
+    return _beside_cuts(owner, cells.wraps)
+
+
+def _owners(
+    layers: Sequence[WorkingLayer],
+    fields: Sequence[Buffer],
+    residual: npt.NDArray[np.float64],
+    whole: npt.NDArray[np.bool_],
+    masks: Masks,
+    grid: Grid,
+    cells: Grid,
+    cut_price: float,
+) -> npt.NDArray[np.intp]:
+    """The layer of each cell, (height, width): in the regions `whole` the one it is taken from, elsewhere the
+    one that the softmax favours, -1 where none is.
+    """
     cover = on_cells(masks.host, cells, np.logical_and)
     shares = np.stack(
         [_at_centres(f.get()[..., 3], k.box, grid, cells) for f, k in zip(fields, layers, strict=True)]
     )
     shares /= np.maximum(shares.sum(0), 1e-12)
-    yields = np.zeros(cover.shape, np.float32)
+    owner = np.where(cover.any(0), (shares * cover).argmax(0), -1)
     for region in _connected(whole, cells.wraps):
         rows, columns = np.nonzero(region)
-        winner = label(rows, columns, residual, shares, cover, cells.wraps)
-        yields[:, rows, columns] = winner[None] != np.arange(len(layers))[:, None]
+        owner[rows, columns] = label(rows, columns, residual, shares, cover, cells.wraps, cut_price)
+    return owner
+
+
+def _beside_cuts(owner: npt.NDArray[np.intp], wraps: bool) -> npt.NDArray[np.bool_]:
+    """Cells around which the owner changes."""
+    size, modes = 2 * _BESIDE + 1, ("nearest", "wrap" if wraps else "nearest")
+    highest = ndimage.maximum_filter(owner, size, mode=modes)
+    lowest = ndimage.minimum_filter(np.where(owner < 0, owner.max() + 1, owner), size, mode=modes)
+    return np.asarray(lowest < highest)
+
+
+def _yield(
+    device: Device,
+    layers: Sequence[WorkingLayer],
+    fields: Sequence[Buffer],
+    yields: Sequence[npt.NDArray[np.float32]],
+    grid: Grid,
+    cells: Grid,
+) -> None:
+    """Take the layers' colour weight away where they yield."""
     for layer, field, one in zip(layers, fields, yields, strict=True):
         if one.any():
-            soft = device.upload(_soften(one, cells.wraps))
-            device.run("seam", "seam_yield", layer.box[2:], field, layer.box, grid.border, soft, cells.border)
+            there = device.upload(one)
+            device.run(
+                "seam", "seam_yield", layer.box[2:], field, layer.box, grid.border, there, cells.border
+            )
 
 
 def _residual(
     device: Device,
     layers: Sequence[WorkingLayer],
     fields: Sequence[Buffer],
-    pairs: Sequence[PairFlow],
+    pairs: Sequence[Pair],
     correction: Correction,
     grid: Grid,
     cells: Grid,
 ) -> npt.NDArray[np.float64]:
     """How far low frequencies differ: per cell the largest of any pair and channel, 0 where no two lie."""
-    none = device.zeros((*correction.grid.shape, 4))
-    difference = device.empty((*cells.shape, 4))
     largest = np.zeros(cells.shape)
     for pair in pairs:
-        sides: list[Any] = []
-        for k in (pair.a, pair.b):
-            sides += [layers[k].pixels, fields[k], layers[k].box, correction.gains[k] or none]
-        device.run(
-            "seam", "seam_difference", cells.border[:2], *sides, grid.border, grid.lens,
-            correction.grid.border, cells.border, int(layers[pair.a].layer.dtype.kind == "u"), difference,
-        )  # fmt: skip
-        found = difference.get().astype(np.float64)
+        found = _difference(device, layers, fields, pair, correction, grid, cells)
         share = found[..., 3]
         mean = _smooth(np.dstack([found[..., :3] * share[..., None], share]), cells.wraps)
         mean = np.abs(mean[..., :3]).max(-1) / np.where(share > 0, mean[..., 3], 1)
         largest = np.maximum(largest, mean * (share > 0))
     return largest
+
+
+def _difference(
+    device: Device,
+    layers: Sequence[WorkingLayer],
+    fields: Sequence[Buffer],
+    pair: Pair,
+    correction: Correction,
+    grid: Grid,
+    cells: Grid,
+    squared: bool = False,
+) -> npt.NDArray[np.float64]:
+    """Of two corrected layers, (height, width, 4): per cell the mean of their difference, or of its square,
+    in r, g, b, and the share of the pixels that both show.
+    """
+    none = device.zeros((*correction.grid.shape, 4))
+    difference = device.empty((*cells.shape, 4))
+    sides: list[Any] = []
+    for k in (pair.a, pair.b):
+        sides += [layers[k].pixels, fields[k], layers[k].box, correction.gains[k] or none]
+    integer = layers[pair.a].layer.dtype.kind == "u"
+    device.run(
+        "seam", "seam_difference", cells.border[:2], *sides, grid.border, grid.lens,
+        correction.grid.border, cells.border, int(integer), int(squared), difference,
+    )  # fmt: skip
+    return difference.get().astype(np.float64)
 
 
 def _smooth(values: npt.NDArray[np.float64], wraps: bool) -> npt.NDArray[np.float64]:
@@ -169,10 +262,12 @@ def label(
     shares: npt.NDArray[np.float64],
     cover: npt.NDArray[np.bool_],
     wraps: bool,
+    cut_price: float = _CUT,
 ) -> npt.NDArray[np.intp]:
     """Which layer each cell (rows, columns) of a region is taken from: the least energy found.
 
     residual: (height, width). shares, cover: shares of the softmax and coverage (layers, height, width).
+    cut_price: of a cut, in cells.
     """
     candidates = np.flatnonzero(cover[:, rows, columns].any(1))
     if candidates.size < 2:
@@ -186,12 +281,12 @@ def label(
     for down, right in ((0, 1), (1, 0), (0, -1), (-1, 0)):
         inside, there = _neighbours(rows + down, columns + right, residual.shape, wraps)
         # a layer's own border is a cut as well, where the union goes on
-        price += _CUT * weight * (inside & cover[:, *there].any(0) & ~cover[candidates][:, *there])
+        price += cut_price * weight * (inside & cover[:, *there].any(0) & ~cover[candidates][:, *there])
         if down + right > 0:
             linked = np.flatnonzero(inside & (number[there] >= 0))
             links.append(np.stack([linked, number[there][linked]]))
     first, second = np.concatenate(links, 1)
-    between = _CUT * (weight[first] + weight[second]) / 2
+    between = cut_price * (weight[first] + weight[second]) / 2
     current = np.full(rows.size, np.argmin(price.sum(1)))
     for _ in range(1 if candidates.size == 2 else 2):
         for alpha in range(candidates.size):

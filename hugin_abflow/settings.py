@@ -23,6 +23,8 @@ class Settings:
     merge               "joint": all layers at once; "sequential": the paper's iteration, two at a time.
     softmax_sharpness   kSoftmaxSharpness of the paper (Code 1); 0..1000, no unit.
     flow_magnitude      kFlowMagCoef of the paper (Code 1); 0..10000, no unit.
+    flow                bring the layers together by optical flow; else they stay where they are, and every
+                        overlap is cut along the seam that shows least.
     flow_quality        how much time the flow may take: "fast", "normal" or "best".
     large_motion        search for motion of up to a tenth of the canvas's width, for very near things; what
                         repeats (grids, tiles) may mislead it.
@@ -46,6 +48,7 @@ class Settings:
     merge: MergeMode = "joint"
     softmax_sharpness: float = 10.0
     flow_magnitude: float = 100.0
+    flow: bool = True
     flow_quality: FlowQuality = "normal"
     large_motion: bool = False
     exposure: bool = True
@@ -86,7 +89,7 @@ class Settings:
             if not isinstance(value, str) or value not in choices:
                 expected = " or ".join(map(repr, choices))
                 raise SettingsError(f"{name} is {value!r}; choose {expected}")
-        for name in ("large_motion", "exposure", "seam", "guides"):
+        for name in ("flow", "large_motion", "exposure", "seam", "guides"):
             if not isinstance(getattr(self, name), bool):
                 raise SettingsError(f"{name} is {getattr(self, name)!r}; choose True or False")
         if self.device is not None and not isinstance(self.device, str):

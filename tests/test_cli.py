@@ -98,6 +98,7 @@ def test_option_reaches_merge_project(calls: Calls, arguments: list[str], name: 
         (["--guides", "off"], "guides", False),
         (["--softmax-sharpness", "3.5"], "softmax_sharpness", 3.5),
         (["--flow-magnitude", "0"], "flow_magnitude", 0.0),
+        (["--no-flow"], "flow", False),
         (["--flow-quality", "best"], "flow_quality", "best"),
         (["--device", "0"], "device", "0"),
     ],

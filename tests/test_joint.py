@@ -75,23 +75,26 @@ def moving(canvas: Canvas) -> list[Layer]:
 
 @pytest.mark.parametrize("dtype", DTYPES)
 @pytest.mark.parametrize("channels", [1, 3])
-def test_identical_layers_come_out_identical(dtype, channels):
+@pytest.mark.parametrize("flow", [True, False])
+def test_identical_layers_come_out_identical(dtype, channels, flow):
     picture = noise(53, 77, dtype, channels)
     layers = [Layer.from_array(str(k), picture, 19, 11) for k in range(3)]
     canvas = Canvas(131, 79, Box(19, 11, 96, 64))
-    result = merged(layers, canvas)
+    result = merged(layers, canvas, flow=flow)
     assert result.dtype == dtype
     np.testing.assert_array_equal(result, picture)  # floats too, where 2 ulp would be allowed
 
 
 @pytest.mark.parametrize("canvas", CANVASES.values(), ids=CANVASES)
-@pytest.mark.parametrize("exposure", [True, False], ids=["exposure", "no exposure"])
+@pytest.mark.parametrize(
+    "settings", [{}, {"exposure": False}, {"flow": False}], ids=["default", "no exposure", "no flow"]
+)
 # 7000 working pixels are neither a whole fraction of the canvas nor in step with any layer's box
 @pytest.mark.parametrize("working_pixels", [2_100_000, 7_000])
-def test_picture_cut_into_layers_comes_back(canvas, exposure, working_pixels):
+def test_picture_cut_into_layers_comes_back(canvas, settings, working_pixels):
     picture = noise(canvas.height, canvas.width)
     layers = [masked(picture, mask) for mask in ring(canvas)]
-    result = merged(layers, canvas, exposure=exposure, working_pixels=working_pixels)
+    result = merged(layers, canvas, working_pixels=working_pixels, **settings)
     np.testing.assert_array_equal(result, picture)
 
 
@@ -161,9 +164,9 @@ def test_picture_cut_along_any_shapes_comes_back(canvas, one_device_for_all, dat
 def test_result_is_opaque_where_a_layer_is_and_nowhere_else(canvas, one_device_for_all, data):
     masks = data.draw(shapes(canvas))
     layers = [moved(canvas, mask, 3.0 * k, -2.0 * k) for k, mask in enumerate(masks)]
-    exposure = data.draw(st.booleans())
+    exposure, flow = data.draw(st.booleans()), data.draw(st.booleans())
     working_pixels = data.draw(st.sampled_from([2_100_000, 1_500]))
-    result = merged(layers, canvas, exposure=exposure, working_pixels=working_pixels)
+    result = merged(layers, canvas, exposure=exposure, flow=flow, working_pixels=working_pixels)
     union = np.logical_or.reduce(masks)
     np.testing.assert_array_equal(result[..., 3] == 255, union)
     np.testing.assert_array_equal(result[~union], 0)
@@ -184,11 +187,11 @@ def test_whole_canvas_is_covered_with_parallax(canvas):
 
 
 @pytest.mark.parametrize("canvas", CANVASES.values(), ids=CANVASES)
-@pytest.mark.parametrize("dtype", [np.uint16, np.float32])
-def test_pixels_of_one_layer_are_copied(canvas, dtype):
+@pytest.mark.parametrize(("dtype", "flow"), [(np.uint16, True), (np.float32, True), (np.uint8, False)])
+def test_pixels_of_one_layer_are_copied(canvas, dtype, flow):
     layers = [moved(canvas, mask, 4.0 * k, dtype=dtype) for k, mask in enumerate(ring(canvas)[:3])]
     covered = masks_of(layers, canvas)
-    result = merged(layers, canvas, exposure=False)
+    result = merged(layers, canvas, exposure=False, flow=flow)
     for layer, own in zip(layers, covered, strict=True):
         alone = own & (covered.sum(0) == 1)
         assert alone.sum() > 1000
@@ -268,13 +271,14 @@ def test_shifted_canvas_gives_the_shifted_result(name, exposure):
 # Order
 
 
-def test_order_does_not_matter():
+@pytest.mark.parametrize("flow", [True, False])
+def test_order_does_not_matter(flow):
     layers = moving(SPHERE)
-    first = merged(layers, SPHERE)
+    first = merged(layers, SPHERE, flow=flow)
     random = np.random.default_rng(0)
     for _ in range(2):
         shuffled = [layers[k] for k in random.permutation(len(layers))]
-        np.testing.assert_array_equal(merged(shuffled, SPHERE), first)
+        np.testing.assert_array_equal(merged(shuffled, SPHERE, flow=flow), first)
 
 
 def test_order_does_not_matter_where_boxes_are_equal():

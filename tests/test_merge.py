@@ -244,6 +244,7 @@ def test_layers_that_do_not_belong_together(other, message):
         {"flow_quality": 2},
         {"exposure": 1},
         {"seam": "auto"},
+        {"flow": "off"},
         {"guides": "off"},
         {"large_motion": 0},
         {"exposure": "auto"},

@@ -43,7 +43,8 @@ def test_twin_of_yield_reads_scipys_zoom() -> None:
 
 @pytest.mark.parametrize("name", list(GRIDS))
 @pytest.mark.parametrize("integer", [0, 1])
-def test_difference_equals_its_twin(device: Device, name: str, integer: int) -> None:
+@pytest.mark.parametrize("squared", [0, 1])
+def test_difference_equals_its_twin(device: Device, name: str, integer: int, squared: int) -> None:
     grid = GRIDS[name]
     cells, colours = grid.resized(10, 7).border, grid.resized(5, 3).border
     sides: list = []
@@ -58,9 +59,10 @@ def test_difference_equals_its_twin(device: Device, name: str, integer: int) -> 
     out = device.empty((7, 10, 4))
     uploaded = [device.upload(one) if isinstance(one, np.ndarray) else one for one in sides]
     device.run(
-        "seam", "seam_difference", (10, 7), *uploaded, grid.border, grid.lens, colours, cells, integer, out
-    )
-    expected = seam_difference(*sides, grid.border, grid.lens, colours, cells, integer)
+        "seam", "seam_difference", (10, 7), *uploaded, grid.border, grid.lens, colours, cells, integer,
+        squared, out,
+    )  # fmt: skip
+    expected = seam_difference(*sides, grid.border, grid.lens, colours, cells, integer, squared)
     assert (expected[..., 3] > 0).mean() > 0.4
     # a pixel more or less at a mask's rim is one of some ten of a cell
     assert_close(out.get(), expected, 10 * POSITION, decisions=0.05)
@@ -289,3 +291,17 @@ def test_cells_that_a_layer_covers_whole() -> None:
     covered[0, 12, 20] = covered[1, 52, 76] = False
     whole = on_cells(covered, plane(110, 70).resized(9, 5), np.logical_and)
     assert np.argwhere(~whole).tolist() == [[0, 1, 2], [1, 4, 8]]
+
+
+def test_beside_a_cut_are_the_cells_near_another_owner() -> None:
+    """Cells without an owner are none; across the border too."""
+    owner = np.zeros((15, 40), int)
+    owner[:, 20:28] = 2
+    owner[:, 28:38] = -1
+    for wraps in WRAPS:
+        owner[:, 0] = 1 if wraps else 0
+        expected = np.zeros(owner.shape, bool)
+        expected[:, 20 - seam._BESIDE : 20 + seam._BESIDE] = True
+        if wraps:
+            expected[:, : 1 + seam._BESIDE] = expected[:, 40 - seam._BESIDE :] = True
+        assert np.array_equal(seam._beside_cuts(owner, wraps), expected)

@@ -191,3 +191,83 @@ def test_weights_outside_the_regions_stay(device: Device, monkeypatch: pytest.Mo
         assert ((after[..., 3] > 0) == (before[..., 3] > 0)).all()
         changed += (after[..., 3] < 1e-6 * before[..., 3]).sum()
     assert changed > np.pi * RADIUS**2
+
+
+# Without flow
+
+
+def shown_by(result: np.ndarray, layers: list[Layer], canvas: Canvas) -> np.ndarray:
+    """Which layers (n, height, width) show exactly what the result does."""
+    found = np.zeros((len(layers), canvas.height, canvas.width), bool)
+    for own, layer in zip(found, layers, strict=True):
+        box, pixels = layer.box, layer.read(0, layer.box.height)
+        here = np.s_[box.top : box.bottom, box.left : box.right]
+        own[here] = (result[here] == pixels).all(-1)
+    return found
+
+
+@pytest.mark.usefixtures(one_device.__name__)
+@pytest.mark.parametrize("name", list(CANVASES))
+def test_without_flow_each_pixel_is_one_layers_but_along_narrow_cuts(name: str) -> None:
+    """Layers that are 5 px off; blended over the whole overlap, two thirds of it would be doubled."""
+    layers, canvas, *_ = scene(name, 0, dx=5)
+    result = merged(layers, canvas, flow=False, exposure=False)
+    neither = ~shown_by(result, layers, canvas).any(0)
+    assert (result[..., 3] == 255).all()
+    cuts = 2 if canvas.wraps else 1
+    assert neither.sum(1).mean() <= 8 * cuts
+    soft = merged(layers, canvas, flow=False, exposure=False, seam=False)
+    assert (~shown_by(soft, layers, canvas).any(0)).sum(1).mean() > 60 * cuts
+
+
+@pytest.mark.usefixtures(one_device.__name__)
+@pytest.mark.parametrize("x", [240, 300])
+def test_without_flow_a_cut_runs_where_fine_texture_agrees(x: int) -> None:
+    """Layers that differ by noise, whose mean is nothing, but on a path that no softmax would choose."""
+    canvas = Canvas.plane(480, 208)
+    rows, columns = pixel_places(canvas.height, canvas.width)
+    path = x + 30 * np.sin(rows / 33)
+    noise = np.random.default_rng(1).normal(0, 25, (2, *rows.shape, 1))
+    noise[:, np.abs(columns - path) <= 9] = 0
+    layers = []
+    for one, mask in zip(noise, halves(canvas, 270), strict=True):
+        picture = wall(canvas)
+        picture[..., :3] = np.clip(picture[..., :3] + one, 0, 255)
+        layers.append(masked(picture, mask))
+    left, right = shown_by(merged(layers, canvas, flow=False, exposure=False), layers, canvas)
+    inside = (rows >= 4) & (rows < canvas.height - 4)  # a cell in a corner has few neighbours to be cut from
+    assert left[inside & (columns < path - 9)].all() and right[inside & (columns > path + 9)].all()
+
+
+@pytest.mark.usefixtures(one_device.__name__)
+def test_without_flow_a_canvas_that_is_turned_gives_the_turned_result() -> None:
+    """By a whole number of cells of every grid."""
+    canvas = CANVASES["across the border"][0]
+    layers = scene("across the border", 1, 0.8, 5)[0]
+    turned = []
+    for layer in layers:
+        pixels = np.zeros((canvas.height, canvas.width, 4), np.uint8)
+        box = layer.box
+        pixels[box.top : box.bottom, box.left : box.right] = layer.read(0, box.height)
+        pixels = np.roll(pixels, 96, 1)
+        turned.append(masked(pixels, pixels[..., 3] > 0))
+    first, second = (merged(ones, canvas, flow=False) for ones in (layers, turned))
+    assert off(np.roll(first, 96, 1), second).max() <= 2  # dither is another one there
+
+
+@pytest.mark.usefixtures(one_device.__name__)
+def test_without_flow_exposures_meet_at_the_cut() -> None:
+    """Beside each cut, the mean brightness of small patches is as without a difference of exposure."""
+    layers, canvas, *_ = scene("plane", None, 0.8, 5)
+    clean = merged(scene("plane", None, 1.0, 5)[0], canvas, flow=False)
+    ratio = ndimage.gaussian_filter(merged(layers, canvas, flow=False)[..., 1].astype(float), 4)
+    ratio /= ndimage.gaussian_filter(clean[..., 1].astype(float), 4)
+    slope = np.abs(ratio[:, 12:] - ratio[:, :-12])
+    assert np.percentile(slope, 99) < 0.1  # layers differ by 0.2
+
+
+@pytest.mark.usefixtures(one_device.__name__)
+def test_without_flow_none_is_looked_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(joint, "_flows", None)
+    layers, canvas, *_ = scene("plane", None, dx=5)
+    assert (merged(layers, canvas, flow=False)[..., 3] == 255).all()

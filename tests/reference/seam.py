@@ -23,8 +23,10 @@ def seam_difference(
     colours: Sequence[int],
     cells: Sequence[int],
     integer: int,
+    squared: int,
 ) -> Array:
-    """Mean corrected difference a - b of every cell's pixels, every other one in x and y, and their share."""
+    """Mean corrected difference a - b, or its square's, of every cell's pixels, every other one in x and y,
+    and their share."""
     columns, rows = pixels(border[0], border[1])
     gain_row = (2 * np.arange(cells[1]) + 1) * colours[1] // (2 * cells[1])
     gain_column = (2 * np.arange(cells[0]) + 1) * colours[0] // (2 * cells[0])
@@ -45,7 +47,7 @@ def seam_difference(
         left, right = (k * border[0] // cells[0] for k in (i, i + 1))
         top, bottom = (k * border[1] // cells[1] for k in (j, j + 1))
         part = np.s_[top:bottom:2, left:right:2]
-        values = (looks[0] - looks[1])[part][usable[part]]
+        values = (looks[0] - looks[1])[part][usable[part]] ** (2 if squared else 1)
         if len(values):
             result[j, i] = [*values.mean(0), len(values) / usable[part].size]
     return result
