@@ -27,7 +27,7 @@ _DTYPES = {"uint8": np.uint8, "uint16": np.uint16, "half": np.float16, "float": 
 _UNASSOCIATED = "oiio:UnassociatedAlpha"
 _SEPARATED, _PALETTE = 5, 3  # TIFF PhotometricInterpretation
 _MAX_CHUNK = 32 << 20  # a strip above this size (bytes) is not decoded whole to get a few rows of it
-_MAX_KEPT = 32 << 20  # bytes of already decoded rows that a layer keeps for its next read
+_MAX_KEPT = 4 << 20  # bytes of already decoded rows that a layer keeps for its next read
 
 
 def read_layer(path: Path | str) -> Layer:

@@ -3,7 +3,11 @@
 from __future__ import annotations
 
 import logging
+import os
+import threading
+from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import combinations
@@ -27,7 +31,7 @@ from hugin_abflow import (
     working,
 )
 from hugin_abflow.blend import BlendLayer
-from hugin_abflow.coefficient import Coefficients, Masks
+from hugin_abflow.coefficient import Masks
 from hugin_abflow.colour import Correction
 from hugin_abflow.flow import FlowParameters
 from hugin_abflow.geometry import Pair, PairFlow
@@ -124,7 +128,6 @@ def prepare(
     used = [i for i in range(len(everything)) if not _redundant(i, everything, masks)]
     reduced = [everything[i] for i in used]
     masks = masks.only(used)
-    coefficients = coefficient.coefficients(device, reduced, masks, grid, settings)
     order = {id(layer): index for index, layer in enumerate(layers)}
     numbers = [order[id(one.layer)] for one in reduced]
     parameters = quality.flow_parameters(settings.flow_quality)
@@ -137,8 +140,9 @@ def prepare(
         if settings.flow
         else []
     )
+    flows = [consistency.mend(device, pair) for pair in flows]
     pairs = [pair for pair, _ in overlaps]
-    fields, correction = _align(device, reduced, coefficients, pairs, flows, masks, grid, settings)
+    fields, correction = _align(device, reduced, pairs, flows, masks, grid, settings)
     final = [
         BlendLayer(layer.layer, layer.box, field, geometry.reach(device, layer, field, grid), gain)
         for layer, field, gain in zip(reduced, fields, correction.gains, strict=True)
@@ -150,7 +154,6 @@ def prepare(
 def _align(
     device: Device,
     layers: Sequence[WorkingLayer],
-    coefficients: Sequence[Coefficients],
     pairs: Sequence[Pair],
     flows: Sequence[PairFlow],
     masks: Masks,
@@ -164,10 +167,11 @@ def _align(
     What flow cannot explain spoils the exposure around it, which is found again without it.
     """
     regions: npt.NDArray[np.bool_] | None = None
-    flows = [consistency.mend(device, pair) for pair in flows]
-    coefficients = transition.narrow(device, layers, coefficients, flows, grid, settings)
+    whole = coefficient.coefficients(device, layers, masks, grid, settings)
+    coefficients = transition.narrow(device, layers, whole, flows, grid, settings)
     correct = partial(colour.correction, device, layers)
     fields = geometry.fields(device, layers, coefficients, flows, grid, settings)
+    del whole, coefficients  # as large as the layers, and not needed again
     # exposure explains a difference whether it is corrected or not
     exposure = replace(settings, exposure=True)
     for _ in range(_SEAM_ROUNDS if settings.seam else 0):
@@ -186,10 +190,35 @@ def _align(
 
 
 def _read(device: Device, layers: Sequence[Layer], grid: Grid, progress: Progress) -> list[WorkingLayer]:
-    """The layers on the working grid, in an order that does not depend on the caller's."""
+    """The layers on the working grid, several decoded at a time, in an order that does not depend on the
+    caller's: by place and size, and by what they show where these are the same.
+    """
+    lock = threading.Lock()
+
+    def told(rows: int) -> None:
+        with lock:
+            advance(rows)
+
+    places = Counter(layer.box for layer in layers)
+    decoders = ThreadPoolExecutor(os.cpu_count())
     with progress("read", sum(layer.box.height for layer in layers)) as advance:
-        reduced = [working.reduce_layer(device, layer, grid, advance) for layer in layers]
-    return sorted(reduced, key=lambda r: (r.layer.box.top, r.layer.box.left, r.box, r.checksum))
+        try:
+            jobs = [
+                decoders.submit(
+                    working.reduce_layer, device, layer, grid, told, checked=places[layer.box] > 1
+                )
+                for layer in layers
+            ]
+            reduced = [job.result() for job in jobs]
+        finally:
+            decoders.shutdown(cancel_futures=True)
+        device.finish()  # else the last rows' time would be told as that of what follows
+    return sorted(reduced, key=_place)
+
+
+def _place(layer: WorkingLayer) -> tuple[int, ...]:
+    box = layer.layer.box
+    return box.top, box.left, box.bottom, box.right, layer.checksum
 
 
 def _redundant(index: int, layers: Sequence[WorkingLayer], masks: Masks) -> bool:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import os
 import sys
+import threading
 import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -218,6 +219,7 @@ class Device:
         self.context = cl.Context([self.device])
         self.queue = cl.CommandQueue(self.context)
         self._kernels: dict[tuple[str, str, str], cl.Kernel] = {}
+        self._arguments = threading.Lock()  # a kernel keeps its arguments from when they are set to its start
         _log.info("device: %s (%s)", self.device.name.strip(), self.device.platform.name.strip())
 
     def empty(self, shape: Sequence[int], dtype: npt.DTypeLike = np.float32) -> Buffer:
@@ -263,13 +265,13 @@ class Device:
 
         Arguments: `Buffer`, int (int32), float (float32), or a tuple / array of 2, 4 or 16 numbers,
         which becomes an int or float vector. The run size is rounded up to whole work-groups; every
-        kernel checks bounds first.
+        kernel checks bounds first. Several threads may call it at a time.
         """
         if min(size) <= 0:
             return
-        kernel = self.kernel(module, name, options)
-        kernel.set_args(*(_argument(a) for a in args))
-        with _device_errors(f"running {name}"):
+        with self._arguments, _device_errors(f"running {name}"):
+            kernel = self.kernel(module, name, options)
+            kernel.set_args(*(_argument(a) for a in args))
             cl.enqueue_nd_range_kernel(self.queue, kernel, _rounded(size), _GROUP)
 
     def repeat(

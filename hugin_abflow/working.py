@@ -23,7 +23,7 @@ from hugin_abflow.progress import Advance
 from hugin_abflow.settings import Settings
 
 # Rows of a layer that are decoded and uploaded at a time.
-_ROWS = 256
+_ROWS = 64
 
 # Bounds of what kernels calculate with int, less some for rounding; only canvases longer than 30,000 px and
 # very narrow get near them.
@@ -168,8 +168,13 @@ def _span(low: int, high: int, start: int, ratio: tuple[int, int]) -> tuple[int,
     return -(-(low - start) * small // full), (high - start) * small // full
 
 
-def reduce_layer(device: Device, layer: Layer, grid: Grid, advance: Advance) -> WorkingLayer:
-    """Decode a layer once, band by band, onto the working grid; `advance` counts its rows."""
+def reduce_layer(
+    device: Device, layer: Layer, grid: Grid, advance: Advance, *, checked: bool = True
+) -> WorkingLayer:
+    """Decode a layer once, band by band, onto the working grid; `advance` counts its rows.
+
+    checked         whether a checksum is calculated, which costs a fifth of what decoding does; else it is 0.
+    """
     region = grid.region
     left, right = _span(layer.box.left, layer.box.right, region.left, (region.width, grid.width))
     top, bottom = _span(layer.box.top, layer.box.bottom, region.top, (region.height, grid.height))
@@ -187,7 +192,7 @@ def reduce_layer(device: Device, layer: Layer, grid: Grid, advance: Advance) -> 
         start = (top + first) * region.height // grid.height - place_y
         end = -(-(top + first + rows) * region.height // grid.height) - place_y
         rows_read = device_rows(layer, start, end)
-        checksum = crc32(rows_read.data, checksum)
+        checksum = crc32(rows_read.data, checksum) if checked else 0
         stored = device.upload(rows_read)
         place = (place_x, start + place_y, layer.box.width, end - start)
         device.run(
@@ -196,7 +201,9 @@ def reduce_layer(device: Device, layer: Layer, grid: Grid, advance: Advance) -> 
         )  # fmt: skip
         advance(end - done)  # bands share rows; each counts once
         done = end
-    if bottom <= top:  # too flat for a row of the grid: the order of such layers must not be the caller's
+    if (
+        checked and bottom <= top
+    ):  # too flat for a row of the grid: the order of such layers must not be the caller's
         checksum = crc32(device_rows(layer, 0, layer.box.height).data)
     advance(layer.box.height - done)
     return WorkingLayer(layer, box, pixels, checksum)
