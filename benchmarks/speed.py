@@ -1,8 +1,9 @@
 """How fast? ``python benchmarks/speed.py [--width 9000] [--runs 3]``
 
 Six layers of the paper's rig on a large canvas, 8 bit, LZW, cropped, as nona writes them, are blended by
-enblend and by hugin-abflow in turns. Wall time, CPU time (user + system) and peak memory are medians over
-the runs; the table is Markdown. The layers are rendered once and kept in --cache.
+enblend and by hugin-abflow in turns. The floor is what decoding the layers twice and encoding hugin-abflow's
+result take, with nothing in between (`floor.py`). Wall time, CPU time (user + system) and peak memory are
+medians over the runs; the table is Markdown. The layers are rendered once and kept in --cache.
 """
 
 from __future__ import annotations
@@ -17,14 +18,18 @@ import time
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
+
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
 from benchmarks.rigs import RIGS, render_layer, write_layer
+from hugin_abflow.images import read_layer
 from sample_projects.project import project_text
 from sample_projects.scene import room
 from sample_projects.tracer import Tracer
 
 ROOT = Path(__file__).resolve().parent.parent
+FLOOR = "floor"
 
 
 @dataclass(frozen=True)
@@ -80,6 +85,10 @@ def commands(folder: Path, width: int) -> dict[str, list[str]]:
         "hugin-abflow": [
             *(sys.executable, "-m", "hugin_abflow", project, "--prefix", prefix, "-o", out["abflow"]),
         ],
+        FLOOR: [
+            *(sys.executable, str(ROOT / "benchmarks" / "floor.py"), str(folder / "result.npy")),
+            *(str(folder / "result-floor.tif"), *layers),
+        ],
     }
 
 
@@ -124,6 +133,9 @@ def main() -> None:
     runs: dict[str, list[Run]] = {name: [] for name in chosen}
     for turn in range(options.runs):
         for name, command in chosen.items():
+            if name == FLOOR and turn == 0:
+                layer = read_layer(folder / "result-abflow.tif")
+                np.save(folder / "result.npy", layer.read(0, layer.box.height))
             runs[name].append(measure(command))
             print(f"run {turn + 1}, {name}: {runs[name][-1].wall:.1f} s", file=sys.stderr)
     size = f"{options.width}x{options.width // 2}"
