@@ -55,6 +55,7 @@ BLENDERS: dict[str, Command | None] = {
     "abflow": abflow(),
     "abflow fast": abflow("--flow-quality", "fast"),
     "abflow best": abflow("--flow-quality", "best"),
+    "abflow no flow": abflow("--no-flow"),
     "abflow sequential": abflow("--merge", "sequential"),
     "enblend -w": enblend,
     "verdandi -w": verdandi,
@@ -111,6 +112,19 @@ def show_places(charts: list[Chart], result: Score, out: Path) -> None:
         cv2.imwrite(str(out.with_name(f"{out.stem}-{('band', 'north', 'south')[number]}.png")), picture)
 
 
+def row(folder: Path, out: Path, width: int, seconds: float, show: bool = False) -> str:
+    """The columns of the table from "false %" on, for a result of the set in `folder`."""
+    picture = read_canvas(out, width)
+    charts, reach = load_charts(folder, picture)
+    result = score(charts, reach=reach, break_px=4.0 * width / 2048)
+    if show:
+        show_places(charts, result, out)
+    return (
+        f"| {result.false_share:.2f} | {result.worst_break():.1f} | {result.broken_share:.2f} "
+        f"| {count_holes(folder, picture, width)} | {result.sharpness:.2f} | {seconds:.1f} |"
+    )
+
+
 def run_set(rig: str, seed: int, width: int, cache: Path, names: list[str], show: bool) -> None:
     """Make a set, blend it with every blender, print one table row each."""
     folder = cache / f"{rig}-{seed}-{width}"
@@ -122,17 +136,17 @@ def run_set(rig: str, seed: int, width: int, cache: Path, names: list[str], show
         if error:
             print(f"| {rig} {seed} | {name} | failed: {error} | | | | | |", flush=True)
             continue
-        picture = read_canvas(out, width)
-        charts, reach = load_charts(folder, picture)
-        result = score(charts, reach=reach, break_px=4.0 * width / 2048)
-        if show:
-            show_places(charts, result, out)
-        print(
-            f"| {rig} {seed} | {name} | {result.false_share:.2f} | {result.worst_break():.1f} "
-            f"| {result.broken_share:.2f} | {count_holes(folder, picture, width)} "
-            f"| {result.sharpness:.2f} | {seconds:.1f} |",
-            flush=True,
-        )
+        print(f"| {rig} {seed} | {name} {row(folder, out, width, seconds, show)}", flush=True)
+
+
+def add_set_options(parser: argparse.ArgumentParser) -> None:
+    """Options that choose the sets."""
+    parser.add_argument("--rigs", nargs="+", choices=list(RIGS), default=list(RIGS))
+    parser.add_argument("--seeds", nargs="+", type=int, default=[1])
+    parser.add_argument("--width", type=int, default=2048, help="of the canvas, px")
+    parser.add_argument(
+        "--cache", type=Path, default=ROOT / "build" / "benchmarks", help="where sets are kept"
+    )
 
 
 def main() -> None:
@@ -140,13 +154,8 @@ def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("--rigs", nargs="+", choices=list(RIGS), default=list(RIGS))
-    parser.add_argument("--seeds", nargs="+", type=int, default=[1])
-    parser.add_argument("--width", type=int, default=2048, help="of the canvas, px")
+    add_set_options(parser)
     parser.add_argument("--blenders", nargs="+", choices=list(BLENDERS), default=list(BLENDERS))
-    parser.add_argument(
-        "--cache", type=Path, default=ROOT / "build" / "benchmarks", help="where sets are kept"
-    )
     parser.add_argument("--show", action="store_true", help="pictures of the false patches and breaks")
     options = parser.parse_args()
     names = []

@@ -11,11 +11,12 @@ import pytest
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
-from benchmarks import rigs
+from benchmarks import ablation, rigs
 from benchmarks.quality import paste
 from benchmarks.rigs import read_canvas, write_layer
 from benchmarks.scoring import Chart, Score, View, score
 from benchmarks.speed import Run, measure, table
+from hugin_abflow import Settings
 from sample_projects import lens
 
 HEIGHT, WIDTH, PARALLAX = 150, 331, 18
@@ -227,3 +228,9 @@ def test_table_has_medians_and_ratios() -> None:
     lines = table(runs).splitlines()
     assert lines[2] == "| a | 2.0 | 4.0 | 200 | 1.00 | 1.00 | 1.00 |"
     assert lines[3] == "| b | 1.0 | 8.0 | 50 | 0.50 | 2.00 | 0.25 |"
+
+
+@pytest.mark.parametrize("part", list(ablation.PARTS))
+def test_each_part_differs_from_the_default_by_valid_settings(part: str) -> None:
+    changed = Settings(**ablation.PARTS[part])
+    assert (changed == Settings()) == (part == "default")
