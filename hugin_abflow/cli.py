@@ -3,11 +3,8 @@
 from __future__ import annotations
 
 import logging
-import traceback
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from functools import partial
-from importlib import metadata
 from pathlib import Path
 from typing import Any, get_args
 
@@ -21,12 +18,14 @@ from hugin_abflow.opencl import list_devices
 from hugin_abflow.settings import FlowQuality, MergeMode, Settings
 from hugin_abflow.terminal import (
     PROGRAM,
+    catching,
     complain,
     display_progress,
     interruptible,
     messages,
     print_path,
     say,
+    version,
 )
 
 EXIT_CODES = {
@@ -109,13 +108,6 @@ def spread_layers(arguments: Sequence[str]) -> list[str]:
             spread.append("--layers")
         spread.append(argument)
     return spread
-
-
-def _version() -> str:
-    try:
-        return metadata.version(PROGRAM)
-    except metadata.PackageNotFoundError:
-        return "(run from its source, not installed)"
 
 
 def _print_devices(context: click.Context, parameter: click.Parameter, wanted: bool) -> None:
@@ -265,7 +257,7 @@ _information = partial(click.option, cls=_Option, group="Information")
 @_information("-q", "--quiet", is_flag=True, help="Print nothing but warnings and errors.")
 @_information("-v", "--verbose", is_flag=True, help="Say what is done and how long it takes.")
 @click.version_option(
-    _version(), prog_name=PROGRAM, message="%(prog)s %(version)s", help="Print the version and exit."
+    version(), prog_name=PROGRAM, message="%(prog)s %(version)s", help="Print the version and exit."
 )
 @click.help_option("-h", "--help", help="Show this help and exit.")
 def command(
@@ -333,7 +325,7 @@ def command(
         for project in projects:
             heading = f"{project.name}: " if len(projects) > 1 else ""
             with (
-                _catching(project, verbose) as failures,
+                catching(str(project), verbose) as failures,
                 display_progress(heading, quiet, verbose) as progress,
             ):
                 panorama = merge_one(project, progress=progress)
@@ -348,31 +340,6 @@ def _combine(codes: Sequence[ExitCode]) -> ExitCode:
     if len(set(codes)) == 1:
         return codes[0]
     return ExitCode.PARTIAL if ExitCode.OK in codes else ExitCode.FAILED
-
-
-@contextmanager
-def _catching(project: Path, verbose: bool) -> Iterator[list[ExitCode]]:
-    """Report an error in one project instead of ending the run; gives the list that its code goes to."""
-    failures: list[ExitCode] = []
-    try:
-        yield failures
-    except AbflowError as error:
-        complain(str(error))
-        failures.append(error.exit_code)
-    except MemoryError:
-        complain(f"{project}: not enough memory; close other programs, or make the panorama smaller in Hugin")
-        failures.append(ExitCode.FAILED)
-    except OSError as error:
-        complain(f"{project}: {error}")
-        failures.append(ExitCode.FAILED)
-    except Exception as error:
-        if verbose:
-            say(traceback.format_exc().rstrip())
-        complain(
-            f"{project}: {type(error).__name__}: {error}\n"
-            f"This is a bug in {PROGRAM}; please report it with what the same command prints with -v."
-        )
-        failures.append(ExitCode.FAILED)
 
 
 def _run(arguments: Sequence[str] | None) -> int:

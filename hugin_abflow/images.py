@@ -103,6 +103,7 @@ def _describe(path: Path, name: str, page: int, source: Any, place: tifftags.Pla
         icc=None if profile is None else bytes(profile),
         canvas_size=canvas,
         file=path,
+        has_alpha=rows.has_alpha,
     )
 
 

@@ -34,6 +34,8 @@ _OIIO_NAMES = {
     np.dtype(np.float16): "half",
     np.dtype(np.float32): "float",
 }
+# What TIFF holds beside these.
+_WIDE_NAMES = {np.dtype(np.float64): "double"}
 ENDINGS = {
     ".tif": "tiff",
     ".tiff": "tiff",
@@ -70,8 +72,10 @@ class ImageWriter:
     path            format by its ending, see `ENDINGS`; an existing file is replaced.
     width, height   pixels.
     channels        1 (grey) or 3 (RGB); rows have one more, alpha.
-    dtype           of the rows: uint8, uint16, float16, float32. JPEG is written with 8 bit, PNG with 8
-                    or 16 (floats: 0..1 becomes 0..65535); EXR needs floats.
+    dtype           of the rows: uint8, uint16, float16, float32.
+    depth           samples that are stored: one of these; TIFF: float64 too; default: `dtype`.
+                    Black and white stay what they are (65535 of uint16 is 1.0 of floats). JPEG is written
+                    with 8 bit, PNG with 8 or 16; EXR needs floats.
     offset          (x, y) on the canvas: TIFF position at 150 dpi as enblend writes it, EXR data window.
     canvas_size     (width, height) for the EXR display window; default: the data window.
     compression     TIFF: none, lzw (default), packbits, deflate; jpeg and zstd become deflate, with a
@@ -92,6 +96,7 @@ class ImageWriter:
         channels: int,
         dtype: npt.DTypeLike,
         *,
+        depth: npt.DTypeLike | None = None,
         offset: tuple[int, int] = (0, 0),
         icc: bytes | None = None,
         compression: str | None = None,
@@ -101,7 +106,7 @@ class ImageWriter:
         self.path = Path(path)
         self.width, self.height, self.channels, self.dtype = width, height, channels, np.dtype(dtype)
         self.format = _format_of(self.path)
-        self.stored = _stored_dtype(self.path, self.format, self.dtype)
+        self.stored = _stored_dtype(self.path, self.format, self.dtype, depth)
         if self.format == "jpeg" and max(width, height) > _JPEG_LIMIT:
             raise OutputError(f"{path}: JPEG ends at {_JPEG_LIMIT} pixels a side; choose .tif or .png")
         self.compression, self._option = _compression(self.path, self.format, compression, jpeg_quality)
@@ -115,7 +120,7 @@ class ImageWriter:
         self, offset: tuple[int, int], icc: bytes | None, canvas_size: tuple[int, int] | None
     ) -> Any:
         samples = self.channels if self.format == "jpeg" else self.channels + 1
-        spec = oiio.ImageSpec(self.width, self.height, samples, _OIIO_NAMES[self.stored])
+        spec = oiio.ImageSpec(self.width, self.height, samples, (_OIIO_NAMES | _WIDE_NAMES)[self.stored])
         colours = ("R", "G", "B") if self.channels == 3 else ("Y",)
         spec.channelnames = colours if self.format == "jpeg" else (*colours, "A")
         spec.alpha_channel = -1 if self.format == "jpeg" else self.channels
@@ -300,16 +305,23 @@ def _format_of(path: Path) -> str:
         raise OutputError(f"{path}: the ending must be one of {', '.join(ENDINGS)}") from None
 
 
-def _stored_dtype(path: Path, format_name: str, dtype: np.dtype[Any]) -> np.dtype[Any]:
+def _stored_dtype(
+    path: Path, format_name: str, dtype: np.dtype[Any], depth: npt.DTypeLike | None
+) -> np.dtype[Any]:
     if dtype not in _OIIO_NAMES:
         raise OutputError(f"{path}: samples of type {dtype}; possible are uint8, uint16, float16, float32")
-    if format_name == "openexr" and dtype.kind != "f":
-        raise OutputError(
-            f"{path}: EXR holds half or float, the layers have {dtype}; choose .tif, .png or .jpg"
-        )
+    wanted = dtype if depth is None else np.dtype(depth)
+    if format_name == "tiff":
+        return wanted
     if format_name == "jpeg":
         return np.dtype(np.uint8)
-    return np.dtype(np.uint16) if format_name == "png" and dtype.kind == "f" else dtype
+    if format_name == "png":
+        return wanted if wanted == np.uint8 else np.dtype(np.uint16)
+    if wanted.kind != "f":
+        raise OutputError(
+            f"{path}: EXR holds half or float, the layers have {wanted}; choose .tif, .png or .jpg"
+        )
+    return wanted if wanted == np.float16 else np.dtype(np.float32)
 
 
 def _compression(
@@ -339,9 +351,12 @@ def _to_depth(rows: Pixels, stored: np.dtype[Any]) -> Pixels:
     """Rescale samples to another depth, rounded to nearest; 0 and full scale stay what they are."""
     if rows.dtype == stored:
         return rows
-    if rows.dtype.kind == "f":
-        full = full_scale(stored)
-        scaled: Pixels = np.rint(np.clip(rows.astype(np.float32), 0, 1) * full).astype(stored)
-        return scaled
-    eight: Pixels = ((rows.astype(np.uint32) + 128) // 257).astype(stored)  # 65535 = 255 * 257
-    return eight
+    if rows.dtype.kind == stored.kind == "f":
+        return rows.astype(stored)
+    scaled: Pixels = rows.astype(np.float64 if stored == np.float64 else np.float32)
+    scaled /= full_scale(rows.dtype)
+    if stored.kind == "u":
+        np.clip(scaled, 0, 1, out=scaled)
+        scaled *= full_scale(stored)
+        np.rint(scaled, out=scaled)
+    return scaled.astype(stored)

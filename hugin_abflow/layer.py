@@ -96,6 +96,7 @@ class Layer:
     icc         the ICC profile, if any.
     canvas_size (width, height) of the canvas that the layer was made for, if its file tells it.
     file        the file that `read` decodes; None for pixels in memory.
+    has_alpha   False for a file without alpha: every pixel is valid.
     """
 
     name: str
@@ -106,6 +107,7 @@ class Layer:
     icc: bytes | None = field(default=None, repr=False)
     canvas_size: tuple[int, int] | None = None
     file: Path | None = None
+    has_alpha: bool = True
 
     @classmethod
     def from_array(

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +25,11 @@ from hugin_abflow.project import Plan, read_plan
 from hugin_abflow.settings import Settings
 
 _log = logging.getLogger(__name__)
+
+# What `joint.merge` looks like.
+Method = Callable[
+    [Device, Sequence[Layer], Canvas, Settings, Progress, Sequence[Guide]], Iterator[npt.NDArray[Any]]
+]
 
 
 def merge_project(
@@ -58,15 +64,45 @@ def merge_project(
         if ENDINGS.get(target.suffix.lower()) == ENDINGS[plan.output.ending]:
             compression = plan.output.compression if compression is None else compression
             jpeg_quality = plan.output.jpeg_quality if jpeg_quality is None else jpeg_quality
-        crop, first = plan.canvas.crop, opened[0]
-        with ImageWriter(
-            target, crop.width, crop.height, first.channels, first.dtype,
-            offset=(crop.left, crop.top), canvas_size=(plan.canvas.width, plan.canvas.height), icc=first.icc,
-            compression=compression, jpeg_quality=jpeg_quality,
-        ) as writer:  # fmt: skip
-            _report(plan, opened, writer)
-            _write(writer, _bands(opened, plan.canvas, settings, progress, _guides(plan, opened, settings)))
+        write_panorama(
+            target, opened, plan.canvas, settings, projection=plan.projection,
+            guides=partial(guides_between, plan, opened, settings),
+            compression=compression, jpeg_quality=jpeg_quality, progress=progress,
+        )  # fmt: skip
     return target
+
+
+def write_panorama(
+    target: Path,
+    layers: Sequence[Layer],
+    canvas: Canvas,
+    settings: Settings,
+    *,
+    projection: str,
+    guides: Callable[[], Sequence[Guide]] = tuple,
+    method: Method | None = None,
+    depth: npt.DTypeLike | None = None,
+    compression: str | None = None,
+    jpeg_quality: int | None = None,
+    progress: Progress = silent,
+) -> None:
+    """Merge layers that fit the canvas into a file, which appears when it is complete.
+
+    projection      of the canvas, in words.
+    guides          gives the places that layers have in common; asked once the file can be written.
+    method          merges the layers; default: what `settings.merge` says.
+    depth, compression, jpeg_quality    of the file, see `images.ImageWriter`.
+
+    Raises `OutputError`, `ImageReadError` (a layer cannot be decoded), `DeviceError`.
+    """
+    crop, first = canvas.crop, layers[0]
+    with ImageWriter(
+        target, crop.width, crop.height, first.channels, first.dtype, depth=depth,
+        offset=(crop.left, crop.top), canvas_size=(canvas.width, canvas.height), icc=first.icc,
+        compression=compression, jpeg_quality=jpeg_quality,
+    ) as writer:  # fmt: skip
+        _report(canvas, projection, layers, writer)
+        _write(writer, _bands(layers, canvas, settings, progress, guides(), method))
 
 
 def merge_layers(
@@ -96,10 +132,11 @@ def _bands(
     settings: Settings,
     progress: Progress,
     guides: Sequence[Guide],
+    method: Method | None = None,
 ) -> Iterator[npt.NDArray[Any]]:
     """The panorama's rows from top to bottom."""
     device = Device(settings.device)
-    method = {"joint": joint.merge, "sequential": sequential.merge}[settings.merge]
+    method = method or {"joint": joint.merge, "sequential": sequential.merge}[settings.merge]
     visible = False
     for rows in method(device, layers, canvas, settings, progress, guides):
         visible = visible or bool(rows[..., -1].any())
@@ -111,7 +148,7 @@ def _bands(
         )
 
 
-def _guides(plan: Plan, layers: Sequence[Layer], settings: Settings) -> list[Guide]:
+def guides_between(plan: Plan, layers: Sequence[Layer], settings: Settings) -> list[Guide]:
     """The project's control points between the layers."""
     if not (settings.flow and settings.guides) or len(layers) < 2:
         return []
@@ -131,12 +168,12 @@ def _write(writer: ImageWriter, bands: Iterator[npt.NDArray[Any]]) -> None:
             encoded.result()
 
 
-def _report(plan: Plan, layers: Sequence[Layer], writer: ImageWriter) -> None:
+def _report(canvas: Canvas, projection: str, layers: Sequence[Layer], writer: ImageWriter) -> None:
     """Say what is merged, and into what."""
-    canvas, crop = plan.canvas, plan.canvas.crop
+    crop = canvas.crop
     _log.info(
         "canvas: %d x %d, %s, %g degrees; crop: %d x %d at (%d, %d)",
-        canvas.width, canvas.height, plan.projection, canvas.hfov,
+        canvas.width, canvas.height, projection, canvas.hfov,
         crop.width, crop.height, crop.left, crop.top,
     )  # fmt: skip
     kind = {1: "grey", 3: "RGB"}[layers[0].channels]
@@ -152,7 +189,11 @@ def _target(plan: Plan, layers: Sequence[Layer], output: Path | str | None) -> P
     inputs = [layer.file for layer in layers if layer.file is not None]
     if output is None:
         return plan.default_output(inputs)
-    for file in [plan.file, *(image.photo for image in plan.images), *inputs]:
-        if file.resolve() == Path(output).resolve():
-            raise OutputError(f"{output} is an input of {plan.file}; choose another name with -o")
+    refuse_input(Path(output), [plan.file, *(image.photo for image in plan.images), *inputs])
     return Path(output)
+
+
+def refuse_input(output: Path, inputs: Iterable[Path]) -> None:
+    """Raise `OutputError` for an output that is one of the inputs."""
+    if output.resolve() in {file.resolve() for file in inputs}:
+        raise OutputError(f"{output} is an input of this panorama; choose another name with -o")

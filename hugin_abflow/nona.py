@@ -92,7 +92,7 @@ def check_layers(canvas: Canvas, layers: Sequence[Layer]) -> None:
     Canvas size (where a layer's file tells it), place inside the canvas, depth, number of channels.
     """
     size = f"{canvas.width}x{canvas.height}"
-    again = "make the layers again (--remap always) or leave the file out"
+    again = "make the layers again with nona, or leave the file out"
     for layer in layers:
         name, box, first = layer.file or layer.name, layer.box, layers[0]
         if layer.canvas_size not in (None, (canvas.width, canvas.height)):

@@ -11,19 +11,28 @@ import signal
 import sys
 import threading
 import time
+import traceback
 from collections.abc import Iterator
 from contextlib import AbstractContextManager, contextmanager, suppress
 from functools import partial
+from importlib import metadata
 from pathlib import Path
 from types import FrameType
 
 import click
 
+from hugin_abflow.errors import AbflowError, ExitCode
 from hugin_abflow.progress import Advance, Progress, silent
 
 PROGRAM = "hugin-abflow"
 
-_log = logging.getLogger("hugin_abflow.terminal")
+
+def version() -> str:
+    """The version of the installed package."""
+    try:
+        return metadata.version(PROGRAM)
+    except metadata.PackageNotFoundError:
+        return "(run from its source, not installed)"
 
 
 def say(text: str) -> None:
@@ -46,6 +55,31 @@ def print_path(path: Path) -> None:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
+@contextmanager
+def catching(task: str, verbose: bool) -> Iterator[list[ExitCode]]:
+    """Report an error in a task instead of ending the run; gives the list that its code goes to."""
+    failures: list[ExitCode] = []
+    try:
+        yield failures
+    except AbflowError as error:
+        complain(str(error))
+        failures.append(error.exit_code)
+    except MemoryError:
+        complain(f"{task}: not enough memory; close other programs, or make the panorama smaller in Hugin")
+        failures.append(ExitCode.FAILED)
+    except OSError as error:
+        complain(f"{task}: {error}")
+        failures.append(ExitCode.FAILED)
+    except Exception as error:
+        if verbose:
+            say(traceback.format_exc().rstrip())
+        complain(
+            f"{task}: {type(error).__name__}: {error}\n"
+            f"This is a bug in {PROGRAM}; please report it with what the same command prints with -v."
+        )
+        failures.append(ExitCode.FAILED)
+
+
 class _MessageHandler(logging.Handler):
     def emit(self, record: logging.LogRecord) -> None:
         label = f"{PROGRAM}: {record.levelname.lower()}: " if record.levelno >= logging.WARNING else ""
@@ -53,18 +87,22 @@ class _MessageHandler(logging.Handler):
 
 
 @contextmanager
-def messages(level: int) -> Iterator[None]:
-    """Print the package's log messages from `level` upwards to stderr."""
-    logger = logging.getLogger("hugin_abflow")
+def messages(level: int, always: str | None = None) -> Iterator[None]:
+    """Print the package's log messages from `level` upwards to stderr; of the logger `always`, all."""
+    levels = {logging.getLogger("hugin_abflow"): level}
+    if always:
+        levels[logging.getLogger(always)] = logging.INFO
+    before = {logger: logger.level for logger in levels}
     handler = _MessageHandler()
-    before = logger.level
-    logger.addHandler(handler)
-    logger.setLevel(level)
+    logging.getLogger("hugin_abflow").addHandler(handler)
+    for logger, its_level in levels.items():
+        logger.setLevel(its_level)
     try:
         yield
     finally:
-        logger.removeHandler(handler)
-        logger.setLevel(before)
+        logging.getLogger("hugin_abflow").removeHandler(handler)
+        for logger, its_level in before.items():
+            logger.setLevel(its_level)
 
 
 def display_progress(heading: str, quiet: bool, verbose: bool) -> AbstractContextManager[Progress]:
@@ -84,11 +122,11 @@ def _as_given(progress: Progress) -> Iterator[Progress]:
 
 @contextmanager
 def _lines(heading: str, phase: str, total: int) -> Iterator[Advance]:
-    """A phase as two lines of the log."""
+    """A phase as two lines."""
     started = time.monotonic()
-    _log.info("%s%s ...", heading, phase)
+    say(f"{heading}{phase} ...")
     yield lambda units: None
-    _log.info("%s%s: %.2f s", heading, phase, time.monotonic() - started)
+    say(f"{heading}{phase}: {time.monotonic() - started:.2f} s")
 
 
 @contextmanager

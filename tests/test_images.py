@@ -11,6 +11,7 @@ import OpenImageIO as oiio
 import pytest
 import tifffile
 from conftest import DTYPES, names_in, noise, photo_pixels, whole
+from layer_files import write_layer
 
 from hugin_abflow.errors import ImageReadError
 from hugin_abflow.images import read_layer, read_layers, write_image
@@ -320,3 +321,9 @@ def open_files() -> int:
     if not folder.is_dir():
         pytest.skip("this system does not list open files")  # only Linux does
     return len(names_in(folder))
+
+
+@pytest.mark.parametrize("alpha", [True, False])
+def test_layer_tells_whether_its_file_has_alpha(tmp_path: Path, alpha: bool) -> None:
+    write_layer(tmp_path / "a.tif", np.full((5, 7, 4), 255, np.uint8), alpha=alpha)
+    assert read_layer(tmp_path / "a.tif").has_alpha == alpha

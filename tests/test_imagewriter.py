@@ -376,3 +376,21 @@ def test_full_disk(tmp_path):
         resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
         signal.signal(signal.SIGXFSZ, old_action)
     assert not names_in(tmp_path)
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+@pytest.mark.parametrize("depth", [np.uint8, np.uint16, np.float16, np.float32, np.float64])
+def test_tiff_holds_the_depth_that_is_asked_for(tmp_path: Path, dtype: type, depth: type) -> None:
+    """Any to any; black and white stay what they are."""
+    path, full = tmp_path / "a.tif", full_scale(dtype)
+    pixels = (np.linspace(0, 1, 64) * full).astype(dtype).reshape(4, 4, 4)
+    with ImageWriter(path, 4, 4, 3, dtype, depth=depth) as writer:
+        writer.write_rows(pixels)
+    found = tifffile.imread(path)
+    assert found.dtype == depth
+    scale = full_scale(depth)
+    expected = pixels.astype(float) / full * scale
+    if found.dtype.kind == "u":
+        expected = np.rint(expected)
+    np.testing.assert_allclose(found, expected, rtol=1e-3 if depth == np.float16 else 1e-6, atol=1e-6)
+    assert found.min() == 0 and found.max() == scale
