@@ -103,3 +103,9 @@ class SettingsError(AbflowError):
     """A setting is out of its range or of a wrong type."""
 
     exit_code = ExitCode.USAGE
+
+
+class CommandLineError(AbflowError):
+    """A command line in enblend's manner is wrong."""
+
+    exit_code = ExitCode.USAGE

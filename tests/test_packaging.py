@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import os
 import subprocess
 import sys
@@ -39,10 +40,15 @@ def test_wheel_has_all_modules_and_kernels_and_nothing_else(wheel: Path) -> None
     assert any(name.endswith("licenses/LICENSE") for name in information)
 
 
-def test_wheel_has_the_command(wheel: Path) -> None:
+def test_wheel_has_the_commands(wheel: Path) -> None:
     archive = zipfile.ZipFile(wheel)
     (points,) = (name for name in archive.namelist() if name.endswith("entry_points.txt"))
-    assert "hugin-abflow = hugin_abflow.cli:main" in archive.read(points).decode()
+    expected = [f"{name} = {target}" for name, target in PROJECT["scripts"].items()]
+    assert expected[0] == "hugin-abflow = hugin_abflow.cli:main"
+    assert archive.read(points).decode().splitlines()[1:] == sorted(expected)
+    for target in PROJECT["scripts"].values():
+        module, function = target.split(":")
+        assert callable(getattr(importlib.import_module(module), function))
 
 
 def test_unpacked_wheel_runs_outside_the_checkout(wheel: Path, tmp_path: Path) -> None:

@@ -1,0 +1,134 @@
+"""Command lines in GNU getopt's manner, and response files: what scripts written for enblend rely on.
+
+Options may follow files, long names may be shortened as long as they are unambiguous, values that may be
+missing must be attached (``-w both`` is an option without a value, and a file), ``--`` ends the options.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+from hugin_abflow.errors import CommandLineError, LayersMissingError
+
+_log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class Option:
+    """One option: its names with their dashes, the first of which is what it is called.
+
+    value       whether it takes one: "optional" ones count only if they are attached (``-w1``, ``--wrap=1``).
+    """
+
+    names: tuple[str, ...]
+    value: Literal["none", "required", "optional"] = "none"
+
+
+# An option that was given, with its value.
+Given = tuple[Option, str | None]
+
+
+def parse(arguments: Iterable[str], options: Sequence[Option]) -> tuple[list[Given], list[str]]:
+    """Options with their values, in the order given; and what is left, the files.
+
+    Raises `CommandLineError` for an unknown or ambiguous option, a value that is missing or not wanted.
+    """
+    given: list[Given] = []
+    files: list[str] = []
+    remaining = iter(arguments)
+    for argument in remaining:
+        if argument == "--":
+            files += remaining
+        elif argument.startswith("--"):
+            given.append(_long(argument, options, remaining))
+        elif argument.startswith("-") and argument != "-":
+            given += _short(argument, options, remaining)
+        else:
+            files.append(argument)
+    return given, files
+
+
+def _long(argument: str, options: Sequence[Option], remaining: Iterable[str]) -> Given:
+    """``--name``, ``--name=value`` or ``--name value``."""
+    name, equals, attached = argument.partition("=")
+    option = _by_long_name(name, options)
+    if equals and option.value == "none":
+        raise CommandLineError(f"{name} takes no value")
+    if equals:
+        return option, attached
+    return option, _next(name, remaining) if option.value == "required" else None
+
+
+def _by_long_name(name: str, options: Sequence[Option]) -> Option:
+    matches = [option for option in options if name in option.names]
+    matches = matches or [option for option in options if any(n.startswith(name) for n in option.names)]
+    if not matches:
+        raise CommandLineError(f"unknown option {name}")
+    if len(matches) > 1:
+        names = ", ".join(n for option in matches for n in option.names if n.startswith(name))
+        raise CommandLineError(f"{name} may mean any of {names}")
+    return matches[0]
+
+
+def _short(argument: str, options: Sequence[Option], remaining: Iterable[str]) -> list[Given]:
+    """``-a``, several as ``-ab``, the last of them with a value: ``-w1``, ``-o name``, ``-oname``."""
+    given: list[Given] = []
+    for at, letter in enumerate(argument[1:], 2):
+        option = next((option for option in options if f"-{letter}" in option.names), None)
+        if option is None:
+            raise CommandLineError(f"unknown option -{letter}")
+        if option.value == "none":
+            given.append((option, None))
+            continue
+        attached = argument[at:] or None
+        if attached is None and option.value == "required":
+            attached = _next(f"-{letter}", remaining)
+        return [*given, (option, attached)]
+    return given
+
+
+def _next(name: str, remaining: Iterable[str]) -> str:
+    for argument in remaining:
+        return argument
+    raise CommandLineError(f"{name} needs a value")
+
+
+def expand(names: Iterable[str]) -> list[Path]:
+    """Files, where ``@list`` stands for the names in a response file.
+
+    A list holds one name a line, relative to its folder; ``#`` begins a comment line; lists may name lists.
+    One that names itself is warned of and passed over. Raises `LayersMissingError` for a list that cannot be
+    read.
+    """
+    return _expand(names, Path(), ())
+
+
+def _expand(names: Iterable[str], folder: Path, outer: tuple[Path, ...]) -> list[Path]:
+    files: list[Path] = []
+    for name in names:
+        if not name.startswith("@"):
+            files.append(folder / name)
+            continue
+        response = folder / name[1:]
+        if response.resolve() in outer:
+            _log.warning("%s names itself; passed over", response)
+            continue
+        files += _expand(_lines(response), response.parent, (*outer, response.resolve()))
+    return files
+
+
+def _lines(response: Path) -> list[str]:
+    """The names in a response file."""
+    try:
+        lines = [os.fsdecode(line.strip()) for line in response.read_bytes().splitlines()]
+    except OSError as error:
+        raise LayersMissingError(
+            f"the list {response} cannot be read: {error.strerror}; a name after @ is that of a text file "
+            "with a layer's name on each line"
+        ) from None
+    return [line for line in lines if line and not line.startswith("#")]

@@ -1,0 +1,156 @@
+"""``abflow-enblend``: blends what enblend is asked to blend, by optical flow."""
+
+from __future__ import annotations
+
+import logging
+import sys
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from functools import partial
+
+from hugin_abflow.dropin.request import HELP, Request, read_command_line
+from hugin_abflow.dropin.weights import MaskedMerge
+from hugin_abflow.errors import CommandLineError, ExitCode, LayersMismatchError, LayersMissingError
+from hugin_abflow.guides import Guide
+from hugin_abflow.images import read_layers
+from hugin_abflow.layer import Box, Canvas, Layer
+from hugin_abflow.merge import guides_between, refuse_input, write_panorama
+from hugin_abflow.nona import check_layers
+from hugin_abflow.progress import Progress
+from hugin_abflow.project import read_plan
+from hugin_abflow.settings import Settings
+from hugin_abflow.terminal import (
+    PROGRAM,
+    catching,
+    complain,
+    display_progress,
+    interruptible,
+    messages,
+    say,
+    version,
+)
+
+NAME = "abflow-enblend"
+
+_log = logging.getLogger(__name__)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run ``abflow-enblend`` with `arguments` (default: the process's own); gives 0, or 1 as enblend does."""
+    with interruptible():
+        try:
+            succeeded = _run(sys.argv[1:] if arguments is None else arguments)
+            return ExitCode.OK if succeeded else ExitCode.FAILED
+        except KeyboardInterrupt:
+            say(f"{PROGRAM}: interrupted")
+            return ExitCode.INTERRUPTED
+
+
+def _run(arguments: Sequence[str]) -> bool:
+    """Whether the command line's panorama, or its answer, is there."""
+    with messages(logging.WARNING), catching(NAME, verbose=False) as failures:
+        try:
+            request = read_command_line(arguments)
+        except CommandLineError as error:
+            complain(f"{error}\nTry '{NAME} --help'.")
+            return False
+    if failures:
+        return False
+    if request.answer:
+        print(HELP if request.answer == "help" else f"{NAME} {version()}, in place of enblend 4.2")
+        return True
+    verbose = request.verbosity > 1
+    with (
+        # that a layer is left out is known to `joint`, which tells it to those who ask; enblend warns of it
+        messages(logging.INFO if verbose else logging.WARNING, always="hugin_abflow.joint"),
+        catching(str(request.output), verbose) as failures,
+        display_progress("", quiet=request.verbosity == 0, verbose=True) as progress,
+    ):
+        blend(request, progress)
+    return not failures
+
+
+def blend(request: Request, progress: Progress) -> None:
+    """Make the panorama that is asked for.
+
+    Raises the `AbflowError` family; `LayersMismatchError` for layers without alpha too, as enblend refuses
+    them.
+    """
+    if request.ignored:
+        _log.warning("options of enblend that change nothing here: %s", ", ".join(request.ignored))
+    layers = _read(request)
+    refuse_input(request.output, request.inputs)
+    guides: Callable[[], Sequence[Guide]] = tuple
+    if request.project:
+        plan = read_plan(request.project)
+        canvas = replace(plan.canvas, crop=request.crop or _bounds(layers))
+        projection, guides = plan.projection, partial(guides_between, plan, layers, Settings())
+    else:
+        canvas = _canvas(layers, request.crop, request.wraps)
+        projection = "taken as equirectangular" if canvas.spherical else "taken as flat"
+    check_layers(canvas, layers)
+    write_panorama(
+        request.output, layers, canvas, Settings(), projection=projection, guides=guides,
+        method=MaskedMerge(request.save_masks, request.load_masks, request.output),
+        depth=request.depth, jpeg_quality=request.jpeg_quality,
+        # what the others call compression is not what enblend's option means
+        compression=request.compression if request.output.suffix.lower() in (".tif", ".tiff") else None,
+        progress=progress,
+    )  # fmt: skip
+
+
+def _read(request: Request) -> list[Layer]:
+    """The layers that are named, described but not decoded."""
+    for path in request.inputs:
+        if not path.is_file():
+            raise LayersMissingError(f"{path}: no such file; name the layers that nona made")
+    layers = [layer for path in request.inputs for layer in read_layers(path)]
+    for layer in layers:
+        if not layer.has_alpha:
+            raise LayersMismatchError(
+                f"{layer.file} has no alpha channel, so nothing says where it ends; make the layer with nona"
+            )
+    if len(layers) == 1:
+        _log.warning("only one layer: there is nothing to blend, the output is the layer")
+    return layers
+
+
+def _bounds(layers: Sequence[Layer]) -> Box:
+    """The smallest box around all layers."""
+    boxes = [layer.box for layer in layers]
+    return Box(
+        min(box.left for box in boxes),
+        min(box.top for box in boxes),
+        max(box.right for box in boxes),
+        max(box.bottom for box in boxes),
+    )
+
+
+def _canvas(layers: Sequence[Layer], crop: Box | None, wraps: bool) -> Canvas:
+    """The canvas that a command line without a project is about.
+
+    Its size is what the layers' files say, else what holds layers and crop. One that wraps and is twice as
+    wide as high is the whole sphere: no other projection is used for that.
+    """
+    bounds = _bounds(layers)
+    crop = crop or bounds
+    sizes = {layer.canvas_size: layer for layer in layers if layer.canvas_size}
+    if len(sizes) > 1:
+        (one, first), (other, second) = list(sizes.items())[:2]
+        raise LayersMismatchError(
+            f"{first.name} was made for a canvas of {one[0]}x{one[1]}, {second.name} for one of "
+            f"{other[0]}x{other[1]}; name the layers of one panorama"
+        )
+    width, height = next(iter(sizes), None) or (
+        max(bounds.right, crop.right),
+        max(bounds.bottom, crop.bottom),
+    )
+    if crop.right > width or crop.bottom > height:
+        raise LayersMismatchError(
+            f"-f {crop.width}x{crop.height}+{crop.left}+{crop.top} reaches beyond the canvas of "
+            f"{width}x{height} that the layers were made for; make them again, or correct -f"
+        )
+    whole = (
+        Canvas.sphere(width, height) if wraps and width == 2 * height else Canvas.plane(width, height, wraps)
+    )
+    return replace(whole, crop=crop)

@@ -1,0 +1,167 @@
+"""Each layer's colour weight as an image: written (``--save-masks``), or taken instead (``--load-masks``)."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from hugin_abflow import joint, working
+from hugin_abflow.blend import BlendLayer
+from hugin_abflow.errors import CommandLineError, LayersMismatchError, LayersMissingError
+from hugin_abflow.guides import Guide
+from hugin_abflow.images import ImageWriter, read_layer
+from hugin_abflow.joint import Prepared
+from hugin_abflow.layer import Box, Canvas, Layer, full_scale
+from hugin_abflow.merge import refuse_input
+from hugin_abflow.opencl import Device
+from hugin_abflow.progress import Progress, silent
+from hugin_abflow.settings import Settings
+
+_WHITE = np.uint16(65535)
+
+
+@dataclass(frozen=True)
+class MaskedMerge:
+    """`joint.merge`, with weights that are saved, or taken from images; see `merge.Method`.
+
+    save, load      templates of the masks' names, see `name`; None: not.
+    output          the panorama's file, which templates may refer to.
+
+    A mask covers the output's pixels. White: the layer counts wherever another could stand in for it.
+    """
+
+    save: str | None
+    load: str | None
+    output: Path
+
+    def __call__(
+        self,
+        device: Device,
+        layers: Sequence[Layer],
+        canvas: Canvas,
+        settings: Settings,
+        progress: Progress,
+        guides: Sequence[Guide],
+    ) -> Iterator[npt.NDArray[Any]]:
+        """Bands as `joint.merge` gives them; raises what it raises, and `LayersMissingError`,
+        `LayersMismatchError` and `ImageReadError` for masks that are missing, of another size, or broken.
+        """
+        numbers = {id(layer): index for index, layer in enumerate(layers)}
+        given = self._read(layers, canvas.crop) if self.load else []
+        targets = self._targets(layers) if self.save else []
+        prepared = joint.prepare_in_memory(device, layers, canvas, settings, progress, guides)
+        if given:
+            weighted = [
+                _weighted(device, one, given[numbers[id(one.layer)]], prepared) for one in prepared.layers
+            ]
+            prepared = replace(prepared, layers=tuple(weighted))
+        if targets:
+            with progress("masks", len(layers)) as advance:
+                for layer, target in zip(layers, targets, strict=True):
+                    _write(device, target, prepared, layer, canvas, settings)
+                    advance(1)
+        yield from joint.bands(device, prepared, canvas, settings, progress)
+
+    def _read(self, layers: Sequence[Layer], crop: Box) -> list[Layer]:
+        """The masks, on the canvas, in the layers' order."""
+        masks = []
+        for layer, path in zip(layers, _names(self.load or "", layers, self.output), strict=True):
+            if not path.is_file():
+                raise LayersMissingError(f"{path}: no such mask for {layer.name}; --save-masks writes them")
+            mask = read_layer(path)
+            if (mask.box.width, mask.box.height) != (crop.width, crop.height):
+                raise LayersMismatchError(
+                    f"{path} has {mask.box.width}x{mask.box.height} pixels, the output has "
+                    f"{crop.width}x{crop.height}; masks must be of the output's size"
+                )
+            masks.append(replace(mask, box=crop))
+        return masks
+
+    def _targets(self, layers: Sequence[Layer]) -> list[Path]:
+        """The files of masks that are written: each its own, and none of those that are needed."""
+        targets = _names(self.save or "", layers, self.output)
+        if len(set(targets)) < len(targets):
+            raise CommandLineError(f"--save-masks={self.save} names one mask twice; %n gives each a number")
+        for target in targets:
+            refuse_input(target, [self.output, *(layer.file for layer in layers if layer.file)])
+        return targets
+
+
+def _names(template: str, layers: Sequence[Layer], output: Path) -> list[Path]:
+    return [Path(name(template, index, layer, output)) for index, layer in enumerate(layers)]
+
+
+def name(template: str, index: int, layer: Layer, output: Path) -> str:
+    """The name of a layer's mask, as enblend makes it.
+
+    template    ``%i``: index, from 0; ``%n``: number, from 1; ``%p``: path, ``%d``: folder, ``%b``: name,
+                ``%f``: name without ending, ``%e``: ending, of the layer or in capitals of the output;
+                ``%%``: a percent sign. Numbers may have a width: ``%03n``.
+
+    Raises `CommandLineError` for another letter.
+    """
+    path = layer.file or Path(layer.name)
+
+    def part(found: re.Match[str]) -> str:
+        width, letter = found[1], found[2]
+        if letter == "%":
+            return "%"
+        if letter in "in":
+            return f"{index + (letter == 'n'):0{int(width or 0)}}"
+        file = output if letter.isupper() else path
+        parts = {
+            "p": str(file), "d": str(file.parent), "b": file.name, "f": file.stem, "e": file.suffix,
+        }  # fmt: skip
+        if letter.lower() not in parts:
+            raise CommandLineError(f"%{letter} in {template} means nothing; see --help for what does")
+        return parts[letter.lower()]
+
+    return re.sub(r"%(\d*)(.)", part, template)
+
+
+def _write(
+    device: Device, path: Path, prepared: Prepared, layer: Layer, canvas: Canvas, settings: Settings
+) -> None:
+    """One layer's weight: the panorama of layers that are black, but for that one, which is white."""
+    painted = replace(prepared, layers=tuple(_painted(device, one, layer) for one in prepared.layers))
+    crop = canvas.crop
+    with ImageWriter(path, crop.width, crop.height, 1, np.uint16, offset=(crop.left, crop.top)) as writer:
+        for rows in joint.bands(device, painted, canvas, settings, silent):
+            writer.write_rows(rows)
+
+
+def _painted(device: Device, one: BlendLayer, white: Layer) -> BlendLayer:
+    """A layer of 16-bit grey with the same mask and weight, white or black, each pixel in its place."""
+    layer = one.layer
+    colour = _WHITE if layer is white else np.uint16(0)
+
+    def read(top: int, bottom: int) -> npt.NDArray[Any]:
+        alpha = layer.read(top, bottom)[..., -1:] >= 0.5 * full_scale(layer.dtype)
+        return np.concatenate([np.full(alpha.shape, colour), alpha * _WHITE], 2)
+
+    grey = replace(layer, dtype=np.dtype(np.uint16), channels=1, read=read)
+    field = one.field.get()
+    field[..., :3] = 0
+    return replace(one, layer=grey, field=device.upload(field), gain=None)
+
+
+def _weighted(device: Device, layer: BlendLayer, mask: Layer, prepared: Prepared) -> BlendLayer:
+    """The layer with the mask as its weight, reduced to the working grid."""
+    region, crop = prepared.grid.region, mask.box
+    rows = np.clip(np.arange(region.top, region.bottom) - crop.top, 0, crop.height - 1)
+    columns = np.clip(np.arange(region.left, region.right) - crop.left, 0, crop.width - 1)
+    # repeated outside the crop: a working pixel that is not wholly covered would weigh nothing
+    grey = mask.read(0, crop.height)[..., :1][rows][:, columns]
+    opaque = np.full_like(grey, full_scale(mask.dtype))
+    whole = Layer.from_array(mask.name, np.concatenate([grey, opaque], 2), region.left, region.top)
+    reduced = working.reduce_layer(device, whole, prepared.grid, lambda units: None)
+    left, top, width, height = layer.box
+    field = layer.field.get()
+    field[..., 3] = reduced.pixels.get()[top : top + height, left : left + width, 0]
+    return replace(layer, field=device.upload(field))

@@ -1,0 +1,131 @@
+"""Masks that abflow-enblend writes and takes."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import tifffile
+from layer_files import write_layer
+from pictures import one_device, texture
+
+from hugin_abflow.dropin import enblend
+from hugin_abflow.dropin.weights import name
+from hugin_abflow.errors import CommandLineError
+from hugin_abflow.layer import Layer
+
+__all__ = ["one_device"]
+pytestmark = pytest.mark.usefixtures("one_device")
+
+WIDTH, HEIGHT = 200, 100
+
+
+@pytest.fixture
+def layers(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """Columns 0 to 120 and 80 to 200 of two quite different pictures."""
+    monkeypatch.chdir(tmp_path)
+    y, x = np.mgrid[:HEIGHT, :WIDTH]
+    write_layer(Path("a.tif"), texture(y, x)[:, :120], 0, 0, (WIDTH, HEIGHT))
+    write_layer(Path("b.tif"), texture(x, y)[:, 80:], 80, 0, (WIDTH, HEIGHT))
+    return ["a.tif", "b.tif"]
+
+
+def run(*arguments: str) -> int:
+    return int(enblend.main(["-v0", "-o", "out.tif", *arguments]))
+
+
+def test_masks_are_the_weights(layers: list[str]) -> None:
+    """Of the output's size; white where a layer is alone, together white everywhere, black outside."""
+    assert run("-f180x90+10+5", "--save-masks", *layers) == 0
+    masks = [tifffile.imread(f"mask-{number}.tif") for number in (1, 2)]
+    for mask in masks:
+        assert mask.shape == (90, 180, 2) and mask.dtype == np.uint16
+        assert (mask[..., 1] == 65535).all()
+    assert (masks[0][:, :70, 0] == 65535).all() and (masks[0][:, 110:, 0] == 0).all()
+    assert (masks[1][:, :70, 0] == 0).all() and (masks[1][:, 110:, 0] == 65535).all()
+    total = masks[0][..., 0].astype(int) + masks[1][..., 0]
+    assert np.abs(total - 65535).max() <= 1
+
+
+def test_masks_that_were_saved_give_the_same_picture(layers: list[str]) -> None:
+    assert run("--save-masks=m%n.tif", *layers) == 0
+    first = tifffile.imread("out.tif").astype(int)
+    assert run("--load-masks=m%n.tif", *layers) == 0
+    assert np.abs(tifffile.imread("out.tif") - first).max() <= 1
+
+
+@pytest.mark.parametrize("crop", ["200x100", "150x70+20+15"])
+@pytest.mark.parametrize("samples", ["8 bit", "16 bit", "float", "colour"])
+def test_masks_decide_which_layer_is_seen(layers: list[str], crop: str, samples: str) -> None:
+    """Half of the overlap from either layer, cut where no weight of ours would; without geometry's help."""
+    width, height = map(int, crop.partition("+")[0].split("x"))
+    left, top = map(int, [*crop.split("+"), "0", "0"][1:3])
+    upper = np.broadcast_to((np.arange(height) + top < 40)[:, None], (height, width))
+    for number, white in ((1, upper), (2, ~upper)):
+        grey = white * np.uint8(255)
+        stored = {
+            "8 bit": grey,
+            "16 bit": grey * np.uint16(257),
+            "float": grey.astype(np.float32) / 255,
+            "colour": np.stack([grey] * 3, 2),
+        }[samples]
+        tifffile.imwrite(f"mask-{number}.tif", stored, photometric="rgb" if samples == "colour" else None)
+    assert run(f"-f{crop}", "--load-masks", "--save-masks=s%n.tif", *layers) == 0
+    masks = [tifffile.imread(f"s{number}.tif")[..., 0] for number in (1, 2)]
+    inside = slice(85 - left, 115 - left)
+    for rows, seen in ((slice(0, 39 - top), 0), (slice(41 - top, None), 1)):
+        assert (masks[seen][rows, inside] == 65535).all()
+        assert (masks[1 - seen][rows, inside] == 0).all()
+
+
+def test_masks_of_a_smaller_working_canvas(layers: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    """Reduced and enlarged again, up to the crop's border, which no working pixel lies on."""
+    settings = enblend.Settings
+    monkeypatch.setattr(enblend, "Settings", lambda: settings(working_pixels=3000))
+    for number, white in ((1, 255), (2, 0)):
+        tifffile.imwrite(f"mask-{number}.tif", np.full((81, 177), white, np.uint8))
+    assert run("-f177x81+9+11", "--load-masks", "--save-masks=s%n.tif", *layers) == 0
+    first = tifffile.imread("s1.tif")[..., 0]
+    assert (first[:, : 115 - 9] == 65535).all()
+
+
+def refused(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
+    before = {path: path.read_bytes() for path in Path().iterdir()}
+    assert run(*arguments) == 1
+    assert {path: path.read_bytes() for path in Path().iterdir()} == before
+    return capsys.readouterr().err
+
+
+def test_masks_that_cannot_be(layers: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    assert "mask-1.tif: no such mask for a.tif" in refused(capsys, "--load-masks", *layers)
+    tifffile.imwrite("m.tif", np.zeros((9, 11), np.uint8))
+    message = refused(capsys, "--load-masks=m.tif", *layers)
+    assert "m.tif has 11x9 pixels, the output has 200x100" in message
+    assert "names one mask twice" in refused(capsys, "--save-masks=s.tif", *layers)
+    assert "is an input" in refused(capsys, "--save-masks=%p", *layers)
+    assert "is an input" in refused(capsys, "--save-masks=%F.tif", layers[0])
+    assert "%q in %q.tif means nothing" in refused(capsys, "--save-masks=%q.tif", *layers)
+
+
+@pytest.mark.parametrize(
+    ("template", "expected"),
+    [
+        ("mask-%n.tif", "mask-3.tif"),
+        ("%03i%%%02n", "002%03"),
+        ("%d/%f_m%e", "in/a.b_m.tif"),
+        ("%b|%p", "a.b.tif|in/a.b.tif"),
+        ("%D/%F%E %B %P", "out/p.png p.png out/p.png"),
+        ("plain", "plain"),
+    ],
+)
+def test_names_of_masks(template: str, expected: str) -> None:
+    layer = Layer.from_array("x", np.zeros((1, 1, 4), np.uint8))
+    layer = replace(layer, file=Path("in/a.b.tif"))
+    assert name(template, 2, layer, Path("out/p.png")) == expected.replace("/", str(Path("/"))[0])
+
+
+def test_name_with_an_unknown_letter() -> None:
+    with pytest.raises(CommandLineError, match="%x in"):
+        name("a%x", 0, Layer.from_array("x", np.zeros((1, 1, 4), np.uint8)), Path("o"))
