@@ -18,8 +18,8 @@ CURRENT := $(shell $(PY) -P -c "import importlib.util, os, sys; \
 	2>/dev/null && echo yes)
 
 # Debian's packages that the tests need, and the programs of theirs that are called.
-PACKAGES := hugin-tools enblend libimage-exiftool-perl
-PROGRAMS := nona pano_trafo enblend exiftool
+PACKAGES := hugin-tools enblend enfuse libimage-exiftool-perl
+PROGRAMS := nona pano_trafo hugin_executor enblend enfuse exiftool
 
 .PHONY: sample test lint clean programs FORCE
 
@@ -59,7 +59,7 @@ programs:
 	echo "The tests need$$missing."; \
 	if command -v apt-get >/dev/null && [ "$$(id -u)" = 0 ]; then sudo=; \
 	elif command -v apt-get >/dev/null && sudo -n true 2>/dev/null; then sudo="sudo -n"; \
-	else echo "Install Hugin's command line tools, enblend and exiftool (Debian: apt-get install $(PACKAGES)), then try again."; exit 1; fi; \
+	else echo "Install Hugin's command line tools, enblend, enfuse and exiftool (Debian: apt-get install $(PACKAGES)), then try again."; exit 1; fi; \
 	export DEBIAN_FRONTEND=noninteractive; \
 	$$sudo apt-get update; \
 	$$sudo apt-get install --yes --no-install-recommends $(PACKAGES)

@@ -109,3 +109,7 @@ class CommandLineError(AbflowError):
     """A command line in enblend's manner is wrong."""
 
     exit_code = ExitCode.USAGE
+
+
+class SetupError(AbflowError):
+    """Hugin's preferences or output sequences cannot be set up."""

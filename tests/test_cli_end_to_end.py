@@ -21,7 +21,6 @@ from hugin_abflow.errors import ExitCode
 from hugin_abflow.project import read_plan
 
 ROOM = Path(__file__).resolve().parent.parent / "sample_projects" / "room"
-SEQUENCE = ROOM.parent.parent / "docs" / "hugin-abflow.executor"
 WIDTH, HEIGHT = 250, 125  # pixels of the tiny canvas
 
 LENS = "Eev0 Er1 Eb1 r0 p0 TrX0 TrY0 TrZ0 Tpy0 Tpp0 j0"
@@ -348,27 +347,3 @@ def test_sample_merges(tmp_path: Path) -> None:
         covered[top : top + alpha.shape[0], left : left + alpha.shape[1]] |= alpha
     covered = covered[crop.top : crop.bottom, crop.left : crop.right]
     np.testing.assert_array_equal(pixels[..., 3] == 255, covered)  # no hole, and nothing outside
-
-
-def test_hugin_runs_the_output_sequence(
-    folder: Path, nona: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    executor = Path(nona).with_name("hugin_executor")  # of the same package
-    for name in ("left.png", "right.png"):
-        oiio.ImageBuf(textured(120, 120)).write(str(folder / name))
-    programs = tmp_path / "bin"
-    programs.mkdir()
-    (programs / "hugin-abflow").write_text(f'#!/bin/sh\nexec "{sys.executable}" -m hugin_abflow "$@"\n')
-    (programs / "hugin-abflow").chmod(0o755)
-    monkeypatch.setenv("PATH", f"{programs}{os.pathsep}{os.environ['PATH']}")
-    monkeypatch.setenv("HOME", str(tmp_path))  # Hugin writes preferences there
-    project = (folder / "tiny.pto").rename(folder / "huginpto_1a2b")  # as Hugin's window hands it over
-    for layer in folder.glob("tiny*.tif"):
-        layer.unlink()
-    before = names(folder)
-    command = [executor, "-s", "-u", SEQUENCE, "-p", folder / "a b'c é", project]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=120, cwd=folder)
-    assert done.returncode == 0, done.stdout + done.stderr
-    assert names(folder) - before == {"a b'c é.tif"}
-    pixels = read(folder / "a b'c é.tif")
-    assert pixels.shape == (HEIGHT, WIDTH, 4) and (pixels[..., 3] == 255).mean() > 0.9

@@ -29,14 +29,16 @@ def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-def test_wheel_has_all_modules_and_kernels_and_nothing_else(wheel: Path) -> None:
+def test_wheel_has_all_modules_kernels_and_sequences_and_nothing_else(wheel: Path) -> None:
     modules = {p.relative_to(ROOT).as_posix() for p in (ROOT / "hugin_abflow").rglob("*.py")}
     kernels = {f"hugin_abflow/kernels/{p.name}" for p in (ROOT / "kernels").glob("*.cl")}
-    assert len(modules) > 10 and len(kernels) > 5
+    folder = "hugin_abflow/dropin/sequences"
+    sequences = {f"{folder}/{p.name}" for p in (ROOT / folder).glob("*.executor")}
+    assert len(modules) > 10 and len(kernels) > 5 and len(sequences) == 3
     names = set(zipfile.ZipFile(wheel).namelist())
     information = {name for name in names if name.split("/")[0].endswith(".dist-info")}
     notes = {name for name in names if name.startswith("hugin_abflow/kernels/") and name.endswith(".md")}
-    assert names - information - notes == modules | kernels | {"hugin_abflow/py.typed"}
+    assert names - information - notes == modules | kernels | sequences | {"hugin_abflow/py.typed"}
     assert any(name.endswith("licenses/LICENSE") for name in information)
 
 
