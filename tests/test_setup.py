@@ -156,7 +156,7 @@ def test_places_on_windows_and_macos() -> None:
 def test_what_must_be_clicked_where_preferences_are_no_file(hugin: Places, programs: Path) -> None:
     for its in (Places(None, hugin.data, False), Places(hugin.preferences, hugin.data, False)):
         said = "\n".join(setup.install(its))
-        assert 'tick "Use alternative Enblend program"' in said and str(programs / "abflow-enblend") in said
+        assert f"as Enblend executable choose\n    {programs / 'abflow-enblend'}\n" in said
         assert {path.name for path in Path(its.data).iterdir()} == NAMES
         assert not Path(hugin.preferences).exists()
     assert 'untick "Use alternative Enblend program"' in setup.uninstall(Places(None, hugin.data, False))[0]

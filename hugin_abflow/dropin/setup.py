@@ -19,15 +19,16 @@ _BLENDER = "abflow-enblend"
 _PROGRAMS = ("hugin-abflow", _BLENDER)
 
 _CLICK_INSTALL = """\
-In Hugin, once: File > Preferences > Programs; tick "Use alternative Enblend program", and choose
-    {program}"""
+In Hugin, once: File, Preferences, tab Programs; as Enblend executable choose
+    {program}
+(tick "Use alternative Enblend program" first, where there is such a box)."""
 _CLICK_UNINSTALL = """\
-In Hugin: File > Preferences > Programs; untick "Use alternative Enblend program".\
-"""
+In Hugin: File, Preferences, tab Programs; untick "Use alternative Enblend program", or write enblend as the
+Enblend executable."""
 _AFTERWARDS = """\
 If Hugin is open, it will write its own preferences over these when it ends: close it, and run this again.
-Then the Stitch! button of its Stitcher tab blends by optical flow, and the menu Output, User defined output
-sequences, has the sequences. Undo: hugin-abflow-setup uninstall"""
+Then its Stitch! button blends by optical flow, and the menu Output, User defined output sequences, has the
+sequences (the menu is there once Interface, Advanced is chosen). Undo: hugin-abflow-setup uninstall"""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
