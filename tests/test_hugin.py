@@ -32,7 +32,7 @@ NAME = 'a b\'c "d" é'  # what has to survive scripts, shells and wxWidgets
 # What the command `pip install` makes does, and keeps the layers that the stitcher removes.
 PROGRAM = """#!/bin/sh
 for name; do
-    case "$name" in *[0-9][0-9][0-9][0-9].tif) test -f "$name" && cp -p "$name" "{kept}/";; esac
+    case "$name" in *[0-9][0-9][0-9][0-9].???) test -f "$name" && cp -p "$name" "{kept}/";; esac
 done
 exec "{python}" -c 'import sys; from {module} import main; sys.exit(main())' "$@"
 """
@@ -165,6 +165,51 @@ def test_stitcher_runs_through_us(
     np.testing.assert_array_equal(pixels, ours(hugin, project, tmp_path / "ours.tif"))
 
 
+def stacked(project: Path, options: str = "") -> Path:
+    """The project with a darker photo in a stack with each of its own; another output than usual is asked."""
+    lines: list[str] = []
+    for line in project.read_text().splitlines():
+        lines.append(line)
+        if not line.startswith("i "):
+            continue
+        index = lines.count("#-hugin  cropFactor=1") - 1
+        darker = f"darker {index}.tif"
+        tifffile.imwrite(project.parent / darker, photo_pixels(index // 2) // 2, photometric="rgb")
+        lines[-1] = line.replace(" j0 ", f" j{index} ")
+        photo = line.split('n"')[0].replace(" Eev0 ", " Eev1 ").replace(" j0 ", f" j={index} ")
+        lines += ["#-hugin  cropFactor=1", f'{photo}n"{darker}"']
+    project.write_text("\n".join([*lines, "#hugin_outputLDRBlended false", options]) + "\n")
+    return project
+
+
+@pytest.mark.parametrize(
+    ("option", "made", "blended"),
+    [
+        ("outputLDRExposureBlended", ["_fused.tif"], True),
+        ("outputHDRBlended", ["_hdr.exr"], True),
+        ("outputLDRExposureLayers", ["_exposure_0000.tif", "_exposure_0001.tif"], False),
+    ],
+)
+def test_stacks_and_exposure_layers_run_through_us(
+    hugin: Hugin, make_project: ProjectMaker, tmp_path: Path, option: str, made: list[str], blended: bool
+) -> None:
+    """As Hugin names them; `blended`: in one call, to compare with."""
+    require_program("enfuse")
+    project = stacked(make_project(panorama=CANVAS), f"#hugin_{option} true\n#hugin_outputImageTypeHDR exr")
+    before = set(names_in(project.parent))
+    assert "read ..." in hugin.stitch(project)
+    panoramas = sorted(set(names_in(project.parent)) - before)
+    assert panoramas == [NAME + ending for ending in made]
+    for name in panoramas:
+        pixels = read(project.parent / name)
+        assert pixels.shape == (200, 400, 4) and (pixels[..., 3] > 0).mean() > 0.15
+        if blended:
+            plain = make_project(folder="plain", panorama=CANVAS)
+            ending = Path(name).suffix
+            assert len(hugin.layers()) == 3 and pixels.dtype == (np.float16 if ending == ".exr" else np.uint8)
+            np.testing.assert_array_equal(pixels, ours(hugin, plain, tmp_path / f"ours{ending}"))
+
+
 def test_project_in_the_options_is_used(hugin: Hugin, make_project: ProjectMaker, tmp_path: Path) -> None:
     """Part of a sphere, which a command line does not tell from a plane."""
     part = CANVAS.replace("n", "S50,350,20,160 n", 1)
@@ -243,26 +288,12 @@ def test_sequence_leaves_only_the_panorama(hugin: Hugin, exiftool: str, make_pro
 def test_sequence_fuses_stacks_first(hugin: Hugin, make_project: ProjectMaker, tmp_path: Path) -> None:
     """Two exposures of each view are fused by enfuse, the three fused ones blended."""
     require_program("enfuse")
-    project = make_project(panorama=CANVAS, yaws=(0, 60, 170))
-    lines, stacked = project.read_text().splitlines(), []
-    for line in lines:
-        stacked.append(line)
-        if not line.startswith("i "):
-            continue
-        index = stacked.count("#-hugin  cropFactor=1") - 1
-        darker = f"darker {index}.tif"
-        stored = photo_pixels(index // 2) // 2
-        tifffile.imwrite(project.parent / darker, stored, photometric="rgb")
-        stacked[-1] = line.replace(" j0 ", f" j{index} ")
-        photo = line.split('n"')[0].replace(" Eev0 ", " Eev1 ").replace(" j0 ", f" j={index} ")
-        stacked += ["#-hugin  cropFactor=1", f'{photo}n"{darker}"']
-    project.write_text("\n".join(stacked) + "\n")
+    project = stacked(make_project(panorama=CANVAS))
     before = set(names_in(project.parent))
     log = hugin.stitch(project, "-u", "abflow_stacks.executor")
     assert log.count("Fusing stacks") == 3
     assert set(names_in(project.parent)) - before == {f"{NAME}_fused.tif"}
     assert len(hugin.layers()) == 3
-    pixels = read(project.parent / f"{NAME}_fused.tif")
-    assert pixels.shape == (200, 400, 4)
     plain = make_project(folder="plain", panorama=CANVAS)
+    pixels = read(project.parent / f"{NAME}_fused.tif")
     np.testing.assert_array_equal(pixels, ours(hugin, plain, tmp_path / "ours.tif"))
