@@ -32,7 +32,7 @@ _CELL = 16
 # takes time by cells^1.5 and layers^3.
 _DEEP = 4.0
 # Samples brighter than this, of full scale, may be clipped and measure nothing (integer images only).
-_CLIPPED = 0.98
+CLIPPED = 0.98
 # Standard deviation of the differences within a cell that halves its trust, on the exposure scale.
 _SPREAD = 0.3
 # Rounds of (weight of the measured differences against smoothness, distance from the solution at which a cell
@@ -124,7 +124,7 @@ def _difference(
     device.run(
         "colour", "colour_difference", cells.border[:2],
         a.pixels, fields[pair.a], a.box, b.pixels, fields[pair.b], b.box, grid.border, grid.lens,
-        cells.border, int(integer), _CLIPPED if integer else 1e30, _SPREAD, values,
+        cells.border, int(integer), CLIPPED if integer else 1e30, _SPREAD, values,
     )  # fmt: skip
     return values.get().astype(np.float64)
 

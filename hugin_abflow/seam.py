@@ -5,19 +5,22 @@ layers that differ although exposure is corrected. In each connected region of s
 to one layer: the one that the softmax favours, with cuts between layers, and at the layers' own
 borders, where they show least. This is a labelling of least energy,
 
-    sum_cells r (1 - s_k)  +  sum_neighbours c (r + r') / 2 [k != k']  +  sum_borders c r
+    sum_cells r (1 - s_k)  +  sum_neighbours c (e + e') / 2 [k != k']  +  sum_borders c e
 
-with r the residual, s_k the share of the softmax and c the price of a cut, found by graph cuts (alpha
-expansion: Boykov, Veksler, Zabih, "Fast approximate energy minimization via graph cuts", 2001). Regions keep
-to themselves: elsewhere the softmax stays as it is, and the transition lies where the layers agree.
+with r the residual of low frequencies, e what a cut shows (r, or more where texture is off), s_k the share of
+the softmax and c the price of a cut, found by graph cuts (alpha expansion: Boykov, Veksler, Zabih, "Fast
+approximate energy minimization via graph cuts", 2001). Regions keep to themselves: elsewhere the softmax
+stays as it is, and the transition lies where the layers agree. What is clipped in one photo only is no such
+difference: it is brighter in the other by an unknown amount, and changes over best where it does so slowly.
 
 Where there is no flow, layers are not aligned, and each overlap is such a region, whole: on finer cells, with
-the mean square of the difference in place of r, since fine texture is as much in the way of a cut, and with
-narrow transitions. Low frequencies are not blended across them: the gains of colour.py make them agree there.
+the mean square of the difference in place of r and e, since fine texture is as much in the way of a cut, and
+with narrow transitions. Low frequencies are not blended across them: the gains of colour.py make them agree.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import Any
 
@@ -29,7 +32,7 @@ from scipy.sparse import csr_array
 from scipy.sparse.csgraph import breadth_first_order, maximum_flow
 
 from hugin_abflow.coefficient import Masks, on_cells
-from hugin_abflow.colour import Correction
+from hugin_abflow.colour import CLIPPED, Correction
 from hugin_abflow.geometry import Pair
 from hugin_abflow.opencl import Buffer, Device
 from hugin_abflow.working import Grid, WorkingLayer
@@ -44,8 +47,12 @@ _SIGMA = 1.0
 _STRONG, _WEAK = 0.2, 0.045
 # Strong cells, of the equator's size, that a region has at least: fewer are an edge that is a pixel off.
 _LEAST = 6.0
+# Where two photos show somebody half over himself only his sides differ: over so many cells they are one.
+_BRIDGE = 4
 # Price of a cut, in cells: what is cut off must be favoured by the softmax over this depth.
 _CUT = 20.0
+# What a cut through texture that is off costs, of the same difference in low frequencies.
+_TEXTURE = 2.0
 # The same without flow, where the softmax has little to say: overlaps are some hundred cells wide.
 _FINE_CUT = 120.0
 # Cells to each side of a cut whose exposure counts.
@@ -74,7 +81,7 @@ def regions(
     """Where aligned, corrected layers still differ: (height, width) on the seam grid."""
     cells = seam_grid(grid)
     found = _regions(_residual(device, layers, fields, pairs, correction, grid, cells), cells)
-    return np.logical_or.reduce(found) if found else np.zeros(cells.shape, bool)
+    return _bridged(np.logical_or.reduce(found), cells.wraps) if found else np.zeros(cells.shape, bool)
 
 
 def cut(
@@ -92,7 +99,9 @@ def cut(
     """
     cells = seam_grid(grid)
     residual = _residual(device, layers, fields, pairs, correction, grid, cells)
-    owner = _owners(layers, fields, residual, whole, masks, grid, cells, _CUT)
+    rough, _ = _roughness(device, layers, fields, pairs, correction, grid, cells)
+    edge = np.maximum(residual, _TEXTURE * np.sqrt(rough))
+    owner = _owners(layers, fields, residual, edge, whole, masks, grid, cells, _CUT)
     yields = [_soften((whole & (owner != k)).astype(np.float32), cells.wraps) for k in range(len(layers))]
     _yield(device, layers, fields, yields, grid, cells)
 
@@ -111,12 +120,9 @@ def divide(
     Returns where the cuts are, with some cells beside them: (height, width) on a grid over the same region.
     """
     cells = grid.coarser(_FINE_CELL)
-    residual = np.zeros(cells.shape)
-    for pair in pairs:
-        found = _difference(device, layers, fields, pair, correction, grid, cells, squared=True)
-        residual = np.maximum(residual, np.where(found[..., 3] > 0, _SHORTER + found[..., :3].max(-1), 0))
-    whole = residual > 0
-    owner = _owners(layers, fields, residual, whole, masks, grid, cells, _FINE_CUT)
+    rough, whole = _roughness(device, layers, fields, pairs, correction, grid, cells)
+    residual = np.where(whole, _SHORTER + rough, 0)
+    owner = _owners(layers, fields, residual, residual, whole, masks, grid, cells, _FINE_CUT)
     yields = [(whole & (owner != k)).astype(np.float32) for k in range(len(layers))]
     _yield(device, layers, fields, yields, grid, cells)
     return _beside_cuts(owner, cells.wraps)
@@ -126,6 +132,7 @@ def _owners(
     layers: Sequence[WorkingLayer],
     fields: Sequence[Buffer],
     residual: npt.NDArray[np.float64],
+    edge: npt.NDArray[np.float64],
     whole: npt.NDArray[np.bool_],
     masks: Masks,
     grid: Grid,
@@ -143,7 +150,7 @@ def _owners(
     owner = np.where(cover.any(0), (shares * cover).argmax(0), -1)
     for region in _connected(whole, cells.wraps):
         rows, columns = np.nonzero(region)
-        owner[rows, columns] = label(rows, columns, residual, shares, cover, cells.wraps, cut_price)
+        owner[rows, columns] = label(rows, columns, residual, edge, shares, cover, cells.wraps, cut_price)
     return owner
 
 
@@ -192,6 +199,26 @@ def _residual(
     return largest
 
 
+def _roughness(
+    device: Device,
+    layers: Sequence[WorkingLayer],
+    fields: Sequence[Buffer],
+    pairs: Sequence[Pair],
+    correction: Correction,
+    grid: Grid,
+    cells: Grid,
+) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.bool_]]:
+    """How far all frequencies differ: per cell the largest mean square of any pair and channel, 0 where no
+    two lie; and where two do.
+    """
+    largest, seen = np.zeros(cells.shape), np.zeros(cells.shape, bool)
+    for pair in pairs:
+        found = _difference(device, layers, fields, pair, correction, grid, cells, squared=True)
+        largest = np.maximum(largest, found[..., :3].max(-1))
+        seen |= found[..., 3] > 0
+    return largest, seen
+
+
 def _difference(
     device: Device,
     layers: Sequence[WorkingLayer],
@@ -202,8 +229,8 @@ def _difference(
     cells: Grid,
     squared: bool = False,
 ) -> npt.NDArray[np.float64]:
-    """Of two corrected layers, (height, width, 4): per cell the mean of their difference, or of its square,
-    in r, g, b, and the share of the pixels that both show.
+    """Of two corrected layers, (height, width, 4): per cell the mean of their difference where neither is
+    clipped, or of its square anywhere, in r, g, b, and the share of the pixels that tell.
     """
     none = device.zeros((*correction.grid.shape, 4))
     difference = device.empty((*cells.shape, 4))
@@ -211,9 +238,10 @@ def _difference(
     for k in (pair.a, pair.b):
         sides += [layers[k].pixels, fields[k], layers[k].box, correction.gains[k] or none]
     integer = layers[pair.a].layer.dtype.kind == "u"
+    clipped = CLIPPED if integer and not squared else math.inf
     device.run(
         "seam", "seam_difference", cells.border[:2], *sides, grid.border, grid.lens,
-        correction.grid.border, cells.border, int(integer), int(squared), difference,
+        correction.grid.border, cells.border, int(integer), clipped, int(squared), difference,
     )  # fmt: skip
     return difference.get().astype(np.float64)
 
@@ -241,6 +269,14 @@ def _regions(residual: npt.NDArray[np.float64], cells: Grid) -> list[npt.NDArray
     return [region for region in _connected(grown, cells.wraps) if strong[region].sum() >= _LEAST]
 
 
+def _bridged(mask: npt.NDArray[np.bool_], wraps: bool) -> npt.NDArray[np.bool_]:
+    """A mask with what lies between parts that are near each other."""
+    margin = 2 * _BRIDGE
+    disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * _BRIDGE + 1, 2 * _BRIDGE + 1))
+    closed = cv2.morphologyEx(_padded(mask.astype(np.uint8), margin, wraps), cv2.MORPH_CLOSE, disc)
+    return np.asarray(closed)[margin:-margin, margin:-margin] > 0
+
+
 def _connected(mask: npt.NDArray[np.bool_], wraps: bool) -> list[npt.NDArray[np.bool_]]:
     """The connected parts of a mask."""
     count, found = cv2.connectedComponents(mask.astype(np.uint8), connectivity=8)
@@ -259,6 +295,7 @@ def label(
     rows: npt.NDArray[np.intp],
     columns: npt.NDArray[np.intp],
     residual: npt.NDArray[np.float64],
+    edge: npt.NDArray[np.float64],
     shares: npt.NDArray[np.float64],
     cover: npt.NDArray[np.bool_],
     wraps: bool,
@@ -266,13 +303,14 @@ def label(
 ) -> npt.NDArray[np.intp]:
     """Which layer each cell (rows, columns) of a region is taken from: the least energy found.
 
-    residual: (height, width). shares, cover: shares of the softmax and coverage (layers, height, width).
+    residual, edge: r and e, (height, width). shares, cover: shares of the softmax and coverage (layers,
+    height, width).
     cut_price: of a cut, in cells.
     """
     candidates = np.flatnonzero(cover[:, rows, columns].any(1))
     if candidates.size < 2:
         return np.full(rows.size, candidates[0] if candidates.size else 0)
-    weight = residual[rows, columns]
+    weight, shown = residual[rows, columns], edge[rows, columns]
     present = cover[candidates][:, rows, columns]
     price = np.where(present, weight * (1 - shares[candidates][:, rows, columns]), _FORBIDDEN)
     number = np.full(residual.shape, -1)
@@ -281,12 +319,12 @@ def label(
     for down, right in ((0, 1), (1, 0), (0, -1), (-1, 0)):
         inside, there = _neighbours(rows + down, columns + right, residual.shape, wraps)
         # a layer's own border is a cut as well, where the union goes on
-        price += cut_price * weight * (inside & cover[:, *there].any(0) & ~cover[candidates][:, *there])
+        price += cut_price * shown * (inside & cover[:, *there].any(0) & ~cover[candidates][:, *there])
         if down + right > 0:
             linked = np.flatnonzero(inside & (number[there] >= 0))
             links.append(np.stack([linked, number[there][linked]]))
     first, second = np.concatenate(links, 1)
-    between = cut_price * (weight[first] + weight[second]) / 2
+    between = cut_price * (shown[first] + shown[second]) / 2
     current = np.full(rows.size, np.argmin(price.sum(1)))
     for _ in range(1 if candidates.size == 2 else 2):
         for alpha in range(candidates.size):

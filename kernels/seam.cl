@@ -7,7 +7,7 @@ static inline float3 seam_look(float3 c, float3 gain, int integer) {
 }
 
 /* Mean difference a - b of two aligned, corrected layers over the pixels of a cell (every second one in x and y)
-   that both show, or the mean of its square, and the share of these. */
+   that both show unclipped, or the mean of its square, and the share of these. */
 __kernel void seam_difference(__global const float4 *layer_a, __global const float4 *field_a, int4 box_a,
                               __global const float4 *gain_a, /* (colours.y, colours.x) */
                               __global const float4 *layer_b, __global const float4 *field_b, int4 box_b,
@@ -15,6 +15,7 @@ __kernel void seam_difference(__global const float4 *layer_a, __global const flo
                               int4 border, float4 lens,    /* working grid */
                               int4 colours, int4 cells,    /* grid of the gains; seam grid, run size */
                               int integer,                 /* which exposure scale */
+                              float clipped,               /* brighter samples are not used */
                               int squared,                 /* 1: texture that is a little off counts as well */
                               __global float4 *difference) /* (cells.y, cells.x): r, g, b, share */
 {
@@ -31,7 +32,8 @@ __kernel void seam_difference(__global const float4 *layer_a, __global const flo
         for (int x = left; x < right; x += 2) {
             tried += 1.0f;
             float4 a, b;
-            if (!layer_pair(layer_a, field_a, box_a, layer_b, field_b, box_b, (int2)(x, y), border, lens, &a, &b))
+            if (!layer_pair(layer_a, field_a, box_a, layer_b, field_b, box_b, (int2)(x, y), border, lens, &a, &b) ||
+                any(a.xyz > clipped) || any(b.xyz > clipped))
                 continue;
             const float3 d = seam_look(a.xyz, gain_a[g].xyz, integer) - seam_look(b.xyz, gain_b[g].xyz, integer);
             sum += squared ? d * d : d;

@@ -23,10 +23,11 @@ def seam_difference(
     colours: Sequence[int],
     cells: Sequence[int],
     integer: int,
+    clipped: float,
     squared: int,
 ) -> Array:
     """Mean corrected difference a - b, or its square's, of every cell's pixels, every other one in x and y,
-    and their share."""
+    and their share; samples brighter than `clipped` are left out."""
     columns, rows = pixels(border[0], border[1])
     gain_row = (2 * np.arange(cells[1]) + 1) * colours[1] // (2 * cells[1])
     gain_column = (2 * np.arange(cells[0]) + 1) * colours[0] // (2 * cells[0])
@@ -38,7 +39,7 @@ def seam_difference(
     usable = np.ones((border[1], border[0]), bool)
     for layer, field, box, gain in ((layer_a, field_a, box_a, gain_a), (layer_b, field_b, box_b, gain_b)):
         seen = layer_seen(layer, field, box, columns, rows, border, lens)
-        usable &= seen[..., 3] > 0
+        usable &= (seen[..., 3] > 0) & (seen[..., :3] <= clipped).all(-1)
         here = gain[gain_row[cell[1]][:, None], gain_column[cell[0]][None], :3].astype(np.float64)
         shifted = exposure_shift(seen[..., :3], here, integer)
         looks.append(shifted if integer else np.sqrt(np.maximum(shifted, 0)))
