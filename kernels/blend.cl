@@ -1,8 +1,5 @@
 /* The full-resolution pass over one band of rows. Built with PIXEL (stored sample type), SAMPLES (2 or 4, alpha
-   last), WHITE (full scale) and INTEGER (1: round and saturate). Places are pixels of the region.
-
-   What runs for every pixel is written with operators: where PoCL's library is compiled for another processor
-   than the kernel, each floor, clamp or fmin is a call, and all that is in vector registers is saved around it. */
+   last), WHITE (full scale) and INTEGER (1: round and saturate). Places are pixels of the region. */
 
 #define BLEND_JOIN(type, n) type##n
 #define BLEND_VECTOR(type, n) BLEND_JOIN(type, n)
@@ -34,11 +31,6 @@ static inline float4 blend_tap(__global const blend_pixel *rows, int4 place, int
     return c.w >= 0.5f * WHITE ? (float4)(c.xyz, 1.0f) : (float4)(0.0f);
 }
 
-static inline int2 blend_floor(float2 p) {
-    const int2 whole = convert_int2(p);
-    return whole + (p < convert_float2(whole)); /* true is -1 */
-}
-
 static inline float4 blend_row(__global const blend_pixel *p, float4 weights, float4 *least) {
     const float4 a = blend_samples(p[0]), b = blend_samples(p[1]), c = blend_samples(p[2]), d = blend_samples(p[3]);
     const float4 ab = a < b ? a : b, cd = c < d ? c : d, low = ab < cd ? ab : cd;
@@ -48,7 +40,7 @@ static inline float4 blend_row(__global const blend_pixel *p, float4 weights, fl
 
 /* Bicubic sample at position q; next to the mask's rim bilinear over the valid taps, whose share is w. */
 static float4 blend_sample(__global const blend_pixel *rows, int4 place, float2 q, int4 border, int nearest) {
-    int2 corner = blend_floor(nearest ? q : q - 0.5f);
+    int2 corner = floor_int2(nearest ? q : q - 0.5f);
     if (nearest)
         return grid_border(&corner, border) ? blend_tap(rows, place, corner) : (float4)(0.0f);
     const float2 t = q - 0.5f - convert_float2(corner);
@@ -143,17 +135,6 @@ static inline bool blend_any(float3 v) {
     return v.x != 0.0f || v.y != 0.0f || v.z != 0.0f;
 }
 
-/* exp(v) to 1e-7, exactly 1 for 0: a power of two times a polynomial fitted to 2^t over 0..1. */
-static inline float4 blend_exp(float4 v) {
-    const float4 y = v * 1.44269504f;
-    int4 whole = convert_int4(y);
-    whole += y < convert_float4(whole); /* true is -1 */
-    const float4 t = y - convert_float4(whole);
-    const float4 upper = 0.0557999383f + t * (0.00901699517f + t * 0.00186714665f);
-    const float4 power = 1.0f + t * (0.693151312f + t * (0.240164443f + t * upper));
-    return power * as_float4((whole + 127) << 23);
-}
-
 /* A layer's gain at column q of the colour grid. */
 static inline float3 blend_gain(__global const float4 *gains, __global const blend_layer *layer, int y, float q,
                                 int4 border) {
@@ -164,7 +145,7 @@ static inline float3 blend_gain(__global const float4 *gains, __global const ble
 
 /* Smooth exposure correction of a colour in stored units. */
 static inline float3 blend_correct(float3 c, float3 gain) {
-    return blend_any(gain) ? exposure_raise(c, blend_exp(gain.xyzz).xyz - 1.0f, WHITE, INTEGER) : c;
+    return blend_any(gain) ? exposure_raise(c, exponential(gain.xyzz).xyz - 1.0f, WHITE, INTEGER) : c;
 }
 
 /* atan2 of a positive x; a few terms of the series do where the angle is small, as it nearly always is. */
@@ -183,7 +164,7 @@ static inline float2 blend_position(float2 p, float3 d, float2 scale, float4 len
     /* in the frame of p (east, north, up) the change of longitude is small, hence exact in float32 */
     const float sl = turn.x, cl = turn.y, sp = turn.z, cp = turn.w;
     const float east = cl * d.x - sl * d.y, out = cp + sl * d.x + cl * d.y;
-    const float north = sp + d.z, level = sqrt(east * east + out * out);
+    const float north = sp + d.z, level = ROOT(east * east + out * out);
     return (float2)(p.x + blend_angle(east, out) / lens.y,
                     p.y - blend_angle(north * cp - level * sp, level * cp + north * sp) / lens.w);
 }

@@ -20,12 +20,12 @@ __kernel void chart_sample(__global const float4 *layer, /* (box.w, box.z) r, g,
     if (i >= size.x || j >= size.y)
         return;
     const float2 p = canvas_position(chart_point((float2)(i + 0.5f, j + 0.5f), &chart), lens) - 0.5f;
-    float2 base = floor(p), t = p - base;
+    int2 corner = floor_int2(p);
+    float2 t = p - convert_float2(corner);
     /* positions come out of trigonometry or scaling: what is a whole pixel but for rounding is a copy */
-    if (t.x > 0.9995f) { base.x += 1.0f; t.x = 0.0f; }
-    if (t.y > 0.9995f) { base.y += 1.0f; t.y = 0.0f; }
-    t = select(t, (float2)(0.0f), t < 0.0005f);
-    const int2 corner = convert_int2(base);
+    if (t.x > 0.9995f) { corner.x += 1; t.x = 0.0f; }
+    if (t.y > 0.9995f) { corner.y += 1; t.y = 0.0f; }
+    t = t < 0.0005f ? (float2)(0.0f) : t;
     const float4 wx = catmull_rom(t.x), wy = catmull_rom(t.y);
     const float ax[4] = {wx.x, wx.y, wx.z, wx.w}, ay[4] = {wy.x, wy.y, wy.z, wy.w};
     const int2 first = corner - 1 - box.xy;
@@ -39,7 +39,7 @@ __kernel void chart_sample(__global const float4 *layer, /* (box.w, box.z) r, g,
             valid *= row[0].w * row[1].w * row[2].w * row[3].w;
         }
         if (valid != 0.0f) {
-            const float3 c = fmax(all.xyz, 0.0f);
+            const float3 c = GREATEST(all.xyz, (float3)(0.0f));
             image[j * size.x + i] = log(0.299f * c.x + 0.587f * c.y + 0.114f * c.z + floor_value);
             mask[j * size.x + i] = 1.0f;
             return;
@@ -58,7 +58,7 @@ __kernel void chart_sample(__global const float4 *layer, /* (box.w, box.z) r, g,
             outer = outer && (w == 0.0f || c.w != 0.0f);
             inner = inner && (l == 0.0f || c.w != 0.0f);
         }
-    const float3 c = fmax(outer ? cubic.xyz : linear.xyz, 0.0f);
+    const float3 found = outer ? cubic.xyz : linear.xyz, c = GREATEST(found, (float3)(0.0f));
     const float brightness = 0.299f * c.x + 0.587f * c.y + 0.114f * c.z;
     image[j * size.x + i] = inner ? log(brightness + floor_value) : 0.0f;
     mask[j * size.x + i] = inner ? 1.0f : 0.0f;

@@ -38,10 +38,10 @@ __kernel void coefficient_seed(__global const uchar *mask,  /* (grid.y, grid.x) 
    plane: dy, dx, 1, hence the squared distance. On the sphere: sin(dlat / 2), sin(dlon / 2), cos(lat), hence the
    haversine, which is exact for small angles. */
 static inline float coefficient_measure(int2 p, int2 q, int4 grid, __global const float *table) {
-    int dx = abs(p.x - q.x);
+    int dx = MAGNITUDE(p.x - q.x);
     if (grid.z)
-        dx = min(dx, grid.x - dx);
-    const float u = table[abs(p.y - q.y)], v = table[grid.y + dx];
+        dx = LEAST(dx, grid.x - dx);
+    const float u = table[MAGNITUDE(p.y - q.y)], v = table[grid.y + dx];
     __global const float *row = table + grid.x + grid.y;
     return u * u + row[p.y] * row[q.y] * v * v;
 }
@@ -96,9 +96,8 @@ __kernel void coefficient_distance(__global const int *seed,   /* (grid.y, grid.
     if (mask[at] && s < 0)
         d = furthest;
     else if (mask[at]) {
-        const float root =
-            sqrt(coefficient_measure((int2)(x, y), (int2)(s & 0xffff, s >> 16), grid, table));
-        d = unit * (spherical ? 2.0f * asin(fmin(1.0f, root)) : root);
+        const float root = ROOT(coefficient_measure((int2)(x, y), (int2)(s & 0xffff, s >> 16), grid, table));
+        d = unit * (spherical ? 2.0f * asin(LEAST(root, 1.0f)) : root);
     }
     distance[at] = d;
 }
@@ -119,7 +118,8 @@ __kernel void coefficient_expand(__global const float *distance, /* (grid.y, gri
     float d = 0.0f;
     if (layer[at].w != 0.0f) {
         const float2 q = ((float2)(x + box.x, y + box.y) + 0.5f) * ratio;
-        d = fmax(bilinear_scalar(distance, q, grid), 1e-3f);
+        d = bilinear_scalar(distance, q, grid);
+        d = GREATEST(d, 1e-3f);
     }
     expanded[at] = d;
     total[(y + box.y) * working.x + x + box.x] += d;
@@ -138,6 +138,6 @@ __kernel void coefficient_ratio(__global float *distance,     /* (box.w, box.z) 
         return;
     const int at = y * box.z + x;
     const float d = distance[at];
-    rim[at] = feather > 0.0f ? fmin(1.0f, d / feather) : (d > 0.0f ? 1.0f : 0.0f);
+    rim[at] = d < feather ? d / feather : (d > 0.0f ? 1.0f : 0.0f);
     distance[at] = d > 0.0f ? d / total[(y + box.y) * working.x + x + box.x] : 0.0f;
 }

@@ -24,18 +24,18 @@ __kernel void colour_difference(__global const float4 *layer_a, __global const f
             tried += 1.0f;
             float4 a, b;
             if (!layer_pair(layer_a, field_a, box_a, layer_b, field_b, box_b, (int2)(x, y), border, lens, &a, &b) ||
-                any(a.xyz > clipped) || any(b.xyz > clipped))
+                a.x > clipped || a.y > clipped || a.z > clipped || b.x > clipped || b.y > clipped || b.z > clipped)
                 continue;
             const float3 d = exposure_scale(a.xyz, integer) - exposure_scale(b.xyz, integer);
             sum += d;
-            squares += dot(d, d);
+            squares += square3(d);
             n += 1.0f;
         }
     float4 result = (float4)(0.0f);
     if (n > 0.0f) {
         const float3 mean = sum / n;
-        const float variance = fmax(0.0f, squares / n - dot(mean, mean));
-        result = (float4)(mean, n / tried / (1.0f + variance / (spread * spread)));
+        const float variance = squares / n - square3(mean);
+        result = (float4)(mean, n / tried / (1.0f + GREATEST(variance, 0.0f) / (spread * spread)));
     }
     difference[cy * cells.x + cx] = result;
 }

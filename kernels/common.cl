@@ -3,7 +3,53 @@
    Frames. A grid is an array of pixels; positions on it are continuous, x right, y down, and pixel (i, j)
    covers [i, i+1) x [j, j+1), so its centre is at (i + 0.5, j + 0.5). "Point" is a place in the scene's
    frame: on a spherical canvas a unit vector (x right, y forward, z up), on a plane (x, y, 0) in canvas
-   grid pixels. */
+   grid pixels.
+
+   What runs for every pixel is written with operators: where PoCL's library is compiled for another processor
+   than the kernel, each floor, clamp or fmin is a call, and all that is in vector registers is saved around it. */
+
+/* Of two scalars or vectors of one type; the second where the first is not a number. */
+#define LEAST(a, b) ((a) < (b) ? (a) : (b))
+#define GREATEST(a, b) ((a) > (b) ? (a) : (b))
+#define LIMITED(a, low, high) ((a) < (low) ? (low) : (a) < (high) ? (a) : (high))
+#define MAGNITUDE(a) ((a) < 0 ? -(a) : (a))
+
+/* PoCL's compiler has an instruction for it, its library a function. */
+#ifdef POCL_DEVICE_ADDRESS_BITS
+#define ROOT(a) __builtin_sqrtf(a)
+#else
+#define ROOT(a) sqrt(a)
+#endif
+
+/* The largest whole number that is not above a. */
+static inline int floor_int(float a) {
+    const int whole = (int)a;
+    return whole - (a < whole ? 1 : 0);
+}
+
+static inline int2 floor_int2(float2 a) {
+    return (int2)(floor_int(a.x), floor_int(a.y));
+}
+
+/* Squared lengths. */
+static inline float square2(float2 a) {
+    return a.x * a.x + a.y * a.y;
+}
+
+static inline float square3(float3 a) {
+    return a.x * a.x + a.y * a.y + a.z * a.z;
+}
+
+/* exp(a) to 1e-7, exactly 1 for 0, of -87 to 88: a power of two times a polynomial fitted to 2^t over 0..1. */
+static inline float4 exponential(float4 a) {
+    const float4 y = a * 1.44269504f;
+    int4 whole = convert_int4(y);
+    whole += y < convert_float4(whole); /* true is -1 */
+    const float4 t = y - convert_float4(whole);
+    const float4 upper = 0.0557999383f + t * (0.00901699517f + t * 0.00186714665f);
+    const float4 power = 1.0f + t * (0.693151312f + t * (0.240164443f + t * upper));
+    return power * as_float4((whole + 127) << 23);
+}
 
 /* Borders of a grid, given as (width, height, wraps, poles): columns are taken modulo the width where the
    grid wraps; a row beyond a pole is the mirrored row half a turn further. Returns false outside. */
@@ -25,6 +71,11 @@ static inline bool grid_border(int2 *p, int4 grid) {
     return true;
 }
 
+/* Index of pixel p in an array of the whole grid; -1 outside. */
+static inline int grid_index(int2 p, int4 grid) {
+    return grid_border(&p, grid) ? p.y * grid.x + p.x : -1;
+}
+
 /* Index of canvas pixel p in an array that covers box (left, top, width, height); -1 outside. */
 static inline int box_index(int2 p, int4 box) {
     const int x = p.x - box.x, y = p.y - box.y;
@@ -34,12 +85,12 @@ static inline int box_index(int2 p, int4 box) {
 /* Sine, and by its address cosine, of an angle of a few turns at most, to 1e-7: positions are calculated several
    times for each pixel, and PoCL's own functions, good for any angle, take four times as long. */
 static inline float angle_sincos(float angle, float *cosine) {
-    const float quarter = rint(angle * M_2_PI_F);
+    const int turn = floor_int(angle * M_2_PI_F + 0.5f);
+    const float quarter = turn;
     /* pi / 2 in two parts, so that nothing is lost */
     const float r = (angle - quarter * 1.5707962513f) - quarter * 7.5497894e-8f, r2 = r * r;
     const float s = r + r * r2 * (-0.166666502f + r2 * (0.00833195158f - r2 * 0.000194922077f));
     const float c = 1.0f - 0.5f * r2 + r2 * r2 * (0.0416666463f + r2 * (-0.00138873371f + r2 * 2.44348453e-5f));
-    const int turn = convert_int(quarter);
     const float first = turn & 1 ? c : s, second = turn & 1 ? s : c;
     *cosine = (turn + 1) & 2 ? -second : second;
     return turn & 2 ? -first : first;
@@ -47,13 +98,14 @@ static inline float angle_sincos(float angle, float *cosine) {
 
 /* atan2 likewise; 0 where both are 0. */
 static inline float angle_of(float y, float x) {
-    const float ax = fabs(x), ay = fabs(y), longer = fmax(ax, ay);
-    const float t = longer > 0.0f ? fmin(ax, ay) / longer : 0.0f, t2 = t * t;
+    const float ax = MAGNITUDE(x), ay = MAGNITUDE(y), longer = GREATEST(ax, ay);
+    const float t = longer > 0.0f ? LEAST(ax, ay) / longer : 0.0f, t2 = t * t;
     const float far = 0.0964219166f + t2 * (-0.055912249f + t2 * (0.0218629038f - t2 * 0.00405455219f));
     const float near = -0.333298607f + t2 * (0.199465652f + t2 * (-0.139086273f + t2 * far));
     float angle = t * (0.999999336f + t2 * near);
     angle = ay > ax ? M_PI_2_F - angle : angle;
-    return copysign(x < 0.0f ? M_PI_F - angle : angle, y);
+    angle = x < 0.0f ? M_PI_F - angle : angle;
+    return as_int(y) < 0 ? -angle : angle; /* by the sign bit: -0 is below 0 */
 }
 
 /* The lens of a canvas grid: lens = (lon of x = 0, radians per column, lat of y = 0, radians per row);
@@ -69,7 +121,7 @@ static inline float3 canvas_point(float2 p, float4 lens) {
 static inline float2 canvas_position(float3 q, float4 lens) {
     if (lens.y == 0.0f)
         return q.xy;
-    const float lon = angle_of(q.x, q.y), lat = angle_of(q.z, sqrt(q.x * q.x + q.y * q.y));
+    const float lon = angle_of(q.x, q.y), lat = angle_of(q.z, ROOT(square2(q.xy)));
     return (float2)((lon - lens.x) / lens.y, (lens.z - lat) / lens.w);
 }
 
@@ -93,56 +145,67 @@ static inline float2 chart_position(float3 q, const float16 *chart) {
     if (chart->sd == 0.0f) {
         float2 u = (float2)(q.x * chart->s9 + chart->sb, q.y * chart->sa + chart->sc);
         if (chart->se > 0.0f) /* the copy that lies on the chart, which may reach across the canvas's border */
-            u.x -= floor(u.x / (chart->se * chart->s9)) * chart->se * chart->s9;
+            u.x -= floor_int(u.x / (chart->se * chart->s9)) * chart->se * chart->s9;
         return u;
     }
     const float x = chart->s0 * q.x + chart->s1 * q.y + chart->s2 * q.z;
     const float y = chart->s3 * q.x + chart->s4 * q.y + chart->s5 * q.z;
     const float z = chart->s6 * q.x + chart->s7 * q.y + chart->s8 * q.z;
-    const float lon = angle_of(x, y), lat = angle_of(z, sqrt(x * x + y * y));
+    const float lon = angle_of(x, y), lat = angle_of(z, ROOT(x * x + y * y));
     return (float2)(lon * chart->s9 + chart->sb, chart->sc - lat * chart->sa);
+}
+
+/* Weights of the four pixels from `corner` on, to read between them at the fraction t, and their indices; weight
+   and index 0 for those that do not lie on the grid. */
+static inline float4 grid_taps(int2 corner, float2 t, int4 grid, int4 *at) {
+    const float4 weights = (float4)(1.0f - t.x, t.x, 1.0f - t.x, t.x) * (float4)(1.0f - t.y, 1.0f - t.y, t.y, t.y);
+    if (corner.x >= 0 && corner.y >= 0 && corner.x + 1 < grid.x && corner.y + 1 < grid.y) {
+        *at = corner.y * grid.x + corner.x + (int4)(0, 1, grid.x, grid.x + 1);
+        return weights;
+    }
+    *at = (int4)(grid_index(corner, grid), grid_index(corner + (int2)(1, 0), grid),
+                 grid_index(corner + (int2)(0, 1), grid), grid_index(corner + 1, grid));
+    const int4 missing = *at < 0;
+    *at = missing ? (int4)(0) : *at;
+    return missing ? (float4)(0.0f) : weights;
+}
+
+/* The same at position q; weights sum to 1, or are all 0 where no pixel is. */
+static inline float4 bilinear_taps(float2 q, int4 grid, int4 *at) {
+    const int2 corner = floor_int2(q - 0.5f);
+    const float4 weights = grid_taps(corner, q - 0.5f - convert_float2(corner), grid, at);
+    const float sum = weights.x + weights.y + weights.z + weights.w;
+    return weights * (sum > 1e-6f ? 1.0f / sum : 0.0f);
 }
 
 /* Bilinear reading of a grid at position q, over the taps that lie on it; 0 where none does. */
 static inline float bilinear_scalar(__global const float *values, float2 q, int4 grid) {
-    const float2 corner = floor(q - 0.5f), t = q - 0.5f - corner;
-    float sum = (float)(0.0f);
-    float weight = 0.0f;
-    for (int j = 0; j < 2; ++j)
-        for (int i = 0; i < 2; ++i) {
-            int2 p = convert_int2(corner) + (int2)(i, j);
-            if (!grid_border(&p, grid))
-                continue;
-            const float w = (i ? t.x : 1.0f - t.x) * (j ? t.y : 1.0f - t.y);
-            sum += w * values[p.y * grid.x + p.x];
-            weight += w;
-        }
-    return weight > 1e-6f ? sum / weight : (float)(0.0f);
+    int4 at;
+    const float4 w = bilinear_taps(q, grid, &at);
+    return w.x * values[at.x] + w.y * values[at.y] + w.z * values[at.z] + w.w * values[at.w];
 }
 
 static inline float2 bilinear_flow(__global const float2 *values, float2 q, int4 grid) {
-    const float2 corner = floor(q - 0.5f), t = q - 0.5f - corner;
-    float2 sum = (float2)(0.0f);
-    float weight = 0.0f;
-    for (int j = 0; j < 2; ++j)
-        for (int i = 0; i < 2; ++i) {
-            int2 p = convert_int2(corner) + (int2)(i, j);
-            if (!grid_border(&p, grid))
-                continue;
-            const float w = (i ? t.x : 1.0f - t.x) * (j ? t.y : 1.0f - t.y);
-            sum += w * values[p.y * grid.x + p.x];
-            weight += w;
-        }
-    return weight > 1e-6f ? sum / weight : (float2)(0.0f);
+    int4 at;
+    const float4 w = bilinear_taps(q, grid, &at);
+    return w.x * values[at.x] + w.y * values[at.y] + w.z * values[at.z] + w.w * values[at.w];
 }
 
 /* A layer of the working grid at position q, bilinear; all 0 where a tap is missing. */
 static inline float4 layer_sample(__global const float4 *layer, int4 box, float2 q, int4 border) {
-    const float2 p = q - 0.5f, base = floor(p), t = p - base;
+    const int2 corner = floor_int2(q - 0.5f), first = corner - box.xy;
+    const float2 t = q - 0.5f - convert_float2(corner);
     float4 sum = (float4)(0.0f);
+    if (first.x >= 0 && first.y >= 0 && first.x + 1 < box.z && first.y + 1 < box.w) {
+        /* nearly all samples: every tap is stored, no border rule is needed */
+        __global const float4 *c = layer + first.y * box.z + first.x;
+        const float4 upper = c[0] + t.x * (c[1] - c[0]), lower = c[box.z] + t.x * (c[box.z + 1] - c[box.z]);
+        sum = upper + t.y * (lower - upper);
+        return sum.w > 0.999f ? sum : (float4)(0.0f);
+    }
     for (int j = 0; j < 2; ++j)
         for (int i = 0; i < 2; ++i) {
-            int2 c = convert_int2(base) + (int2)(i, j);
+            int2 c = corner + (int2)(i, j);
             if (!grid_border(&c, border))
                 continue;
             const int at = box_index(c, box);
@@ -177,8 +240,8 @@ static inline bool layer_pair(__global const float4 *layer_a, __global const flo
 #define EXPOSURE_FLOOR 0.02f
 
 static inline float3 exposure_scale(float3 c, int integer) {
-    const float3 low = fmax(c, 0.0f) + EXPOSURE_FLOOR;
-    return integer ? log(low / (fmax(1.0f - c, 0.0f) + EXPOSURE_FLOOR)) : log(low);
+    const float3 low = GREATEST(c, (float3)(0.0f)) + EXPOSURE_FLOOR, rest = 1.0f - c;
+    return log(integer ? low / (GREATEST(rest, (float3)(0.0f)) + EXPOSURE_FLOOR) : low);
 }
 
 /* Multiply by 1 + rise the odds of an integer image's colour, or a float's value. Black and an integer image's
@@ -190,7 +253,7 @@ static inline float3 exposure_raise(float3 c, float3 rise, float white, int inte
 
 /* Add a gain on the exposure scale. */
 static inline float3 exposure_shift(float3 c, float3 gain, int integer) {
-    return exposure_raise(c, expm1(gain), 1.0f, integer);
+    return exposure_raise(c, exponential(gain.xyzz).xyz - 1.0f, 1.0f, integer);
 }
 
 /* Catmull-Rom weights of the four taps around fraction t: exactly (0, 1, 0, 0) at t = 0. */

@@ -15,11 +15,11 @@ __kernel void consistency_trust(__global const float2 *flow, /* (grid.y, grid.x)
     const float2 f = flow[at];
     float2 q = (float2)(x + 0.5f, y + 0.5f) + f;
     /* what leaves the grid comes back as it does at the border */
-    q.y = clamp(q.y, 0.5f, grid.y - 0.5f);
+    q.y = LIMITED(q.y, 0.5f, grid.y - 0.5f);
     if (!grid.z)
-        q.x = clamp(q.x, 0.5f, grid.x - 0.5f);
+        q.x = LIMITED(q.x, 0.5f, grid.x - 0.5f);
     const float2 e = (f + bilinear_flow(back, q, grid)) / tolerance;
-    const float c = 1.0f / (1.0f + dot(e, e));
+    const float c = 1.0f / (1.0f + square2(e));
     trusted[at] = (float4)(f, c * c, 0.0f);
 }
 
@@ -59,19 +59,10 @@ __kernel void consistency_pull(__global float4 *trusted,      /* (fine.y, fine.x
     if (x >= fine.x || y >= fine.y)
         return;
     const float4 own = trusted[y * fine.x + x];
-    const float2 q = 0.5f * (float2)(x + 0.5f, y + 0.5f) - 0.5f, base = floor(q), t = q - base;
-    float2 sum = (float2)(0.0f);
-    float weight = 0.0f;
-    for (int j = 0; j < 2; ++j)
-        for (int i = 0; i < 2; ++i) {
-            int2 p = convert_int2(base) + (int2)(i, j);
-            if (!grid_border(&p, size))
-                continue;
-            const float w = (i ? t.x : 1.0f - t.x) * (j ? t.y : 1.0f - t.y);
-            sum += w * coarse[p.y * size.x + p.x].xy;
-            weight += w;
-        }
-    trusted[y * fine.x + x].xy = own.z * own.xy + (1.0f - own.z) * sum / weight;
+    int4 at;
+    const float4 w = bilinear_taps(0.5f * (float2)(x + 0.5f, y + 0.5f), size, &at);
+    const float4 sum = w.x * coarse[at.x] + w.y * coarse[at.y] + w.z * coarse[at.z] + w.w * coarse[at.w];
+    trusted[y * fine.x + x].xy = own.z * own.xy + (1.0f - own.z) * sum.xy;
 }
 
 /* The flow alone. */

@@ -6,20 +6,15 @@
    pixels of the level's grid; grid = (width, height, wraps, 0). */
 
 /* Bilinear reading of the local mean, which is kept on the next coarser level. */
-static inline float flow_local_mean(__global const float *mean, __global const float *weight, int4 coarse, int x, int y) {
-    const float2 q = (float2)(x + 0.5f, y + 0.5f) * 0.5f - 0.5f;
-    const float2 base = floor(q), t = q - base;
-    float sum = 0.0f, total = 0.0f;
-    for (int j = 0; j < 2; ++j)
-        for (int i = 0; i < 2; ++i) {
-            int2 p = convert_int2(base) + (int2)(i, j);
-            if (!grid_border(&p, coarse) || weight[p.y * coarse.x + p.x] <= 1e-6f)
-                continue;
-            const float w = (i ? t.x : 1.0f - t.x) * (j ? t.y : 1.0f - t.y);
-            sum += w * mean[p.y * coarse.x + p.x];
-            total += w;
-        }
-    return total > 0.0f ? sum / total : 0.0f;
+static inline float flow_local_mean(__global const float *mean, __global const float *weight, int4 coarse, int x,
+                                    int y) {
+    int4 at;
+    const float4 w = bilinear_taps((float2)(x + 0.5f, y + 0.5f) * 0.5f, coarse, &at);
+    const float4 known = (float4)(weight[at.x], weight[at.y], weight[at.z], weight[at.w]);
+    const float4 values = (float4)(mean[at.x], mean[at.y], mean[at.z], mean[at.w]);
+    const float4 shares = known > 1e-6f ? w : (float4)(0.0f), parts = shares * values;
+    const float total = shares.x + shares.y + shares.z + shares.w;
+    return total > 0.0f ? (parts.x + parts.y + parts.z + parts.w) / total : 0.0f;
 }
 
 __kernel void flow_feature(__global const float *image,  /* (grid.y, grid.x) log brightness */
@@ -63,15 +58,10 @@ __kernel void flow_warp(__global const float4 *feature, /* (grid.y, grid.x) of t
     if (x >= grid.x || y >= grid.y)
         return;
     const float2 f = flow[y * grid.x + x];
-    const float2 base = floor(f), t = f - base;
-    const int2 corner = (int2)(x, y) + convert_int2(base);
-    float4 sum = (float4)(0.0f);
-    for (int j = 0; j < 2; ++j)
-        for (int i = 0; i < 2; ++i) {
-            int2 p = corner + (int2)(i, j);
-            if (grid_border(&p, grid))
-                sum += (i ? t.x : 1.0f - t.x) * (j ? t.y : 1.0f - t.y) * feature[p.y * grid.x + p.x];
-        }
+    const int2 whole = floor_int2(f);
+    int4 at;
+    const float4 w = grid_taps((int2)(x, y) + whole, f - convert_float2(whole), grid, &at);
+    const float4 sum = w.x * feature[at.x] + w.y * feature[at.y] + w.z * feature[at.z] + w.w * feature[at.w];
     warped[y * grid.x + x] = sum.w > 0.999f ? sum / sum.w : (float4)(0.0f);
 }
 
@@ -103,8 +93,8 @@ __kernel void flow_tensor(__global const float4 *feature, /* (grid.y, grid.x) */
         const float robust = 1e-3f, zeta = noise * noise;
         const float2 d = 0.5f * (a.yz + b.yz);
         const float4 t = b - a;
-        const float n = 1.0f / (dot(d, d) + zeta);
-        const float w = brightness * n / sqrt(t.x * t.x * n + robust * robust);
+        const float n = 1.0f / (square2(d) + zeta);
+        const float w = brightness * n / ROOT(t.x * t.x * n + robust * robust);
         j = (float4)(w * d.x * d.x, w * d.x * d.y, w * d.y * d.y, 1.0f);
         r = w * t.x * d;
         const float4 west = flow_mean_feature(feature, warped, (int2)(x - 1, y), grid);
@@ -116,7 +106,7 @@ __kernel void flow_tensor(__global const float4 *feature, /* (grid.y, grid.x) */
             const float2 dy = 0.5f * (south.yz - north.yz); /* d(hx)/dy, d(hy)/dy */
             const float nx = 1.0f / (dx.x * dx.x + dy.x * dy.x + zeta);
             const float ny = 1.0f / (dx.y * dx.y + dy.y * dy.y + zeta);
-            const float g = gradient / sqrt(t.y * t.y * nx + t.z * t.z * ny + robust * robust);
+            const float g = gradient / ROOT(t.y * t.y * nx + t.z * t.z * ny + robust * robust);
             j.x += g * (nx * dx.x * dx.x + ny * dx.y * dx.y);
             j.y += g * (nx * dx.x * dy.x + ny * dx.y * dy.y);
             j.z += g * (nx * dy.x * dy.x + ny * dy.y * dy.y);
@@ -138,31 +128,30 @@ __kernel void flow_window(__global const float4 *tensor, /* (grid.y, grid.x) */
     const int x = get_global_id(0), y = get_global_id(1);
     if (x >= grid.x || y >= grid.y)
         return;
+    const bool inner = x > 0 && x + 1 < grid.x && y > 0 && y + 1 < grid.y;
     float4 j = (float4)(0.0f);
     float2 r = (float2)(0.0f);
     for (int dy = -1; dy <= 1; ++dy)
         for (int dx = -1; dx <= 1; ++dx) {
-            int2 p = (int2)(x + dx, y + dy);
-            if (!grid_border(&p, grid))
+            const int2 p = (int2)(x + dx, y + dy);
+            const int at = inner ? p.y * grid.x + p.x : grid_index(p, grid);
+            if (at < 0)
                 continue;
             const float w = (dx ? 0.25f : 0.5f) * (dy ? 0.25f : 0.5f);
-            j += w * tensor[p.y * grid.x + p.x];
-            r += w * right[p.y * grid.x + p.x];
+            j += w * tensor[at];
+            r += w * right[at];
         }
     tensor_out[y * grid.x + x] = j;
     right_out[y * grid.x + x] = r;
 }
 
-static inline float flow_edge(__global const float2 *flow, __global const float4 *feature, int at, int2 p, int4 grid,
-                       float smoothness, float contrast) {
-    if (!grid_border(&p, grid))
-        return 0.0f;
-    const int to = p.y * grid.x + p.x;
-    const float2 d = flow[to] - flow[at];
-    const float4 fa = feature[at], fb = feature[to];
+/* How far two pixels are apart: step of the image over `contrast`, squared difference of their flows. */
+static inline float2 flow_gap(__global const float2 *flow, __global const float4 *feature, int at, int to,
+                              float contrast) {
+    const float4 a = feature[at], b = feature[to];
+    const float step = (a.x - b.x) / contrast;
     /* an edge of the image is where the flow may jump */
-    const float step = fa.w * fb.w > 0.0f ? (fa.x - fb.x) / contrast : 0.0f;
-    return smoothness * exp(-fabs(step)) / sqrt(dot(d, d) + 1e-4f);
+    return (float2)(a.w * b.w > 0.0f ? LEAST(MAGNITUDE(step), 80.0f) : 0.0f, square2(flow[to] - flow[at]));
 }
 
 /* The linear system of one warp: diag/off-diagonals of the data term, right-hand side for the whole flow (not
@@ -182,9 +171,13 @@ __kernel void flow_system(__global const float4 *tensor,  /* (grid.y, grid.x) */
     const int at = y * grid.x + x;
     const float4 j = tensor[at];
     const float2 f = flow[at], r = right[at];
-    left_side[at] = (float4)(j.xyz, flow_edge(flow, feature, at, (int2)(x + 1, y), grid, smoothness, contrast));
+    const int east = grid_index((int2)(x + 1, y), grid), south = grid_index((int2)(x, y + 1), grid);
+    const float2 to_east = flow_gap(flow, feature, at, east < 0 ? at : east, contrast);
+    const float2 to_south = flow_gap(flow, feature, at, south < 0 ? at : south, contrast);
+    const float4 alike = smoothness * exponential((float4)(-to_east.x, -to_south.x, 0.0f, 0.0f));
+    left_side[at] = (float4)(j.xyz, east < 0 ? 0.0f : alike.x / ROOT(to_east.y + 1e-4f));
     right_side[at] = (float4)(j.x * f.x + j.y * f.y - r.x, j.y * f.x + j.z * f.y - r.y,
-                              flow_edge(flow, feature, at, (int2)(x, y + 1), grid, smoothness, contrast), 0.0f);
+                              south < 0 ? 0.0f : alike.y / ROOT(to_south.y + 1e-4f), 0.0f);
 }
 
 /* One half-sweep of red-black successive over-relaxation, in place. */
@@ -218,8 +211,8 @@ __kernel void flow_relax(__global const float4 *left_side,  /* (grid.y, grid.x) 
 #define FLOW_CHUNK 4
 
 static inline void flow_sort(float8 *a, float8 *b) {
-    const float8 low = fmin(*a, *b);
-    *b = fmax(*a, *b);
+    const float8 low = LEAST(*a, *b);
+    *b = GREATEST(*a, *b);
     *a = low;
 }
 
@@ -232,20 +225,21 @@ __kernel void flow_median(__global const float2 *flow, /* (grid.y, grid.x) */
     if (first >= grid.x || y >= grid.y)
         return;
     const bool inner = first > 0 && first + FLOW_CHUNK < grid.x && y > 0 && y + 1 < grid.y;
-    const int count = min(FLOW_CHUNK, grid.x - first);
+    const int count = LEAST(FLOW_CHUNK, grid.x - first);
     float8 v[9];
     for (int k = 0; k < 9; ++k) {
         const int x = first + k % 3 - 1, row = y + k / 3 - 1;
         if (inner) {
-            v[k] = vload8(0, (__global const float *)(flow + row * grid.x + x));
+            __global const float *p = (__global const float *)(flow + row * grid.x + x);
+            v[k] = (float8)(p[0], p[1], p[2], p[3], p[4], p[5], p[6], p[7]);
             continue;
         }
         float2 values[FLOW_CHUNK];
         for (int i = 0; i < FLOW_CHUNK; ++i) {
-            int2 p = (int2)(x + min(i, count - 1), row);
-            values[i] = flow[grid_border(&p, grid) ? p.y * grid.x + p.x : y * grid.x + first + min(i, count - 1)];
+            const int column = LEAST(i, count - 1), at = grid_index((int2)(x + column, row), grid);
+            values[i] = flow[at < 0 ? y * grid.x + first + column : at];
         }
-        v[k] = vload8(0, (const float *)values);
+        v[k] = (float8)(values[0], values[1], values[2], values[3]);
     }
     /* the median of nine by 19 exchanges */
     flow_sort(v + 1, v + 2); flow_sort(v + 4, v + 5); flow_sort(v + 7, v + 8);
@@ -255,12 +249,7 @@ __kernel void flow_median(__global const float2 *flow, /* (grid.y, grid.x) */
     flow_sort(v + 3, v + 6); flow_sort(v + 1, v + 4); flow_sort(v + 2, v + 5);
     flow_sort(v + 4, v + 7); flow_sort(v + 4, v + 2); flow_sort(v + 6, v + 4);
     flow_sort(v + 4, v + 2);
-    if (count == FLOW_CHUNK) {
-        vstore8(v[4], 0, (__global float *)(median + y * grid.x + first));
-        return;
-    }
-    float2 values[FLOW_CHUNK];
-    vstore8(v[4], 0, (float *)values);
+    const float2 values[FLOW_CHUNK] = {v[4].s01, v[4].s23, v[4].s45, v[4].s67};
     for (int i = 0; i < count; ++i)
         median[y * grid.x + first + i] = values[i];
 }

@@ -35,7 +35,7 @@ __kernel void geometry_add(__global const float *blend_j,   /* (box_j.w, box_j.z
     if (use_guess) {
         q += guess[at].xyz;
         if (lens.y != 0.0f)
-            q = normalize(q);
+            q /= ROOT(square3(q));
     }
     const float2 u = chart_position(q, &chart);
     const float2 f = bilinear_flow(flow, u, grid);
@@ -61,12 +61,11 @@ __kernel void geometry_activation(__global float4 *field,        /* (box.w, box.
     const float w = blend[at];
     if (w == 0.0f)
         return;
-    const float d = length(field[at].xyz);
-    const float f = w < 1.0f ? fmin(d / (1.0f - w), furthest) : 0.0f;
-    const float a = sharpness * w * (1.0f + magnitude * f / width);
+    const float d = ROOT(square3(field[at].xyz)), f = w < 1.0f ? d / (1.0f - w) : 0.0f;
+    const float a = sharpness * w * (1.0f + magnitude * LEAST(f, furthest) / width);
     field[at].w = a;
     const int top = (y + box.y) * border.x + x + box.x;
-    highest[top] = fmax(highest[top], a);
+    highest[top] = GREATEST(highest[top], a);
 }
 
 /* s_k (not yet normalised) = m_k * exp(a_k - max a). */
@@ -97,7 +96,8 @@ __kernel void geometry_reach(__global const float4 *field, /* (box.w, box.z) */
     float longest = 0.0f;
     for (int x = 0; x < box.z; ++x) {
         const float3 d = field[y * box.z + x].xyz;
-        longest = fmax(longest, plane ? fabs(d.y) : length(d));
+        const float length = plane ? MAGNITUDE(d.y) : ROOT(square3(d));
+        longest = GREATEST(longest, length);
     }
     reach[y] = longest;
 }

@@ -47,7 +47,7 @@ __kernel void pyramid_smooth(__global const float *image,  /* (grid.y, grid.x), 
         int2 p = (int2)(x, y) + i * step;
         if (!grid_border(&p, grid))
             continue;
-        const float g = taps[abs(i)];
+        const float g = taps[MAGNITUDE(i)];
         sum += g * image[p.y * grid.x + p.x];
         total += g * weight[p.y * grid.x + p.x];
     }

@@ -3,7 +3,8 @@
 /* A colour as a difference of it is seen: integer images are coded so already, floats are linear light. */
 static inline float3 seam_look(float3 c, float3 gain, int integer) {
     c = exposure_shift(c, gain, integer);
-    return integer ? c : sqrt(fmax(c, 0.0f));
+    c = GREATEST(c, (float3)(0.0f));
+    return integer ? c : (float3)(ROOT(c.x), ROOT(c.y), ROOT(c.z));
 }
 
 /* Mean difference a - b of two aligned, corrected layers over the pixels of a cell (every second one in x and y)
@@ -55,5 +56,6 @@ __kernel void seam_yield(__global float4 *field,        /* (box.w, box.z) of the
     const float2 ratio = (float2)((float)cells.x / border.x, (float)cells.y / border.y);
     const float keep = 1.0f - bilinear_scalar(yields, (float2)(x + box.x + 0.5f, y + box.y + 0.5f) * ratio, cells);
     /* to the fourth power: the softmax's own weights span many powers of ten */
-    field[y * box.z + x].w *= fmax(keep * keep * keep * keep, 1e-12f);
+    const float left = keep * keep * keep * keep;
+    field[y * box.z + x].w *= GREATEST(left, 1e-12f);
 }

@@ -15,9 +15,10 @@ __kernel void transition_strain(__global const float4 *displacement, /* (box.w /
     if (cx >= cells.x || cy >= cells.y)
         return;
     /* the layer's own pixels of the cell, its outermost left out */
-    const int left = max(cx * border.x / cells.x - box.x, 1), top = max(cy * border.y / cells.y - box.y, 1);
-    const int right = min((cx + 1) * border.x / cells.x - box.x, box.z - 1);
-    const int bottom = min((cy + 1) * border.y / cells.y - box.y, box.w - 1);
+    const int left = GREATEST(cx * border.x / cells.x - box.x, 1);
+    const int top = GREATEST(cy * border.y / cells.y - box.y, 1);
+    const int right = LEAST((cx + 1) * border.x / cells.x - box.x, box.z - 1);
+    const int bottom = LEAST((cy + 1) * border.y / cells.y - box.y, box.w - 1);
     const int columns = (box.z + every - 1) / every;
     const float unit = lens.y == 0.0f ? 1.0f : 1.0f / lens.y;
     float2 sum = (float2)(0.0f);
@@ -31,8 +32,9 @@ __kernel void transition_strain(__global const float4 *displacement, /* (box.w /
                 continue;
             const float2 slope = 0.5f * (float2)((blend[at + 1] - blend[at - 1]) / across,
                                                  blend[at + box.z] - blend[at - box.z]);
-            const float flow = unit * length(displacement[y / every * columns + x / every].xyz) / fmax(1.0f - w, 0.05f);
-            const float s = length(slope) * flow, weight = w * (1.0f - w);
+            const float3 d = displacement[y / every * columns + x / every].xyz;
+            const float s = unit * ROOT(square2(slope) * square3(d)) / GREATEST(1.0f - w, 0.05f);
+            const float weight = w * (1.0f - w);
             sum += weight * (float2)(s * s * s * s, 1.0f);
         }
     }

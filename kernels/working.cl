@@ -29,8 +29,8 @@ __kernel void working_reduce(__global const PIXEL *rows, /* (box.w, box.z, SAMPL
             __global const PIXEL *p = rows + (size_t)at * SAMPLES;
             if ((float)p[SAMPLES - 1] < 0.5f * white)
                 valid = false;
-            const float w = (float)(min(y1, (y + 1) * ratio.w) - max(y0, y * ratio.w)) *
-                            (float)(min(x1, (x + 1) * ratio.y) - max(x0, x * ratio.y));
+            const float w = (float)(LEAST(y1, (y + 1) * ratio.w) - GREATEST(y0, y * ratio.w)) *
+                            (float)(LEAST(x1, (x + 1) * ratio.y) - GREATEST(x0, x * ratio.y));
             sum += w * (float3)(p[0], p[SAMPLES > 2 ? 1 : 0], p[SAMPLES > 2 ? 2 : 0]);
             total += w;
         }
@@ -49,6 +49,6 @@ __kernel void working_compare(__global const float4 *a, int4 a_box, /* run size:
     if (at < 0)
         return;
     const float4 p = a[y * a_box.z + x], q = b[at];
-    if (p.w != 0.0f && q.w != 0.0f && any(p.xyz != q.xyz))
+    if (p.w != 0.0f && q.w != 0.0f && (p.x != q.x || p.y != q.y || p.z != q.z))
         *differs = 1;
 }
