@@ -190,20 +190,18 @@ __kernel void flow_relax(__global const float4 *left_side,  /* (grid.y, grid.x) 
     const int y = get_global_id(1), x = 2 * get_global_id(0) + ((y + colour) & 1);
     if (x >= grid.x || y >= grid.y)
         return;
-    const int at = y * grid.x + x;
     /* across a border that does not wrap the weights are 0, so that any place will do */
-    const int east = x + 1 < grid.x ? at + 1 : at + 1 - grid.x, west = x > 0 ? at - 1 : at - 1 + grid.x;
-    const int south = y + 1 < grid.y ? at + grid.x : x, north = y > 0 ? at - grid.x : at + (grid.y - 1) * grid.x;
+    const int row = y * grid.x, at = row + x;
+    const int east = row + (x + 1 < grid.x ? x + 1 : 0), west = row + (x > 0 ? x : grid.x) - 1;
+    const int south = (y + 1 < grid.y ? row + grid.x : 0) + x, north = (y > 0 ? row : grid.y * grid.x) - grid.x + x;
     const float4 j = left_side[at], b = right_side[at];
     const float from_west = left_side[west].w, from_north = right_side[north].z;
-    const float2 sum = j.w * flow[east] + b.z * flow[south] + from_west * flow[west] + from_north * flow[north];
-    const float weight = j.w + b.z + from_west + from_north;
+    const float2 sum = b.xy + j.w * flow[east] + b.z * flow[south] + from_west * flow[west] + from_north * flow[north];
+    const float2 diagonal = j.xz + (j.w + b.z + from_west + from_north);
+    const float2 step = diagonal > 0.0f ? relaxation / diagonal : (float2)(0.0f);
     float2 f = flow[at];
-    const float dx = j.x + weight, dy = j.z + weight;
-    if (dx > 0.0f)
-        f.x += relaxation * ((sum.x + b.x - j.y * f.y) / dx - f.x);
-    if (dy > 0.0f)
-        f.y += relaxation * ((sum.y + b.y - j.y * f.x) / dy - f.y);
+    f.x += step.x * (sum.x - j.y * f.y - diagonal.x * f.x);
+    f.y += step.y * (sum.y - j.y * f.x - diagonal.y * f.y);
     flow[at] = f;
 }
 
