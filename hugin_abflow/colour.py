@@ -46,6 +46,11 @@ _FADE, _TREND_FADE = 0.12, 1.0
 _NEGLIGIBLE = 1e-3
 
 
+# Of two layers, by their indices, a - b per cell of the colour grid, on the exposure scale:
+# (height, width, 4), r, g, b and a weight 0..1.
+Difference = tuple[int, int, npt.NDArray[np.float64]]
+
+
 @dataclass(frozen=True)
 class Correction:
     """grid: the colour grid. gains: per layer, float32 (height, width, 4) on the exposure scale: r, g, b and
@@ -62,35 +67,45 @@ def colour_grid(grid: Grid, covered: npt.NDArray[np.bool_]) -> Grid:
     return grid.coarser(max(_CELL, round(_CELL * depth / _DEEP)))
 
 
-def correction(
+def differences(
     device: Device,
     layers: Sequence[WorkingLayer],
     fields: Sequence[Buffer],
     pairs: Sequence[Pair],
     grid: Grid,
     covered: npt.NDArray[np.bool_],
+) -> list[Difference]:
+    """Measure the overlaps of the aligned layers. fields: of geometry.py, whose weights do not count here.
+    covered: (layers, height, width) on any grid over the same region.
+    """
+    cells = colour_grid(grid, covered)
+    return [(pair.a, pair.b, _difference(device, layers, fields, pair, grid, cells)) for pair in pairs]
+
+
+def correction(
+    device: Device,
+    measured: Sequence[Difference],
+    grid: Grid,
+    covered: npt.NDArray[np.bool_],
     settings: Settings,
     ignored: npt.NDArray[np.bool_] | None = None,
     strict: bool = False,
 ) -> Correction:
-    """Measure the overlaps of the aligned layers and solve for the gains.
+    """Solve for the gains of all layers.
 
-    fields: of geometry.py. covered: (layers, height, width) on any grid over the same region.
+    measured, covered: of `differences`.
     ignored: (height, width) on any grid over the same region: what is no evidence, none of a cell's.
     strict: leave out what may not be exposure, to see it.
     With `settings.exposure` off there is no correction.
     """
     cells = colour_grid(grid, covered)
     if not settings.exposure:
-        return Correction(cells, (None,) * len(layers))
-    measured = []
-    for pair in pairs:
-        values = _difference(device, layers, fields, pair, grid, cells)
-        if ignored is not None:
-            values[on_cells(ignored[None], cells, np.logical_or)[0], 3] = 0
-        measured.append((pair.a, pair.b, values))
+        return Correction(cells, (None,) * len(covered))
+    if ignored is not None:
+        counts = ~on_cells(ignored[None], cells, np.logical_or)[0]
+        measured = [(a, b, values * counts[..., None]) for a, b, values in measured]
     if not any(np.any(d[..., :3] * d[..., 3:]) for _, _, d in measured):
-        return Correction(cells, (None,) * len(layers))
+        return Correction(cells, (None,) * len(covered))
     inside = on_cells(covered, cells, np.logical_or)
     gains = solve(measured, inside, cells, _STRICT if strict else _ROUNDS)
     gains = np.sign(gains) * np.maximum(np.abs(gains) - _NEGLIGIBLE, 0)
@@ -130,12 +145,12 @@ def _difference(
 
 
 def solve(
-    measured: Sequence[tuple[int, int, npt.NDArray[np.float64]]],
+    measured: Sequence[Difference],
     inside: npt.NDArray[np.bool_],
     cells: Grid,
     rounds: Sequence[tuple[float, float]] = _ROUNDS,
 ) -> npt.NDArray[np.float64]:
-    """Gains (layers, height, width, 3) for differences (a, b, array of r, g, b, weight per cell)."""
+    """Gains (layers, height, width, 3) for differences."""
     latitude = cells.lens[2] - (np.arange(cells.height) + 0.5) * cells.lens[3]
     area = np.maximum(np.cos(latitude), 0.02)[:, None] if cells.lens[1] else np.ones((cells.height, 1))
     # a cell's sides: steps along a row are shorter near a pole, so neighbours there are bound closer

@@ -169,13 +169,14 @@ def _align(
     regions: npt.NDArray[np.bool_] | None = None
     whole = coefficient.coefficients(device, layers, masks, grid, settings)
     coefficients = transition.narrow(device, layers, whole, flows, grid, settings)
-    correct = partial(colour.correction, device, layers)
     fields = geometry.fields(device, layers, coefficients, flows, grid, settings)
     del whole, coefficients  # as large as the layers, and not needed again
+    measured = colour.differences(device, layers, fields, pairs, grid, masks.host)
+    correct = partial(colour.correction, device, measured, grid, masks.host)
     # exposure explains a difference whether it is corrected or not
     exposure = replace(settings, exposure=True)
     for _ in range(_SEAM_ROUNDS if settings.seam else 0):
-        strict = correct(fields, pairs, grid, masks.host, exposure, regions, strict=True)
+        strict = correct(exposure, regions, strict=True)
         found = seam.regions(device, layers, fields, pairs, strict, grid)
         grown = found if regions is None else found | regions
         if not grown.any() or (regions is not None and np.array_equal(grown, regions)):
@@ -186,7 +187,7 @@ def _align(
         regions = ~seam.divide(device, layers, fields, pairs, strict, masks, grid)
     elif regions is not None:
         seam.cut(device, layers, fields, pairs, strict, regions, masks, grid)
-    return fields, correct(fields, pairs, grid, masks.host, settings, regions)
+    return fields, correct(settings, regions)
 
 
 def _read(device: Device, layers: Sequence[Layer], grid: Grid, progress: Progress) -> list[WorkingLayer]:

@@ -282,7 +282,8 @@ def corrected(
     zero = device.zeros((found.height, found.width, 2))
     fields = [device.zeros(layer.pixels.shape) for layer in layers]
     flows = [PairFlow(0, 1, found, zero, zero)]
-    return colour.correction(device, layers, fields, flows, grid, covered, settings, ignored)
+    measured = colour.differences(device, layers, fields, flows, grid, covered)
+    return colour.correction(device, measured, grid, covered, settings, ignored)
 
 
 @pytest.mark.parametrize(("gain", "dtype"), [(0.5, np.uint8), (-0.3, np.uint16), (0.7, np.float32)])
