@@ -7,6 +7,11 @@ static inline float4 chart_tap(__global const float4 *layer, int4 box, int2 p, i
     return at < 0 ? (float4)(0.0f) : layer[at];
 }
 
+static inline float4 chart_row(__global const float4 *row, float4 weights, float *valid) {
+    *valid *= row[0].w * row[1].w * row[2].w * row[3].w;
+    return weights.x * row[0] + weights.y * row[1] + weights.z * row[2] + weights.w * row[3];
+}
+
 /* Log brightness of a layer on a chart: bicubic where all taps are valid, bilinear at the rim of the mask. */
 __kernel void chart_sample(__global const float4 *layer, /* (box.w, box.z) r, g, b, valid */
                            int4 box,                     /* place of `layer` on the canvas grid */
@@ -27,17 +32,15 @@ __kernel void chart_sample(__global const float4 *layer, /* (box.w, box.z) r, g,
     if (t.y > 0.9995f) { corner.y += 1; t.y = 0.0f; }
     t = t < 0.0005f ? (float2)(0.0f) : t;
     const float4 wx = catmull_rom(t.x), wy = catmull_rom(t.y);
-    const float ax[4] = {wx.x, wx.y, wx.z, wx.w}, ay[4] = {wy.x, wy.y, wy.z, wy.w};
     const int2 first = corner - 1 - box.xy;
     if (first.x >= 0 && first.y >= 0 && first.x + 3 < box.z && first.y + 3 < box.w) {
         /* nearly all samples: every tap is stored, no border rule is needed */
-        float4 all = (float4)(0.0f);
+        __global const float4 *row = layer + first.y * box.z + first.x;
         float valid = 1.0f;
-        for (int y = 0; y < 4; ++y) {
-            __global const float4 *row = layer + (first.y + y) * box.z + first.x;
-            all += ay[y] * (ax[0] * row[0] + ax[1] * row[1] + ax[2] * row[2] + ax[3] * row[3]);
-            valid *= row[0].w * row[1].w * row[2].w * row[3].w;
-        }
+        float4 all = wy.x * chart_row(row, wx, &valid);
+        all += wy.y * chart_row(row + box.z, wx, &valid);
+        all += wy.z * chart_row(row + 2 * box.z, wx, &valid);
+        all += wy.w * chart_row(row + 3 * box.z, wx, &valid);
         if (valid != 0.0f) {
             const float3 c = GREATEST(all.xyz, (float3)(0.0f));
             image[j * size.x + i] = log(0.299f * c.x + 0.587f * c.y + 0.114f * c.z + floor_value);
@@ -45,6 +48,7 @@ __kernel void chart_sample(__global const float4 *layer, /* (box.w, box.z) r, g,
             return;
         }
     }
+    const float ax[4] = {wx.x, wx.y, wx.z, wx.w}, ay[4] = {wy.x, wy.y, wy.z, wy.w};
     float4 cubic = (float4)(0.0f), linear = (float4)(0.0f);
     bool inner = true, outer = true;
     for (int y = 0; y < 4; ++y)

@@ -17,6 +17,14 @@ static inline float flow_local_mean(__global const float *mean, __global const f
     return total > 0.0f ? (parts.x + parts.y + parts.z + parts.w) / total : 0.0f;
 }
 
+/* Slope of the image between two neighbours of a pixel, or beside it where one is not valid; 0: neither is. */
+static inline float flow_slope(__global const float *image, __global const float *mask, int at, int2 before,
+                               int2 after, int4 grid) {
+    const int first = grid_index(before, grid), last = grid_index(after, grid);
+    const int from = first >= 0 && mask[first] != 0.0f ? first : at, to = last >= 0 && mask[last] != 0.0f ? last : at;
+    return (image[to] - image[from]) * (from != at && to != at ? 0.5f : 1.0f);
+}
+
 __kernel void flow_feature(__global const float *image,  /* (grid.y, grid.x) log brightness */
                            __global const float *mask,   /* (grid.y, grid.x), 0 or 1 */
                            int4 grid,                    /* run size */
@@ -33,19 +41,9 @@ __kernel void flow_feature(__global const float *image,  /* (grid.y, grid.x) log
         feature[at] = (float4)(0.0f);
         return;
     }
-    float d[2];
-    for (int axis = 0; axis < 2; ++axis) {
-        float difference = 0.0f, span = 0.0f;
-        for (int side = -1; side <= 1; side += 2) {
-            int2 p = (int2)(x + (axis ? 0 : side), y + (axis ? side : 0));
-            if (grid_border(&p, grid) && mask[p.y * grid.x + p.x] != 0.0f) {
-                difference += side * (image[p.y * grid.x + p.x] - image[at]);
-                span += 1.0f;
-            }
-        }
-        d[axis] = span > 0.0f ? difference / span : 0.0f;
-    }
-    feature[at] = (float4)(image[at] - flow_local_mean(mean, weight, coarse, x, y), d[0], d[1], 1.0f);
+    const float dx = flow_slope(image, mask, at, (int2)(x - 1, y), (int2)(x + 1, y), grid);
+    const float dy = flow_slope(image, mask, at, (int2)(x, y - 1), (int2)(x, y + 1), grid);
+    feature[at] = (float4)(image[at] - flow_local_mean(mean, weight, coarse, x, y), dx, dy, 1.0f);
 }
 
 /* Sample feature at q + flow(q), bilinear; w is the share of valid taps. */
@@ -118,6 +116,16 @@ __kernel void flow_tensor(__global const float4 *feature, /* (grid.y, grid.x) */
     right[at] = r;
 }
 
+/* Add to the sums j, r what a pixel p of the window has, if it lies on the grid; inner: it does. */
+static inline void flow_add(__global const float4 *tensor, __global const float2 *right, int2 p, float weight,
+                            int4 grid, bool inner, float4 *j, float2 *r) {
+    const int at = inner ? p.y * grid.x + p.x : grid_index(p, grid);
+    if (at < 0)
+        return;
+    *j += weight * tensor[at];
+    *r += weight * right[at];
+}
+
 /* Sum the constraints over the Lucas-Kanade window (binomial, 3 x 3). */
 __kernel void flow_window(__global const float4 *tensor, /* (grid.y, grid.x) */
                           __global const float2 *right,  /* (grid.y, grid.x) */
@@ -131,16 +139,12 @@ __kernel void flow_window(__global const float4 *tensor, /* (grid.y, grid.x) */
     const bool inner = x > 0 && x + 1 < grid.x && y > 0 && y + 1 < grid.y;
     float4 j = (float4)(0.0f);
     float2 r = (float2)(0.0f);
-    for (int dy = -1; dy <= 1; ++dy)
-        for (int dx = -1; dx <= 1; ++dx) {
-            const int2 p = (int2)(x + dx, y + dy);
-            const int at = inner ? p.y * grid.x + p.x : grid_index(p, grid);
-            if (at < 0)
-                continue;
-            const float w = (dx ? 0.25f : 0.5f) * (dy ? 0.25f : 0.5f);
-            j += w * tensor[at];
-            r += w * right[at];
-        }
+    for (int row = y - 1; row <= y + 1; ++row) {
+        const float weight = row == y ? 0.5f : 0.25f;
+        flow_add(tensor, right, (int2)(x - 1, row), 0.25f * weight, grid, inner, &j, &r);
+        flow_add(tensor, right, (int2)(x, row), 0.5f * weight, grid, inner, &j, &r);
+        flow_add(tensor, right, (int2)(x + 1, row), 0.25f * weight, grid, inner, &j, &r);
+    }
     tensor_out[y * grid.x + x] = j;
     right_out[y * grid.x + x] = r;
 }
@@ -214,31 +218,36 @@ static inline void flow_sort(float8 *a, float8 *b) {
     *a = low;
 }
 
+/* The chunk of the flow from (x, y) on, moved by (dx, dy); beyond the border a pixel stands for its neighbour. */
+static inline float8 flow_chunk(__global const float2 *flow, int x, int y, int dx, int dy, int4 grid, bool inner) {
+    if (inner) {
+        __global const float2 *p = flow + (y + dy) * grid.x + x + dx;
+        return (float8)(p[0], p[1], p[2], p[3]);
+    }
+    float2 values[FLOW_CHUNK];
+    for (int i = 0; i < FLOW_CHUNK; ++i) {
+        const int column = LEAST(x + i, grid.x - 1), at = grid_index((int2)(column + dx, y + dy), grid);
+        values[i] = flow[at < 0 ? y * grid.x + column : at];
+    }
+    return (float8)(values[0], values[1], values[2], values[3]);
+}
+
 /* 3 x 3 median of each component: removes outliers, keeps edges of motion. */
 __kernel void flow_median(__global const float2 *flow, /* (grid.y, grid.x) */
                           int4 grid,                   /* run size: grid.x / FLOW_CHUNK, rounded up, grid.y */
                           __global float2 *median)     /* (grid.y, grid.x) */
 {
-    const int y = get_global_id(1), first = get_global_id(0) * FLOW_CHUNK;
-    if (first >= grid.x || y >= grid.y)
+    const int y = get_global_id(1), x = get_global_id(0) * FLOW_CHUNK;
+    if (x >= grid.x || y >= grid.y)
         return;
-    const bool inner = first > 0 && first + FLOW_CHUNK < grid.x && y > 0 && y + 1 < grid.y;
-    const int count = LEAST(FLOW_CHUNK, grid.x - first);
-    float8 v[9];
-    for (int k = 0; k < 9; ++k) {
-        const int x = first + k % 3 - 1, row = y + k / 3 - 1;
-        if (inner) {
-            __global const float *p = (__global const float *)(flow + row * grid.x + x);
-            v[k] = (float8)(p[0], p[1], p[2], p[3], p[4], p[5], p[6], p[7]);
-            continue;
-        }
-        float2 values[FLOW_CHUNK];
-        for (int i = 0; i < FLOW_CHUNK; ++i) {
-            const int column = LEAST(i, count - 1), at = grid_index((int2)(x + column, row), grid);
-            values[i] = flow[at < 0 ? y * grid.x + first + column : at];
-        }
-        v[k] = (float8)(values[0], values[1], values[2], values[3]);
-    }
+    const bool inner = x > 0 && x + FLOW_CHUNK < grid.x && y > 0 && y + 1 < grid.y;
+    /* written out: indices that a loop counts would keep the array in memory */
+    float8 v[9] = {
+        flow_chunk(flow, x, y, -1, -1, grid, inner), flow_chunk(flow, x, y, 0, -1, grid, inner),
+        flow_chunk(flow, x, y, 1, -1, grid, inner),  flow_chunk(flow, x, y, -1, 0, grid, inner),
+        flow_chunk(flow, x, y, 0, 0, grid, inner),   flow_chunk(flow, x, y, 1, 0, grid, inner),
+        flow_chunk(flow, x, y, -1, 1, grid, inner),  flow_chunk(flow, x, y, 0, 1, grid, inner),
+        flow_chunk(flow, x, y, 1, 1, grid, inner)};
     /* the median of nine by 19 exchanges */
     flow_sort(v + 1, v + 2); flow_sort(v + 4, v + 5); flow_sort(v + 7, v + 8);
     flow_sort(v + 0, v + 1); flow_sort(v + 3, v + 4); flow_sort(v + 6, v + 7);
@@ -248,8 +257,8 @@ __kernel void flow_median(__global const float2 *flow, /* (grid.y, grid.x) */
     flow_sort(v + 4, v + 7); flow_sort(v + 4, v + 2); flow_sort(v + 6, v + 4);
     flow_sort(v + 4, v + 2);
     const float2 values[FLOW_CHUNK] = {v[4].s01, v[4].s23, v[4].s45, v[4].s67};
-    for (int i = 0; i < count; ++i)
-        median[y * grid.x + first + i] = values[i];
+    for (int i = 0; i < FLOW_CHUNK && x + i < grid.x; ++i)
+        median[y * grid.x + x + i] = values[i];
 }
 
 /* Carry the flow of the coarser level to the next finer one: bilinear, doubled. */
