@@ -6,9 +6,11 @@ With `hugin_abflow.images` the only module that uses OpenImageIO.
 from __future__ import annotations
 
 import contextlib
+import errno
 import logging
 import os
 import secrets
+import shutil
 from pathlib import Path
 from types import TracebackType
 from typing import Any
@@ -62,6 +64,7 @@ _TIFF_COMPRESSIONS = {
 _EXR_COMPRESSIONS = {"none": "none", "rle": "rle", "zip": "zip", "zips": "zips", "piz": "piz"}
 _PNG_LEVEL = 4  # twice as fast as zlib's usual 6 for 2 % more bytes
 _JPEG_LIMIT = 65500  # pixels a side, of libjpeg
+_JPEG_WORST, _JPEG_LEAST = 2, 1 << 16  # bytes that noise takes for each sample, and a file beside them
 _CLASSIC_LIMIT = 0xFFFFFFFF - (16 << 20)  # bytes of a classic TIFF, with room for tags and metadata
 _LZW_WORST = 1.5  # LZW codes of up to 12 bits may stand for a byte each
 
@@ -215,10 +218,23 @@ class ImageWriter:
         if not len(rows):
             return
         samples = np.ascontiguousarray(self._convert(rows))
+        if self.format == "jpeg":
+            self._refuse_full_disk(_JPEG_WORST * samples.nbytes + _JPEG_LEAST)
         top = self._spec.y + self._done
-        if not self._output.write_scanlines(top, top + len(rows), 0, samples):
+        written = self._output.write_scanlines(top, top + len(rows), 0, samples)
+        if not written or self._has_hidden_error(self._output):
             raise self._failure(self._output.geterror())
         self._done += len(rows)
+
+    def _has_hidden_error(self, output: Any) -> bool:
+        """Whether a disk was full, of which PNG's writer only takes a note; TIFF's notes are no errors."""
+        return self.format == "png" and bool(output.has_error)
+
+    def _refuse_full_disk(self, needed: int) -> None:
+        """Raise `OutputError` before libjpeg meets a full disk: it would end the process, untidily."""
+        disk = shutil.disk_usage(self._part.parent)
+        if disk.total and disk.free < needed:  # some network folders say 0 of 0
+            raise self._failure(os.strerror(errno.ENOSPC))
 
     def _convert(self, rows: Pixels) -> Pixels:
         """To the stored depth and the format's kind of alpha."""
@@ -239,7 +255,7 @@ class ImageWriter:
         if self._done < self.height:
             raise OutputError(f"{self.path}: only {self._done} of {self.height} rows were made; not written")
         output, self._output = self._output, None
-        if not output.close():
+        if not output.close() or self._has_hidden_error(output):
             raise self._failure(output.geterror())
         try:
             if self.format == "tiff":
@@ -257,8 +273,9 @@ class ImageWriter:
         self._part.unlink(missing_ok=True)
 
     def _failure(self, why: str) -> OutputError:
+        reason = (why.strip() or "no reason given").splitlines()[0]  # PNG's writer adds a line for each block
         return OutputError(
-            f"{self.path} cannot be written: {why.strip() or 'no reason given'}; "
+            f"{self.path} cannot be written: {reason.strip()}; "
             "is there room in the folder? Choose another with -o"
         )
 

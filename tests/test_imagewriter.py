@@ -5,9 +5,11 @@ from __future__ import annotations
 import hashlib
 import json
 import os
+import shutil
 import subprocess
 import zlib
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import OpenImageIO as oiio
@@ -361,7 +363,8 @@ def test_unwritable_folder(tmp_path):
         folder.chmod(0o700)
 
 
-def test_full_disk(tmp_path):
+@pytest.mark.parametrize("ending", [".tif", ".png"])
+def test_full_disk(tmp_path, ending):
     """A limit on file size stands for a full disk."""
     resource = pytest.importorskip("resource")
     import signal
@@ -370,12 +373,30 @@ def test_full_disk(tmp_path):
     soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, hard))
     try:
-        with pytest.raises(OutputError, match=r"a\.tif cannot be written"):
-            write_image(tmp_path / "a.tif", noise(np.uint16, width=401, height=301))
+        with pytest.raises(OutputError, match=rf"a\{ending} cannot be written: [^\n]*;"):
+            write_image(tmp_path / f"a{ending}", noise(np.uint16, width=401, height=301))
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
         signal.signal(signal.SIGXFSZ, old_action)
     assert not names_in(tmp_path)
+
+
+def test_jpeg_stops_before_the_disk_is_full(tmp_path, monkeypatch):
+    """libjpeg would end the process there. Disks that do not tell their size are written to."""
+    disk = SimpleNamespace(total=1 << 30, free=1 << 20)
+    monkeypatch.setattr(shutil, "disk_usage", lambda folder: disk)
+    pixels = noise(np.uint8, width=401, height=301)
+    with ImageWriter(tmp_path / "a.jpg", 401, 602, 3, np.uint8) as writer:
+        writer.write_rows(pixels)
+        disk.free = 1 << 19
+        with pytest.raises(OutputError, match=r"a\.jpg cannot be written: No space left on device"):
+            writer.write_rows(pixels)
+        disk.free = 1 << 20
+        writer.write_rows(pixels)
+    assert names_in(tmp_path) == ["a.jpg"]
+    disk.total = disk.free = 0
+    write_image(tmp_path / "b.jpg", pixels)
+    assert (tmp_path / "b.jpg").is_file()
 
 
 @pytest.mark.parametrize("dtype", DTYPES)
