@@ -16,7 +16,7 @@ import OpenImageIO as oiio  # noqa: N813
 
 from hugin_abflow import tifftags
 from hugin_abflow.errors import ImageReadError
-from hugin_abflow.imagewriter import COMPRESSIONS, ENDINGS, ImageWriter, write_image
+from hugin_abflow.imagewriter import COMPRESSIONS, ENDINGS, ImageWriter, named_in_unicode, write_image
 from hugin_abflow.layer import Box, Layer, full_scale
 
 __all__ = ["COMPRESSIONS", "ENDINGS", "ImageWriter", "read_layer", "read_layers", "write_image"]
@@ -66,6 +66,8 @@ def read_layers(path: Path | str) -> list[Layer]:
 
 def _open(path: Path, page: int) -> Any:
     """An ImageInput that leaves colours as they are stored."""
+    if not named_in_unicode(path):
+        raise ImageReadError(f"{path} cannot be read: its path is not valid UTF-8; rename it")
     config = oiio.ImageSpec()
     config[_UNASSOCIATED] = 1
     source = oiio.ImageInput.open(str(path), config)

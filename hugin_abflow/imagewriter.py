@@ -159,6 +159,11 @@ class ImageWriter:
         # through a link: replace what it points to, not the link
         self._final = self.path.resolve()
         self._part = self._final.with_name(f".abflow-{secrets.token_hex(6)}{self.path.suffix}")
+        if not named_in_unicode(self._part):
+            raise OutputError(
+                f"{self.path} cannot be written: the path of its folder is not valid UTF-8; rename that, "
+                "or choose another with -o"
+            )
         try:
             if self._final.is_dir():
                 raise OutputError(f"{self.path} is a folder; name a file with -o")
@@ -313,6 +318,11 @@ def write_image(
         canvas_size=canvas_size,
     ) as writer:
         writer.write_rows(pixels)
+
+
+def named_in_unicode(path: Path) -> bool:
+    """Whether OpenImageIO can be told the path: bytes that are no UTF-8 (an old archive's) it cannot."""
+    return not any("\ud800" <= letter <= "\udfff" for letter in str(path))
 
 
 def _format_of(path: Path) -> str:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import sys
 import threading
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -202,6 +204,14 @@ def test_unusable_files_are_named_with_the_reason(tmp_path, what):
     with pytest.raises(ImageReadError) as error:
         read_layer(path)
     assert str(path) in str(error.value) and what in str(error.value)
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="other systems' names of files are Unicode")
+def test_a_name_that_is_no_unicode_is_refused(tmp_path):
+    path = Path(os.fsdecode(os.fsencode(tmp_path) + b"/\xe9.tif"))
+    path.write_bytes(b"")
+    with pytest.raises(ImageReadError, match="UTF-8; rename"):
+        read_layer(path)
 
 
 def test_missing_strips_are_told_once(tmp_path):

@@ -7,6 +7,7 @@ import json
 import os
 import shutil
 import subprocess
+import sys
 import zlib
 from pathlib import Path
 from types import SimpleNamespace
@@ -361,6 +362,18 @@ def test_unwritable_folder(tmp_path):
             write_image(folder / "a.tif", noise(np.uint8))
     finally:
         folder.chmod(0o700)
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="other systems' names of files are Unicode")
+def test_a_name_may_be_no_unicode_but_its_folder_must(tmp_path):
+    folder = Path(os.fsdecode(os.fsencode(tmp_path) + b"/\xe9"))
+    folder.mkdir()
+    with pytest.raises(OutputError, match="UTF-8; rename"):
+        write_image(folder / "a.tif", noise(np.uint8))
+    assert not names_in(folder)
+    folder.rmdir()
+    write_image(folder.with_suffix(".tif"), noise(np.uint8))
+    assert folder.with_suffix(".tif").is_file()
 
 
 @pytest.mark.parametrize("ending", [".tif", ".png"])
