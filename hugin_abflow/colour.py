@@ -205,20 +205,18 @@ def _extend(
 ) -> npt.NDArray[np.float64]:
     """Carry gains two cells beyond the layer, so that interpolation at its border finds no zeros."""
     known = mask.astype(np.float64)
+    rows, columns = known.shape
     value = gain * known[..., None]
     for _ in range(2):
         sums, weights = np.zeros_like(value), np.zeros_like(known)
+        around_w, around_v = np.pad(known, 1), np.pad(value, [(1, 1), (1, 1), (0, 0)])
+        if wraps:
+            around_w[1:-1, 0], around_w[1:-1, -1] = known[:, -1], known[:, 0]
+            around_v[1:-1, 0], around_v[1:-1, -1] = value[:, -1], value[:, 0]
         for dy in (-1, 0, 1):
             for dx in (-1, 0, 1):
-                pad = [(1, 1), (1, 1)]
-                shifted_w = np.pad(known, pad, mode="constant")
-                shifted_v = np.pad(value, [*pad, (0, 0)], mode="constant")
-                if wraps:
-                    shifted_w[1:-1, 0], shifted_w[1:-1, -1] = known[:, -1], known[:, 0]
-                    shifted_v[1:-1, 0], shifted_v[1:-1, -1] = value[:, -1], value[:, 0]
-                rows, columns = known.shape
-                sums += shifted_v[1 + dy : 1 + dy + rows, 1 + dx : 1 + dx + columns]
-                weights += shifted_w[1 + dy : 1 + dy + rows, 1 + dx : 1 + dx + columns]
+                sums += around_v[1 + dy : 1 + dy + rows, 1 + dx : 1 + dx + columns]
+                weights += around_w[1 + dy : 1 + dy + rows, 1 + dx : 1 + dx + columns]
         new = (known == 0) & (weights > 0)
         value[new] = sums[new] / weights[new][:, None]
         known[new] = 1
