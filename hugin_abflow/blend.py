@@ -204,7 +204,8 @@ def _plan(layers: Sequence[BlendLayer], full: Grid, grid: Grid, crop: Box, heigh
 class _Store:
     """Rows of all layers on the device, those that a band needs. Each row is decoded and uploaded once.
 
-    spans   for each band, the rows of each layer; from band to band neither end goes back.
+    spans   for each band, the rows of each layer; from band to band neither end goes back, but for a layer
+            that is not needed: its are equal.
     """
 
     def __init__(self, device: Device, layers: Sequence[Layer], spans: Sequence[Sequence[Span]]) -> None:

@@ -160,9 +160,8 @@ def _align(
     grid: Grid,
     settings: Settings,
 ) -> tuple[list[Buffer], Correction]:
-    """Geometry and colour that make the layers agree; where nothing does, one layer whole.
-
-    Without flow nothing does but colour.
+    """Geometry and colour that make the layers agree, without flow colour alone; where nothing does, one
+    layer whole.
 
     What flow cannot explain spoils the exposure around it, which is found again without it.
     """

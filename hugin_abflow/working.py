@@ -201,9 +201,8 @@ def reduce_layer(
         )  # fmt: skip
         advance(end - done)  # bands share rows; each counts once
         done = end
-    if (
-        checked and bottom <= top
-    ):  # too flat for a row of the grid: the order of such layers must not be the caller's
+    if checked and bottom <= top:
+        # too flat for a row of the grid: the order of such layers must not be the caller's
         checksum = crc32(device_rows(layer, 0, layer.box.height).data)
     advance(layer.box.height - done)
     return WorkingLayer(layer, box, pixels, checksum)
