@@ -5,17 +5,17 @@ layers that differ although exposure is corrected. In each connected region of s
 to one layer: the one that the softmax favours, with cuts between layers, and at the layers' own
 borders, where they show least. This is a labelling of least energy,
 
-    sum_cells r (1 - s_k)  +  sum_neighbours c (e + e') / 2 [k != k']  +  sum_borders c e
+    sum_cells r (1 - s_k)  +  sum_neighbours c (r + r') / 2 [k != k']  +  sum_borders c r
 
-with r the residual of low frequencies, e what a cut shows (r, or more where texture is off), s_k the share of
-the softmax and c the price of a cut, found by graph cuts (alpha expansion: Boykov, Veksler, Zabih, "Fast
-approximate energy minimization via graph cuts", 2001). Regions keep to themselves: elsewhere the softmax
-stays as it is, and the transition lies where the layers agree. What is clipped in one photo only is no such
-difference: it is brighter in the other by an unknown amount, and changes over best where it does so slowly.
+with r the residual, s_k the share of the softmax and c the price of a cut, found by graph cuts (alpha
+expansion: Boykov, Veksler, Zabih, "Fast approximate energy minimization via graph cuts", 2001). Regions keep
+to themselves: elsewhere the softmax stays as it is, and the transition lies where the layers agree. What is
+clipped in one photo only is no such difference: it is brighter in the other by an unknown amount, and changes
+over best where it does so slowly.
 
 Where there is no flow, layers are not aligned, and each overlap is such a region, whole: on finer cells, with
-the mean square of the difference in place of r and e, since fine texture is as much in the way of a cut, and
-with narrow transitions. Low frequencies are not blended across them: the gains of colour.py make them agree.
+the mean square of the difference in place of r, since fine texture is as much in the way of a cut, and with
+narrow transitions. Low frequencies are not blended across them: the gains of colour.py make them agree there.
 """
 
 from __future__ import annotations
@@ -47,12 +47,8 @@ _SIGMA = 1.0
 _STRONG, _WEAK = 0.2, 0.045
 # Strong cells, of the equator's size, that a region has at least: fewer are an edge that is a pixel off.
 _LEAST = 6.0
-# Where two photos show somebody half over himself only his sides differ: over so many cells they are one.
-_BRIDGE = 4
 # Price of a cut, in cells: what is cut off must be favoured by the softmax over this depth.
 _CUT = 20.0
-# What a cut through texture that is off costs, of the same difference in low frequencies.
-_TEXTURE = 2.0
 # The same without flow, where the softmax has little to say: overlaps are some hundred cells wide.
 _FINE_CUT = 120.0
 # Cells to each side of a cut whose exposure counts.
@@ -81,7 +77,7 @@ def regions(
     """Where aligned, corrected layers still differ: (height, width) on the seam grid."""
     cells = seam_grid(grid)
     found = _regions(_residual(device, layers, fields, pairs, correction, grid, cells), cells)
-    return _bridged(np.logical_or.reduce(found), cells.wraps) if found else np.zeros(cells.shape, bool)
+    return np.logical_or.reduce(found) if found else np.zeros(cells.shape, bool)
 
 
 def cut(
@@ -99,9 +95,7 @@ def cut(
     """
     cells = seam_grid(grid)
     residual = _residual(device, layers, fields, pairs, correction, grid, cells)
-    rough, _ = _roughness(device, layers, fields, pairs, correction, grid, cells)
-    edge = np.maximum(residual, _TEXTURE * np.sqrt(rough))
-    owner = _owners(layers, fields, residual, edge, whole, masks, grid, cells, _CUT)
+    owner = _owners(layers, fields, residual, whole, masks, grid, cells, _CUT)
     yields = [_soften((whole & (owner != k)).astype(np.float32), cells.wraps) for k in range(len(layers))]
     _yield(device, layers, fields, yields, grid, cells)
 
@@ -120,9 +114,12 @@ def divide(
     Returns where the cuts are, with some cells beside them: (height, width) on a grid over the same region.
     """
     cells = grid.coarser(_FINE_CELL)
-    rough, whole = _roughness(device, layers, fields, pairs, correction, grid, cells)
-    residual = np.where(whole, _SHORTER + rough, 0)
-    owner = _owners(layers, fields, residual, residual, whole, masks, grid, cells, _FINE_CUT)
+    residual = np.zeros(cells.shape)
+    for pair in pairs:
+        found = _difference(device, layers, fields, pair, correction, grid, cells, squared=True)
+        residual = np.maximum(residual, np.where(found[..., 3] > 0, _SHORTER + found[..., :3].max(-1), 0))
+    whole = residual > 0
+    owner = _owners(layers, fields, residual, whole, masks, grid, cells, _FINE_CUT)
     yields = [(whole & (owner != k)).astype(np.float32) for k in range(len(layers))]
     _yield(device, layers, fields, yields, grid, cells)
     return _beside_cuts(owner, cells.wraps)
@@ -132,7 +129,6 @@ def _owners(
     layers: Sequence[WorkingLayer],
     fields: Sequence[Buffer],
     residual: npt.NDArray[np.float64],
-    edge: npt.NDArray[np.float64],
     whole: npt.NDArray[np.bool_],
     masks: Masks,
     grid: Grid,
@@ -150,7 +146,7 @@ def _owners(
     owner = np.where(cover.any(0), (shares * cover).argmax(0), -1)
     for region in _connected(whole, cells.wraps):
         rows, columns = np.nonzero(region)
-        owner[rows, columns] = label(rows, columns, residual, edge, shares, cover, cells.wraps, cut_price)
+        owner[rows, columns] = label(rows, columns, residual, shares, cover, cells.wraps, cut_price)
     return owner
 
 
@@ -197,26 +193,6 @@ def _residual(
         mean = np.abs(mean[..., :3]).max(-1) / np.where(share > 0, mean[..., 3], 1)
         largest = np.maximum(largest, mean * (share > 0))
     return largest
-
-
-def _roughness(
-    device: Device,
-    layers: Sequence[WorkingLayer],
-    fields: Sequence[Buffer],
-    pairs: Sequence[Pair],
-    correction: Correction,
-    grid: Grid,
-    cells: Grid,
-) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.bool_]]:
-    """How far all frequencies differ: per cell the largest mean square of any pair and channel, 0 where no
-    two lie; and where two do.
-    """
-    largest, seen = np.zeros(cells.shape), np.zeros(cells.shape, bool)
-    for pair in pairs:
-        found = _difference(device, layers, fields, pair, correction, grid, cells, squared=True)
-        largest = np.maximum(largest, found[..., :3].max(-1))
-        seen |= found[..., 3] > 0
-    return largest, seen
 
 
 def _difference(
@@ -269,14 +245,6 @@ def _regions(residual: npt.NDArray[np.float64], cells: Grid) -> list[npt.NDArray
     return [region for region in _connected(grown, cells.wraps) if strong[region].sum() >= _LEAST]
 
 
-def _bridged(mask: npt.NDArray[np.bool_], wraps: bool) -> npt.NDArray[np.bool_]:
-    """A mask with what lies between parts that are near each other."""
-    margin = 2 * _BRIDGE
-    disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * _BRIDGE + 1, 2 * _BRIDGE + 1))
-    closed = cv2.morphologyEx(_padded(mask.astype(np.uint8), margin, wraps), cv2.MORPH_CLOSE, disc)
-    return np.asarray(closed)[margin:-margin, margin:-margin] > 0
-
-
 def _connected(mask: npt.NDArray[np.bool_], wraps: bool) -> list[npt.NDArray[np.bool_]]:
     """The connected parts of a mask."""
     count, found = cv2.connectedComponents(mask.astype(np.uint8), connectivity=8)
@@ -295,7 +263,6 @@ def label(
     rows: npt.NDArray[np.intp],
     columns: npt.NDArray[np.intp],
     residual: npt.NDArray[np.float64],
-    edge: npt.NDArray[np.float64],
     shares: npt.NDArray[np.float64],
     cover: npt.NDArray[np.bool_],
     wraps: bool,
@@ -303,14 +270,13 @@ def label(
 ) -> npt.NDArray[np.intp]:
     """Which layer each cell (rows, columns) of a region is taken from: the least energy found.
 
-    residual, edge: r and e, (height, width). shares, cover: shares of the softmax and coverage (layers,
-    height, width).
+    residual: (height, width). shares, cover: shares of the softmax and coverage (layers, height, width).
     cut_price: of a cut, in cells.
     """
     candidates = np.flatnonzero(cover[:, rows, columns].any(1))
     if candidates.size < 2:
         return np.full(rows.size, candidates[0] if candidates.size else 0)
-    weight, shown = residual[rows, columns], edge[rows, columns]
+    weight = residual[rows, columns]
     present = cover[candidates][:, rows, columns]
     price = np.where(present, weight * (1 - shares[candidates][:, rows, columns]), _FORBIDDEN)
     number = np.full(residual.shape, -1)
@@ -319,12 +285,12 @@ def label(
     for down, right in ((0, 1), (1, 0), (0, -1), (-1, 0)):
         inside, there = _neighbours(rows + down, columns + right, residual.shape, wraps)
         # a layer's own border is a cut as well, where the union goes on
-        price += cut_price * shown * (inside & cover[:, *there].any(0) & ~cover[candidates][:, *there])
+        price += cut_price * weight * (inside & cover[:, *there].any(0) & ~cover[candidates][:, *there])
         if down + right > 0:
             linked = np.flatnonzero(inside & (number[there] >= 0))
             links.append(np.stack([linked, number[there][linked]]))
     first, second = np.concatenate(links, 1)
-    between = cut_price * (shown[first] + shown[second]) / 2
+    between = cut_price * (weight[first] + weight[second]) / 2
     current = np.full(rows.size, np.argmin(price.sum(1)))
     for _ in range(1 if candidates.size == 2 else 2):
         for alpha in range(candidates.size):
