@@ -12,6 +12,7 @@ is no difference it is exactly zero.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -22,6 +23,7 @@ from scipy.sparse.linalg import splu
 
 from hugin_abflow.coefficient import on_cells
 from hugin_abflow.geometry import Pair
+from hugin_abflow.layer import Layer
 from hugin_abflow.opencl import Buffer, Device
 from hugin_abflow.settings import Settings
 from hugin_abflow.working import Grid, WorkingLayer
@@ -32,7 +34,7 @@ _CELL = 16
 # takes time by cells^1.5 and layers^3.
 _DEEP = 4.0
 # Samples brighter than this, of full scale, may be clipped and measure nothing (integer images only).
-CLIPPED = 0.98
+_CLIPPED = 0.98
 # Standard deviation of the differences within a cell that halves its trust, on the exposure scale.
 _SPREAD = 0.3
 # Rounds of (weight of the measured differences against smoothness, distance from the solution at which a cell
@@ -44,7 +46,6 @@ _STRICT = ((0.01, 4.0), (0.03, 2.5), (0.3, 1.6), (3.0, 1.2), (100.0, 1.0))
 _FADE, _TREND_FADE = 0.12, 1.0
 # All gains shrink towards 0 by this, at most a quarter of an 8-bit level, so that small ones are exactly 0.
 _NEGLIGIBLE = 1e-3
-
 
 # Of two layers, by their indices, a - b per cell of the colour grid, on the exposure scale:
 # (height, width, 4), r, g, b and a weight 0..1.
@@ -65,6 +66,11 @@ def colour_grid(grid: Grid, covered: npt.NDArray[np.bool_]) -> Grid:
     """The coarse grid over the region of `grid`; covered: (layers, height, width), of any grid over it."""
     depth = np.cbrt(np.mean(covered.sum(0, dtype=np.float64) ** 3))
     return grid.coarser(max(_CELL, round(_CELL * depth / _DEEP)))
+
+
+def clipping(layer: Layer) -> float:
+    """The share of full scale above which a layer's samples may be clipped; floats never are."""
+    return _CLIPPED if layer.dtype.kind == "u" else math.inf
 
 
 def differences(
@@ -139,7 +145,7 @@ def _difference(
     device.run(
         "colour", "colour_difference", cells.border[:2],
         a.pixels, fields[pair.a], a.box, b.pixels, fields[pair.b], b.box, grid.border, grid.lens,
-        cells.border, int(integer), CLIPPED if integer else 1e30, _SPREAD, values,
+        cells.border, int(integer), clipping(a.layer), _SPREAD, values,
     )  # fmt: skip
     return values.get().astype(np.float64)
 

@@ -6,7 +6,7 @@ covers [x, x+1) x [y, y+1), so its centre is at (x + 0.5, y + 0.5).
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -134,3 +134,14 @@ class Layer:
             stored = stored if finite.all() else np.where(finite, stored, stored.dtype.type(0))
         box = Box(left, top, left + width, top + height)
         return cls(name, box, stored.dtype, samples - 1, lambda first, last: stored[first:last], icc)
+
+
+def bounding_box(layers: Sequence[Layer]) -> Box:
+    """The smallest box around all layers, at least one."""
+    boxes = [layer.box for layer in layers]
+    return Box(
+        min(box.left for box in boxes),
+        min(box.top for box in boxes),
+        max(box.right for box in boxes),
+        max(box.bottom for box in boxes),
+    )

@@ -238,8 +238,7 @@ class Device:
         """A copy of an array on the device."""
         result = self.empty(source.shape, source.dtype)
         if source.nbytes:
-            with _device_errors("copying a buffer"):
-                cl.enqueue_copy(self.queue, result.data, source.data, byte_count=source.nbytes)
+            result.copy(0, source, 0, source.nbytes // source._pixel)
         return result
 
     def kernel(self, module: str, name: str, options: str = "") -> cl.Kernel:

@@ -32,7 +32,7 @@ from scipy.sparse import csr_array
 from scipy.sparse.csgraph import breadth_first_order, maximum_flow
 
 from hugin_abflow.coefficient import Masks, on_cells
-from hugin_abflow.colour import CLIPPED, Correction
+from hugin_abflow.colour import Correction, clipping
 from hugin_abflow.geometry import Pair
 from hugin_abflow.opencl import Buffer, Device
 from hugin_abflow.working import Grid, WorkingLayer
@@ -214,7 +214,7 @@ def _difference(
     for k in (pair.a, pair.b):
         sides += [layers[k].pixels, fields[k], layers[k].box, correction.gains[k] or none]
     integer = layers[pair.a].layer.dtype.kind == "u"
-    clipped = CLIPPED if integer and not squared else math.inf
+    clipped = math.inf if squared else clipping(layers[pair.a].layer)
     device.run(
         "seam", "seam_difference", cells.border[:2], *sides, grid.border, grid.lens,
         correction.grid.border, cells.border, int(integer), clipped, int(squared), difference,

@@ -17,7 +17,7 @@ from zlib import crc32
 import numpy as np
 import numpy.typing as npt
 
-from hugin_abflow.layer import Box, Canvas, Layer
+from hugin_abflow.layer import Box, Canvas, Layer, bounding_box
 from hugin_abflow.opencl import Buffer, Device
 from hugin_abflow.progress import Advance
 from hugin_abflow.settings import Settings
@@ -119,18 +119,17 @@ class WorkingLayer:
 
 def full_grid(canvas: Canvas, layers: Sequence[Layer]) -> Grid:
     """The region's own pixels: the layers' common bounding box at full resolution."""
-    top = min(layer.box.top for layer in layers)
-    bottom = max(layer.box.bottom for layer in layers)
-    left = 0 if canvas.wraps else min(layer.box.left for layer in layers)
-    right = canvas.width if canvas.wraps else max(layer.box.right for layer in layers)
+    region = bounding_box(layers)
+    if canvas.wraps:
+        region = replace(region, left=0, right=canvas.width)
     lens, poles = (0.0, 0.0, 0.0, 0.0), 0
     if canvas.spherical:
         step = math.radians(canvas.hfov) / canvas.width
-        lens = ((left - canvas.width / 2) * step, step, (canvas.height / 2 - top) * step, step)
+        left, top = region.left - canvas.width / 2, canvas.height / 2 - region.top
+        lens = (left * step, step, top * step, step)
         if canvas.wraps and canvas.width % 2 == 0:
             poles += abs(lens[2] - math.pi / 2) < step / 2
-            poles += 2 * (abs(lens[2] - (bottom - top) * step + math.pi / 2) < step / 2)
-    region = Box(left, top, right, bottom)
+            poles += 2 * (abs(lens[2] - region.height * step + math.pi / 2) < step / 2)
     return Grid(region, region.width, region.height, canvas.wraps, poles, lens, canvas.width)
 
 

@@ -13,7 +13,7 @@ from hugin_abflow.dropin.weights import MaskedMerge
 from hugin_abflow.errors import CommandLineError, ExitCode, LayersMismatchError, LayersMissingError
 from hugin_abflow.guides import Guide
 from hugin_abflow.images import read_layers
-from hugin_abflow.layer import Box, Canvas, Layer
+from hugin_abflow.layer import Box, Canvas, Layer, bounding_box
 from hugin_abflow.merge import guides_between, refuse_input, write_panorama
 from hugin_abflow.nona import check_layers
 from hugin_abflow.progress import Progress
@@ -83,7 +83,7 @@ def blend(request: Request, progress: Progress) -> None:
     guides: Callable[[], Sequence[Guide]] = tuple
     if request.project:
         plan = read_plan(request.project)
-        canvas = replace(plan.canvas, crop=request.crop or _bounds(layers))
+        canvas = replace(plan.canvas, crop=request.crop or bounding_box(layers))
         projection, guides = plan.projection, partial(guides_between, plan, layers, Settings())
     else:
         canvas = _canvas(layers, request.crop, request.wraps)
@@ -115,24 +115,13 @@ def _read(request: Request) -> list[Layer]:
     return layers
 
 
-def _bounds(layers: Sequence[Layer]) -> Box:
-    """The smallest box around all layers."""
-    boxes = [layer.box for layer in layers]
-    return Box(
-        min(box.left for box in boxes),
-        min(box.top for box in boxes),
-        max(box.right for box in boxes),
-        max(box.bottom for box in boxes),
-    )
-
-
 def _canvas(layers: Sequence[Layer], crop: Box | None, wraps: bool) -> Canvas:
     """The canvas that a command line without a project is about.
 
     Its size is what the layers' files say, else what holds layers and crop. One that wraps and is twice as
     wide as high is the whole sphere: no other projection is used for that.
     """
-    bounds = _bounds(layers)
+    bounds = bounding_box(layers)
     crop = crop or bounds
     sizes = {layer.canvas_size: layer for layer in layers if layer.canvas_size}
     if len(sizes) > 1:
