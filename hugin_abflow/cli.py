@@ -10,6 +10,7 @@ from typing import Any, get_args
 
 import click
 
+from hugin_abflow import trace
 from hugin_abflow.errors import AbflowError, ExitCode
 from hugin_abflow.images import COMPRESSIONS
 from hugin_abflow.merge import merge_project
@@ -23,6 +24,7 @@ from hugin_abflow.terminal import (
     display_progress,
     interruptible,
     messages,
+    phase_table,
     print_path,
     say,
     version,
@@ -256,6 +258,12 @@ _information = partial(click.option, cls=_Option, group="Information")
 )
 @_information("-q", "--quiet", is_flag=True, help="Print nothing but warnings and errors.")
 @_information("-v", "--verbose", is_flag=True, help="Say what is done and how long it takes.")
+@_information(
+    "--profile",
+    metavar="FILE",
+    type=_file,
+    help="Write where the time goes, as a trace (JSON) that chrome://tracing and ui.perfetto.dev open.",
+)
 @click.version_option(
     version(), prog_name=PROGRAM, message="%(prog)s %(version)s", help="Print the version and exit."
 )
@@ -281,6 +289,7 @@ def command(
     device: str | None,
     quiet: bool,
     verbose: bool,
+    profile: Path | None,
 ) -> ExitCode:
     """Blend the photos of Hugin projects into panoramas, by optical flow.
 
@@ -321,12 +330,13 @@ def command(
         jpeg_quality=jpeg_quality,
     )
     codes = []
-    with messages(logging.INFO if verbose else logging.WARNING):
+    with messages(logging.INFO if verbose else logging.WARNING), trace.recording(profile):
         for project in projects:
             heading = f"{project.name}: " if len(projects) > 1 else ""
             with (
                 catching(str(project), verbose) as failures,
-                display_progress(heading, quiet, verbose) as progress,
+                display_progress(heading, quiet, verbose) as display,
+                phase_table(heading, trace.phases(display), verbose) as progress,
             ):
                 panorama = merge_one(project, progress=progress)
             if not failures and not quiet:

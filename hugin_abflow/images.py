@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 import OpenImageIO as oiio  # noqa: N813
 
-from hugin_abflow import tifftags
+from hugin_abflow import tifftags, trace
 from hugin_abflow.errors import ImageReadError
 from hugin_abflow.imagewriter import COMPRESSIONS, ENDINGS, ImageWriter, named_in_unicode, write_image
 from hugin_abflow.layer import Box, Layer, full_scale
@@ -174,7 +174,7 @@ class _Rows:
             raise IndexError(f"rows {top}..{bottom} of an image of {self.height} rows")
         if top == bottom:
             return np.empty((0, self.width, self.channels + 1), self.dtype)
-        with self._lock:
+        with self._lock, trace.span("decode", trace.FILE, file=self.path.name, rows=bottom - top):
             kept_from = self._end - (0 if self._kept is None else len(self._kept))
             if self._kept is not None and kept_from <= top and bottom <= self._end:
                 rows, first = self._kept, kept_from

@@ -19,7 +19,7 @@ import numpy as np
 import numpy.typing as npt
 import OpenImageIO as oiio  # noqa: N813
 
-from hugin_abflow import tifftags
+from hugin_abflow import tifftags, trace
 from hugin_abflow.errors import OutputError
 from hugin_abflow.layer import full_scale
 
@@ -226,7 +226,8 @@ class ImageWriter:
         if self.format == "jpeg":
             self._refuse_full_disk(_JPEG_WORST * samples.nbytes + _JPEG_LEAST)
         top = self._spec.y + self._done
-        written = self._output.write_scanlines(top, top + len(rows), 0, samples)
+        with trace.span("encode", trace.FILE, rows=len(rows)):
+            written = self._output.write_scanlines(top, top + len(rows), 0, samples)
         if not written or self._has_hidden_error(self._output):
             raise self._failure(self._output.geterror())
         self._done += len(rows)

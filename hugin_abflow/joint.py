@@ -140,13 +140,15 @@ def prepare(
         if settings.flow
         else []
     )
-    flows = [consistency.mend(device, pair) for pair in flows]
-    pairs = [pair for pair, _ in overlaps]
-    fields, correction = _align(device, reduced, pairs, flows, masks, grid, settings)
-    final = [
-        BlendLayer(layer.layer, layer.box, field, geometry.reach(device, layer, field, grid), gain)
-        for layer, field, gain in zip(reduced, fields, correction.gains, strict=True)
-    ]
+    with progress("align", 1) as advance:
+        flows = [consistency.mend(device, pair) for pair in flows]
+        pairs = [pair for pair, _ in overlaps]
+        fields, correction = _align(device, reduced, pairs, flows, masks, grid, settings)
+        final = [
+            BlendLayer(layer.layer, layer.box, field, geometry.reach(device, layer, field, grid), gain)
+            for layer, field, gain in zip(reduced, fields, correction.gains, strict=True)
+        ]
+        advance(1)
     final += [_unblended(device, everything[i]) for i in range(len(everything)) if i not in used]
     return Prepared(tuple(final), full, grid, correction.grid)
 

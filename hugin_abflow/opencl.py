@@ -6,7 +6,9 @@ import logging
 import os
 import sys
 import threading
+import time
 import warnings
+from collections import deque
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -18,6 +20,7 @@ import numpy as np
 import numpy.typing as npt
 import pyopencl as cl
 
+from hugin_abflow import trace
 from hugin_abflow.errors import DeviceError
 
 _log = logging.getLogger(__name__)
@@ -159,38 +162,41 @@ class Buffer:
         self.nbytes = int(np.prod(shape, dtype=np.int64)) * self.dtype.itemsize
         with _device_errors(f"allocating {self.nbytes} bytes"):
             self.data = cl.Buffer(device.context, cl.mem_flags.READ_WRITE, max(self.nbytes, 16))
-        self._queue = device.queue
+        self._device = device
+
+    def _transfer(self, name: str, *places: Any, **offsets: int) -> None:
+        """Copy between arrays, the target first."""
+        self._device.timed(name, trace.TRANSFER, cl.enqueue_copy(self._device.queue, *places, **offsets))
 
     def get(self) -> npt.NDArray[Any]:
         """Copy to the host."""
         host = np.empty(self.shape, self.dtype)
         if host.size:
             with _device_errors("copying to the host"):
-                cl.enqueue_copy(self._queue, host, self.data)
+                self._transfer("download", host, self.data)
+            self._device.tell_times()
         return host
 
     def set(self, host: npt.NDArray[Any]) -> Buffer:
         """Copy from the host; `host` has this buffer's shape."""
         if host.size:
             with _device_errors("copying from the host"):
-                cl.enqueue_copy(self._queue, self.data, np.ascontiguousarray(host, self.dtype))
+                self._transfer("upload", self.data, np.ascontiguousarray(host, self.dtype))
         return self
 
     def put(self, start: int, host: npt.NDArray[Any]) -> None:
         """Copy from the host to this buffer's pixels from `start` on; the last axis is one pixel."""
         if host.size:
             with _device_errors("copying from the host"):
-                cl.enqueue_copy(
-                    self._queue, self.data, np.ascontiguousarray(host, self.dtype),
-                    dst_offset=start * self._pixel,
-                )  # fmt: skip
+                rows = np.ascontiguousarray(host, self.dtype)
+                self._transfer("upload", self.data, rows, dst_offset=start * self._pixel)
 
     def copy(self, start: int, source: Buffer, first: int, count: int) -> None:
         """Copy `count` pixels of another buffer, from its `first` on, to this one's from `start` on."""
         if count:
             with _device_errors("copying on the device"):
-                cl.enqueue_copy(
-                    self._queue, self.data, source.data, byte_count=count * self._pixel,
+                self._transfer(
+                    "copy", self.data, source.data, byte_count=count * self._pixel,
                     src_offset=first * self._pixel, dst_offset=start * self._pixel,
                 )  # fmt: skip
 
@@ -204,8 +210,26 @@ class Buffer:
         if self.nbytes:
             pattern = np.array(value, self.dtype)
             with _device_errors("filling a buffer"):
-                cl.enqueue_fill_buffer(self._queue, self.data, pattern, 0, self.nbytes)
+                cl.enqueue_fill_buffer(self._device.queue, self.data, pattern, 0, self.nbytes)
         return self
+
+
+class _Times:
+    """When the device did what; its queue does one thing after the other."""
+
+    def __init__(self, queue: cl.CommandQueue) -> None:
+        self.events: deque[tuple[str, str, cl.Event]] = deque()
+        event = cl.enqueue_fill_buffer(queue, cl.Buffer(queue.context, 0, 16), np.int32(0), 0, 16)
+        event.wait()
+        self._offset = time.perf_counter() - event.profile.end * 1e-9  # its clock to ours
+
+    def tell(self) -> None:
+        """Tell the trace what is done."""
+        complete = cl.command_execution_status.COMPLETE
+        while self.events and self.events[0][2].command_execution_status == complete:
+            name, kind, event = self.events.popleft()
+            start, end = (self._offset + ns * 1e-9 for ns in (event.profile.start, event.profile.end))
+            trace.add(name, kind, start, end, "device")
 
 
 class Device:
@@ -217,7 +241,9 @@ class Device:
     def __init__(self, wanted: str | None = None) -> None:
         self.device = _choose(wanted)
         self.context = cl.Context([self.device])
-        self.queue = cl.CommandQueue(self.context)
+        timing = cl.command_queue_properties.PROFILING_ENABLE if trace.is_recording() else 0
+        self.queue = cl.CommandQueue(self.context, properties=timing)
+        self._times = _Times(self.queue) if timing else None
         self._kernels: dict[tuple[str, str, str], cl.Kernel] = {}
         self._arguments = threading.Lock()  # a kernel keeps its arguments from when they are set to its start
         _log.info("device: %s (%s)", self.device.name.strip(), self.device.platform.name.strip())
@@ -271,7 +297,8 @@ class Device:
         with self._arguments, _device_errors(f"running {name}"):
             kernel = self.kernel(module, name, options)
             kernel.set_args(*(_argument(a) for a in args))
-            cl.enqueue_nd_range_kernel(self.queue, kernel, _rounded(size), _GROUP)
+            event = cl.enqueue_nd_range_kernel(self.queue, kernel, _rounded(size), _GROUP)
+        self.timed(name, trace.KERNEL, event)
 
     def repeat(
         self, module: str, name: str, size: Sequence[int], calls: Sequence[Sequence[object]], times: int
@@ -288,12 +315,24 @@ class Device:
         with _device_errors(f"running {name}"):
             for _ in range(times):
                 for kernel in kernels:
-                    cl.enqueue_nd_range_kernel(self.queue, kernel, rounded, _GROUP)
+                    event = cl.enqueue_nd_range_kernel(self.queue, kernel, rounded, _GROUP)
+                    self.timed(name, trace.KERNEL, event)
 
     def finish(self) -> None:
         """Wait for all that was started; raises `DeviceError` if the device failed."""
         with _device_errors("finishing"):
             self.queue.finish()
+        self.tell_times()
+
+    def timed(self, name: str, kind: str, event: cl.Event) -> None:
+        """Have the trace, where there is one, told later when this was done."""
+        if self._times:
+            self._times.events.append((name, kind, event))
+
+    def tell_times(self) -> None:
+        """Tell the trace what is done."""
+        if self._times:
+            self._times.tell()
 
 
 def _rounded(size: Sequence[int]) -> tuple[int, ...]:

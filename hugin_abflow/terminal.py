@@ -116,6 +116,30 @@ def display_progress(heading: str, quiet: bool, verbose: bool) -> AbstractContex
 
 
 @contextmanager
+def phase_table(heading: str, progress: Progress, shown: bool) -> Iterator[Progress]:
+    """The same progress; if `shown`, a table of seconds and shares follows what ends well."""
+    if not shown:
+        yield progress
+        return
+    seconds: dict[str, float] = {}
+
+    @contextmanager
+    def timed(phase: str, total: int) -> Iterator[Advance]:
+        started = time.monotonic()
+        with progress(phase, total) as advance:
+            yield advance
+        seconds[phase] = seconds.get(phase, 0.0) + time.monotonic() - started
+
+    started = time.monotonic()
+    yield timed
+    whole = max(time.monotonic() - started, 1e-9)
+    seconds |= {"other": whole - sum(seconds.values()), "total": whole}
+    say(f"{heading}phase     seconds  share")
+    for phase, value in seconds.items():
+        say(f"{heading}{phase:<9}{value:8.2f}{value / whole:6.0%}")
+
+
+@contextmanager
 def _as_given(progress: Progress) -> Iterator[Progress]:
     yield progress
 

@@ -118,12 +118,12 @@ def test_progress_reports_every_phase_to_its_end(folder, mode):
     recorder = Recorder()
     settings = Settings(merge=mode, band_rows=16)
     merge_project(folder / "pano.pto", settings, prefix="pano", progress=recorder)
-    expected = ["read", "flow", "blend"] if mode == "joint" else ["merge", "read", "flow", "blend"]
+    expected = ["merge"] * (mode == "sequential") + ["read", "flow", "align", "blend"]
     assert recorder.phases == expected
     assert recorder.totals["read"] == 2 * HEIGHT
     assert recorder.totals["flow"] == 1
     assert recorder.totals["blend"] == CROP[3] - CROP[1]
-    for phase in ("read", "flow", "blend"):
+    for phase in ("read", "flow", "align", "blend"):
         assert recorder.done[phase] == recorder.totals[phase]
     assert not recorder.open
 

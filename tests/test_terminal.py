@@ -59,8 +59,31 @@ def test_verbose_shows_info_and_phases(replace: Replace, capsys: pytest.CaptureF
         "device [red]PoCL[/red]",
         "hugin-abflow: warning: layers are older than the project",
         *("Flow ...", "Flow: 0.0 s", "Blend ...", "Blend: 0.0 s"),
+        "phase     seconds  share",
+        *lines[-4:],
     ]
     assert output.out == "a.tif\n"
+
+
+def test_verbose_ends_with_a_table_of_phases(replace: Replace, capsys: pytest.CaptureFixture[str]) -> None:
+    """A phase that comes twice has one line; shares are of the whole."""
+
+    def slow(path: Path, **keywords: Any) -> Path:
+        for phase, seconds in (("read", 0.02), ("blend", 0.06), ("read", 0.02)):
+            with keywords["progress"](phase, 1):
+                time.sleep(seconds)
+        return path
+
+    replace(slow)
+    assert cli.main(["-v", "a.pto"]) == 0
+    table = capsys.readouterr().err.split("phase     seconds  share\n")[1].splitlines()
+    rows = [re.fullmatch(r"(\w+) +(\d+\.\d\d) +(\d+)%", line) for line in table]
+    assert all(rows)
+    names, seconds, shares = zip(*(row.groups() for row in rows if row), strict=True)
+    assert names == ("read", "blend", "other", "total")
+    assert float(seconds[0]) >= 0.04 and float(seconds[1]) >= 0.06
+    assert sum(map(float, seconds[:3])) == pytest.approx(float(seconds[3]), abs=0.02)
+    assert sum(map(int, shares[:3])) == pytest.approx(100, abs=2) and shares[3] == "100"
 
 
 def test_messages_are_not_doubled_by_a_second_run(

@@ -1,0 +1,105 @@
+"""Where the time goes: phases, kernels, input and output, as Chrome trace-event JSON.
+
+Trace viewers (chrome://tracing, Perfetto, speedscope) open the file. Nothing is recorded, and next to no
+time is lost, outside `recording`. A process has one recorder, which all its threads write into.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, TextIO
+
+from hugin_abflow.errors import OutputError
+from hugin_abflow.progress import Advance, Progress
+
+# What is told of: steps of a run; work on the device; files; copies between host and device.
+PHASE, KERNEL, FILE, TRANSFER = "phase", "kernel", "file", "transfer"
+
+_recorder: _Recorder | None = None
+
+
+class _Recorder:
+    """Events of one run; times are in seconds of `time.perf_counter`."""
+
+    def __init__(self) -> None:
+        self._events: list[dict[str, Any]] = []
+        self._lanes: dict[str, int] = {}
+        self._lock = threading.Lock()
+
+    def add(self, name: str, kind: str, start: float, end: float, lane: str, **details: object) -> None:
+        with self._lock:
+            number = self._lanes.setdefault(lane, len(self._lanes) + 1)
+            self._events.append(
+                {
+                    "name": name, "cat": kind, "ph": "X", "ts": start * 1e6, "dur": (end - start) * 1e6,
+                    "pid": os.getpid(), "tid": number, "args": details,
+                }
+            )  # fmt: skip
+
+    def write(self, file: TextIO) -> None:
+        names = [
+            {"name": "thread_name", "ph": "M", "pid": os.getpid(), "tid": number, "args": {"name": lane}}
+            for lane, number in self._lanes.items()
+        ]
+        json.dump({"traceEvents": names + self._events, "displayTimeUnit": "ms"}, file)
+
+
+@contextmanager
+def recording(path: Path | None) -> Iterator[None]:
+    """Record what happens inside, also what fails, into the file `path`; None: do nothing.
+
+    Raises `OutputError` if the file cannot be written.
+    """
+    global _recorder
+    if path is None:
+        yield
+        return
+    try:
+        file = path.open("w", encoding="utf-8")  # now: a run may be long
+    except OSError as error:
+        raise OutputError(f"the profile {path} cannot be written: {error.strerror}; name another") from None
+    with file:
+        recorder = _recorder = _Recorder()
+        try:
+            yield
+        finally:
+            _recorder = None
+            recorder.write(file)
+
+
+def is_recording() -> bool:
+    """Whether what is added now is kept."""
+    return _recorder is not None
+
+
+def add(name: str, kind: str, start: float, end: float, lane: str, **details: object) -> None:
+    """Record what lasted from `start` to `end`, in seconds of `time.perf_counter`."""
+    if _recorder is not None:
+        _recorder.add(name, kind, start, end, lane, **details)
+
+
+@contextmanager
+def span(name: str, kind: str, **details: object) -> Iterator[None]:
+    """Record how long the block takes, in the lane of its thread."""
+    start = time.perf_counter()
+    try:
+        yield
+    finally:
+        add(name, kind, start, time.perf_counter(), threading.current_thread().name, **details)
+
+
+def phases(progress: Progress) -> Progress:
+    """The same progress, whose phases are recorded."""
+
+    @contextmanager
+    def phase(name: str, total: int) -> Iterator[Advance]:
+        with span(name, PHASE, total=total), progress(name, total) as advance:
+            yield advance
+
+    return phase

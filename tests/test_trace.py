@@ -1,0 +1,123 @@
+"""The profile: what a trace viewer needs is there, true, and only where it was asked for."""
+
+from __future__ import annotations
+
+import json
+import threading
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from layer_files import write_layer
+
+from hugin_abflow import cli, trace
+from hugin_abflow.errors import ExitCode, OutputError
+from hugin_abflow.opencl import Device
+
+CANVAS = (200, 100)
+
+
+def events(path: Path) -> list[dict[str, Any]]:
+    """The spans of a trace, each with the name of its lane."""
+    found = json.loads(path.read_text("utf-8"))["traceEvents"]
+    lanes = {event["tid"]: event["args"]["name"] for event in found if event["ph"] == "M"}
+    return [event | {"lane": lanes[event["tid"]]} for event in found if event["ph"] == "X"]
+
+
+def end(event: dict[str, Any]) -> float:
+    return float(event["ts"] + event["dur"])
+
+
+def project(folder: Path) -> Path:
+    """A project of two layers, which are there."""
+    random = np.random.default_rng(1)
+    for k, left in enumerate((0, 80)):
+        pixels = random.integers(0, 256, (CANVAS[1], 120, 4), np.uint8)
+        pixels[..., 3] = 255
+        write_layer(folder / f"pano{k:04d}.tif", pixels, left, 0, CANVAS)
+    path = folder / "pano.pto"
+    path.write_text(f'p f0 w{CANVAS[0]} h{CANVAS[1]} v50 n"TIFF_m"\nm i0\n' + 'i w9 h9 f0 v50 n"a.jpg"\n' * 2)
+    return path
+
+
+def test_nothing_is_kept_unless_asked_for(tmp_path: Path) -> None:
+    assert not trace.is_recording()
+    with trace.recording(None), trace.span("a", trace.FILE):
+        assert not trace.is_recording()
+    with trace.recording(tmp_path / "trace.json"):
+        assert trace.is_recording()
+    assert not trace.is_recording()
+    assert events(tmp_path / "trace.json") == []
+
+
+def test_spans_of_threads_have_lanes_of_their_own(tmp_path: Path) -> None:
+    def work() -> None:
+        with trace.span("inside", trace.FILE, rows=7):
+            pass
+
+    with trace.recording(tmp_path / "trace.json"), trace.span("outside", trace.PHASE):
+        thread = threading.Thread(target=work, name="decoder")
+        thread.start()
+        thread.join()
+    inside, outside = events(tmp_path / "trace.json")
+    assert (inside["name"], inside["cat"], inside["lane"]) == ("inside", "file", "decoder")
+    assert inside["args"] == {"rows": 7}
+    assert inside["tid"] != outside["tid"]
+    assert outside["ts"] <= inside["ts"] <= end(inside) <= end(outside)
+
+
+def test_what_fails_is_recorded_too(tmp_path: Path) -> None:
+    with pytest.raises(OSError, match="mine"), trace.recording(tmp_path / "t"), trace.span("a", trace.FILE):
+        raise OSError("mine")
+    assert [event["name"] for event in events(tmp_path / "t")] == ["a"]
+
+
+def test_kernels_are_recorded_on_the_hosts_clock(tmp_path: Path) -> None:
+    with trace.recording(tmp_path / "trace.json"):
+        device = Device()
+        with trace.span("all", trace.PHASE):
+            mask = device.zeros((65, 129), np.uint8)
+            pixels = device.zeros((65, 129, 4))
+            grid = (129, 65, 0, 0)
+            device.run("coefficient", "coefficient_mask", grid[:2], pixels, grid[:2] * 2, grid, grid, mask)
+            mask.get()
+    found = {event["name"]: event for event in events(tmp_path / "trace.json")}
+    assert list(found) == ["coefficient_mask", "download", "all"]
+    assert [event["cat"] for event in found.values()] == ["kernel", "transfer", "phase"]
+    assert found["coefficient_mask"]["lane"] == found["download"]["lane"] == "device"
+    slack = 1e3  # us: clocks are compared once
+    assert found["all"]["ts"] - slack <= found["coefficient_mask"]["ts"]
+    assert end(found["coefficient_mask"]) <= found["download"]["ts"] + slack
+    assert end(found["download"]) <= end(found["all"]) + slack
+
+
+def test_a_run_tells_phases_kernels_and_files(tmp_path: Path) -> None:
+    profile = tmp_path / "profile.json"
+    arguments = [str(project(tmp_path)), "--prefix", "pano", "-o", str(tmp_path / "out.tif")]
+    assert cli.main([*arguments, "--profile", str(profile)]) == 0
+    found = events(profile)
+    phases = {event["name"]: event for event in found if event["cat"] == "phase"}
+    assert list(phases) == ["read", "flow", "align", "blend"]
+    for kind, name, phase in (
+        ("kernel", "working_reduce", "read"),
+        ("kernel", "flow_relax", "flow"),
+        ("kernel", "blend_band", "blend"),
+        ("file", "encode", "blend"),
+    ):
+        (*_, event) = (event for event in found if (event["cat"], event["name"]) == (kind, name))
+        assert phases[phase]["ts"] <= event["ts"], name
+    decoded = [event for event in found if event["name"] == "decode"]
+    assert {event["args"]["file"] for event in decoded} == {"pano0000.tif", "pano0001.tif"}
+    starts = sorted(event["ts"] for event in decoded)
+    assert starts[0] < end(phases["read"]) < phases["blend"]["ts"] < starts[-1]
+
+
+def test_a_profile_that_cannot_be_written_ends_the_run_before_it_starts(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(OutputError, match="cannot be written"), trace.recording(tmp_path):
+        raise AssertionError
+    assert cli.main([str(project(tmp_path)), "--profile", str(tmp_path)]) == ExitCode.OUTPUT
+    assert "name another" in capsys.readouterr().err
+    assert not (tmp_path / "pano.tif").exists()
