@@ -14,11 +14,11 @@ from hugin_abflow import trace
 from hugin_abflow.errors import AbflowError, ExitCode
 from hugin_abflow.images import COMPRESSIONS
 from hugin_abflow.merge import merge_project
+from hugin_abflow.metadata import PROGRAM, version
 from hugin_abflow.nona import Remap
 from hugin_abflow.opencl import list_devices
 from hugin_abflow.settings import FlowQuality, MergeMode, Settings
 from hugin_abflow.terminal import (
-    PROGRAM,
     catching,
     complain,
     display_progress,
@@ -27,7 +27,6 @@ from hugin_abflow.terminal import (
     phase_table,
     print_path,
     say,
-    version,
 )
 
 EXIT_CODES = {
@@ -157,6 +156,12 @@ _information = partial(click.option, cls=_Option, group="Information")
     type=click.IntRange(1, 100),
     help="JPEG quality. [default: the project's]",
 )
+@_result(
+    "--no-metadata",
+    is_flag=True,
+    help="Write no camera, date and place of the first photo, and nothing that tells viewers of 360-degree "
+    "panoramas how to show it.",
+)
 @_layers(
     "--prefix",
     metavar="PREFIX",
@@ -273,6 +278,7 @@ def command(
     output: Path | None,
     compression: str | None,
     jpeg_quality: int | None,
+    no_metadata: bool,
     prefix: str | None,
     layers: tuple[Path, ...],
     remap: Remap,
@@ -328,6 +334,7 @@ def command(
         keep_layers=keep_layers,
         compression=compression,
         jpeg_quality=jpeg_quality,
+        metadata=not no_metadata,
     )
     codes = []
     with messages(logging.INFO if verbose else logging.WARNING), trace.recording(profile):

@@ -21,6 +21,7 @@ import OpenImageIO as oiio  # noqa: N813
 
 from hugin_abflow import tifftags, trace
 from hugin_abflow.errors import OutputError
+from hugin_abflow.exif import Metadata, embed
 from hugin_abflow.layer import full_scale
 
 Pixels = npt.NDArray[Any]
@@ -85,6 +86,7 @@ class ImageWriter:
                     warning. EXR: none, rle, zips, zip (default), piz. JPEG and PNG: not used.
     jpeg_quality    1..100, default 90 as Hugin's.
     icc             profile, carried as it is; PNG leaves a broken one out, with a warning.
+    metadata        EXIF and XMP; of EXR what OpenImageIO carries, as its attributes.
 
     The attribute `compression` says what is really used. JPEG loses alpha: laid over black.
     Raises `OutputError` for an unknown ending, a depth or size the format cannot hold, an unwritable
@@ -105,8 +107,9 @@ class ImageWriter:
         compression: str | None = None,
         jpeg_quality: int | None = None,
         canvas_size: tuple[int, int] | None = None,
+        metadata: Metadata | None = None,
     ) -> None:
-        self.path = Path(path)
+        self.path, self.metadata = Path(path), metadata
         self.width, self.height, self.channels, self.dtype = width, height, channels, np.dtype(dtype)
         self.format = _format_of(self.path)
         self.stored = _stored_dtype(self.path, self.format, self.dtype, depth)
@@ -149,6 +152,11 @@ class ImageWriter:
             if canvas_size is not None:
                 spec.full_x, spec.full_y = 0, 0
                 spec.full_width, spec.full_height = canvas_size
+            for name, value in self.metadata.attributes().items() if self.metadata else ():
+                if isinstance(value, str):
+                    spec[name] = value
+                else:
+                    spec.attribute(name, f"float[{len(value)}]", value)
         elif self.format == "png":
             spec["png:compressionLevel"] = _PNG_LEVEL
         elif self.format == "jpeg":
@@ -266,6 +274,8 @@ class ImageWriter:
         try:
             if self.format == "tiff":
                 tifftags.drop_tag(self._part, tifftags.DATE_TIME)
+            if self.metadata:
+                embed(self._part, self.format, self.metadata)
             self._part.replace(self._final)
         except OSError as error:
             raise self._failure(error.strerror or str(error)) from None

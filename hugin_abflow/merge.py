@@ -14,9 +14,11 @@ import numpy.typing as npt
 
 from hugin_abflow import joint, sequential
 from hugin_abflow.errors import LayersMissingError, OutputError
+from hugin_abflow.exif import Metadata
 from hugin_abflow.guides import Guide
 from hugin_abflow.images import ENDINGS, ImageWriter
 from hugin_abflow.layer import Canvas, Layer
+from hugin_abflow.metadata import describe
 from hugin_abflow.nona import Remap, check_layers, open_layers
 from hugin_abflow.opencl import Device
 from hugin_abflow.pano_trafo import images_of, read_guides
@@ -43,6 +45,7 @@ def merge_project(
     keep_layers: bool = False,
     compression: str | None = None,
     jpeg_quality: int | None = None,
+    metadata: bool = True,
     progress: Progress = silent,
 ) -> Path:
     """Turn a Hugin project into a panorama; returns its file.
@@ -51,6 +54,7 @@ def merge_project(
     prefix, layers, remap, keep_layers    where the layers come from, see `nona.open_layers`.
     compression, jpeg_quality    of the file, see `images.ImageWriter`; default: the project's, if the output
                     has the project's format.
+    metadata        write EXIF and, for viewers of 360-degree panoramas, GPano; see `metadata.describe`.
 
     The file appears when it is complete; inputs are never touched. Raises the `AbflowError` family:
     what the project, its layers, the device or the output can get wrong.
@@ -67,7 +71,8 @@ def merge_project(
         write_panorama(
             target, opened, plan.canvas, settings, projection=plan.projection,
             guides=partial(guides_between, plan, opened, settings),
-            compression=compression, jpeg_quality=jpeg_quality, progress=progress,
+            compression=compression, jpeg_quality=jpeg_quality,
+            metadata=describe(plan) if metadata else None, progress=progress,
         )  # fmt: skip
     return target
 
@@ -84,6 +89,7 @@ def write_panorama(
     depth: npt.DTypeLike | None = None,
     compression: str | None = None,
     jpeg_quality: int | None = None,
+    metadata: Metadata | None = None,
     progress: Progress = silent,
 ) -> None:
     """Merge layers that fit the canvas into a file, which appears when it is complete.
@@ -91,7 +97,7 @@ def write_panorama(
     projection      of the canvas, in words.
     guides          gives the places that layers have in common; asked once the file can be written.
     method          merges the layers; default: what `settings.merge` says.
-    depth, compression, jpeg_quality    of the file, see `images.ImageWriter`.
+    depth, compression, jpeg_quality, metadata    of the file, see `images.ImageWriter`.
 
     Raises `OutputError`, `ImageReadError` (a layer cannot be decoded), `DeviceError`.
     """
@@ -99,7 +105,7 @@ def write_panorama(
     with ImageWriter(
         target, crop.width, crop.height, first.channels, first.dtype, depth=depth,
         offset=(crop.left, crop.top), canvas_size=(canvas.width, canvas.height), icc=first.icc,
-        compression=compression, jpeg_quality=jpeg_quality,
+        compression=compression, jpeg_quality=jpeg_quality, metadata=metadata,
     ) as writer:  # fmt: skip
         _report(canvas, projection, layers, writer)
         _write(writer, _bands(layers, canvas, settings, progress, guides(), method))

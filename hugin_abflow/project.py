@@ -22,7 +22,7 @@ WRAPPING = frozenset({1, 2, 5, 8, 11, 13})
 
 # libpano's names of output projections, by the p-line's f.
 _PROJECTIONS = (
-    "rectilinear", "cylindrical", "equirectangular", "full-frame fisheye", "stereographic", "Mercator",
+    "rectilinear", "cylindrical", "equirectangular", "fisheye", "stereographic", "Mercator",
     "transverse Mercator", "sinusoidal", "Lambert cylindrical equal-area", "Lambert azimuthal equal-area",
     "Albers conic equal-area", "Miller cylindrical", "Panini", "architectural", "orthographic", "equisolid",
     "equirectangular Panini", "biplane", "triplane", "general Panini", "Thoby", "Hammer-Aitoff",

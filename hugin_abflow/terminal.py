@@ -15,24 +15,14 @@ import traceback
 from collections.abc import Iterator
 from contextlib import AbstractContextManager, contextmanager, suppress
 from functools import partial
-from importlib import metadata
 from pathlib import Path
 from types import FrameType
 
 import click
 
 from hugin_abflow.errors import AbflowError, ExitCode
+from hugin_abflow.metadata import PROGRAM
 from hugin_abflow.progress import Advance, Progress, silent
-
-PROGRAM = "hugin-abflow"
-
-
-def version() -> str:
-    """The version of the installed package."""
-    try:
-        return metadata.version(PROGRAM)
-    except metadata.PackageNotFoundError:
-        return "(run from its source, not installed)"
 
 
 def say(text: str) -> None:

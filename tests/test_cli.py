@@ -69,6 +69,7 @@ def test_defaults_are_those_of_settings(calls: Calls) -> None:
         "keep_layers": False,
         "compression": None,
         "jpeg_quality": None,
+        "metadata": True,
     }
 
 

@@ -15,19 +15,18 @@ from hugin_abflow.guides import Guide
 from hugin_abflow.images import read_layers
 from hugin_abflow.layer import Box, Canvas, Layer, bounding_box
 from hugin_abflow.merge import guides_between, refuse_input, write_panorama
+from hugin_abflow.metadata import PROGRAM, describe, version
 from hugin_abflow.nona import check_layers
 from hugin_abflow.progress import Progress
 from hugin_abflow.project import read_plan
 from hugin_abflow.settings import Settings
 from hugin_abflow.terminal import (
-    PROGRAM,
     catching,
     complain,
     display_progress,
     interruptible,
     messages,
     say,
-    version,
 )
 
 NAME = "abflow-enblend"
@@ -81,10 +80,12 @@ def blend(request: Request, progress: Progress) -> None:
     layers = _read(request)
     refuse_input(request.output, request.inputs)
     guides: Callable[[], Sequence[Guide]] = tuple
+    metadata = None
     if request.project:
         plan = read_plan(request.project)
         canvas = replace(plan.canvas, crop=request.crop or bounding_box(layers))
         projection, guides = plan.projection, partial(guides_between, plan, layers, Settings())
+        metadata = describe(replace(plan, canvas=canvas))
     else:
         canvas = _canvas(layers, request.crop, request.wraps)
         projection = "taken as equirectangular" if canvas.spherical else "taken as flat"
@@ -95,7 +96,7 @@ def blend(request: Request, progress: Progress) -> None:
         depth=request.depth, jpeg_quality=request.jpeg_quality,
         # what the others call compression is not what enblend's option means
         compression=request.compression if request.output.suffix.lower() in (".tif", ".tiff") else None,
-        progress=progress,
+        metadata=metadata, progress=progress,
     )  # fmt: skip
 
 

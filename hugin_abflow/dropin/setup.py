@@ -11,7 +11,8 @@ from pathlib import Path, PureWindowsPath
 from hugin_abflow.dropin import wxconfig
 from hugin_abflow.dropin.places import Places, our_places, program
 from hugin_abflow.errors import ExitCode, SetupError
-from hugin_abflow.terminal import catching, version
+from hugin_abflow.metadata import version
+from hugin_abflow.terminal import catching
 
 NAME = "hugin-abflow-setup"
 _GROUP = "Enblend"

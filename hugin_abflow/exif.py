@@ -1,0 +1,210 @@
+"""EXIF and XMP in image files: read from photos, put into panoramas.
+
+Both are put into a file that is whole otherwise, by writing at its end (TIFF) or by moving what follows
+(JPEG, PNG); no pixel is decoded, and no other program is needed. Formats: CIPA DC-008 (Exif 2.32), Adobe's
+XMP specification part 3, the PNG specification (third edition).
+"""
+
+from __future__ import annotations
+
+import struct
+import zlib
+from dataclasses import dataclass
+from io import SEEK_CUR, SEEK_END, BytesIO
+from pathlib import Path
+from typing import BinaryIO
+
+from hugin_abflow import tifftags
+from hugin_abflow.tifftags import ASCII, EXIF, GPS, MAIN, SHORT, UNDEFINED, Directories, Value
+
+XMP_TAG = 700  # of TIFF
+_PNG = b"\x89PNG\r\n\x1a\n"
+_EXIF_MARK, _XMP_MARK = b"Exif\0\0", b"http://ns.adobe.com/xap/1.0/\0"  # of JPEG's APP1
+_SCAN, _APP0, _APP1 = 0xDA, 0xE0, 0xE1
+_LONGEST = 65533  # bytes of a JPEG segment
+_BLOCK = 16 << 20  # bytes that are moved at a time
+_NOT_IN_TIFF = (40962, 40963)  # PixelXDimension, PixelYDimension
+# What EXIF must have in JPEG, and only there: ComponentsConfiguration (Y, Cb, Cr), YCbCrPositioning.
+_JPEG_TAGS = {
+    MAIN: {531: Value(SHORT, b"\1\0")},
+    EXIF: {37121: Value(UNDEFINED, b"\1\2\3\0")},
+}
+# What OpenEXR's files name otherwise than by the tag's number; by directory.
+_EXR_NAMES = {
+    MAIN: {
+        270: "ImageDescription", 271: "Make", 272: "Model", 305: "Software", 306: "DateTime", 315: "Artist",
+        33432: "Copyright",
+    },
+    EXIF: {
+        36867: "Exif:DateTimeOriginal", 36868: "Exif:DateTimeDigitized", 42035: "Exif:LensMake",
+        42036: "Exif:LensModel",
+    },
+    GPS: {1: "GPS:LatitudeRef", 2: "GPS:Latitude", 3: "GPS:LongitudeRef", 4: "GPS:Longitude"},
+}  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Metadata:
+    """What a file says of its picture beside pixels, place and profile.
+
+    exif    tags and their values, by directory.
+    xmp     an XMP packet; empty: none.
+    """
+
+    exif: Directories
+    xmp: bytes = b""
+
+    def attributes(self) -> dict[str, str | tuple[float, ...]]:
+        """What EXR holds, by OpenImageIO's names: texts, and degrees, minutes, seconds."""
+        found: dict[str, str | tuple[float, ...]] = {}
+        for directory, names in _EXR_NAMES.items():
+            for tag, value in self.exif.get(directory, {}).items():
+                if tag in names and value.kind == ASCII:
+                    found[names[tag]] = text_of(value)
+                elif tag in names and len(value.data) == 24:
+                    parts = struct.unpack("<6I", value.data)
+                    pairs = zip(parts[::2], parts[1::2], strict=True)
+                    found[names[tag]] = tuple(top / (bottom or 1) for top, bottom in pairs)
+        return found
+
+
+def text(content: str) -> Value:
+    """A text as EXIF holds it."""
+    return Value(ASCII, content.encode() + b"\0")
+
+
+def text_of(value: Value) -> str:
+    """What `text` was given; also of cameras that pad it with blanks, or write Latin-1."""
+    content = value.data.split(b"\0")[0].strip()
+    try:
+        return content.decode()
+    except UnicodeDecodeError:
+        return content.decode("latin-1")
+
+
+def comment(content: str) -> Value:
+    """A text as the tag UserComment holds it."""
+    if content.isascii():
+        return Value(UNDEFINED, b"ASCII\0\0\0" + content.encode())
+    return Value(UNDEFINED, b"UNICODE\0" + content.encode("utf-16-le"))
+
+
+def comment_of(value: Value | None) -> str:
+    """The text of a UserComment; empty where there is none, or none that can be read."""
+    if value is None:
+        return ""
+    code, content = value.data[:8], value.data[8:]
+    if code == b"UNICODE\0":
+        # in the byte order of the camera, which is forgotten: mostly letters below 256
+        big = content[0::2].count(0) > content[1::2].count(0)
+        return content.decode("utf-16-be" if big else "utf-16-le", "ignore").strip("\0 \ufeff")
+    if code in (b"ASCII\0\0\0", bytes(8)):
+        return text_of(Value(ASCII, content))
+    return ""
+
+
+def read_exif(path: Path) -> dict[int, dict[int, Value]]:
+    """The EXIF tags of a JPEG, TIFF or PNG file; none where there are none, or none that can be read."""
+    try:
+        with path.open("rb") as file:
+            mark = file.read(8)
+            if mark[:2] == b"\xff\xd8":
+                block = _find_in_jpeg(file)
+            elif mark == _PNG:
+                block = _find_in_png(file)
+            else:
+                file.seek(0)
+                return tifftags.read_directories(file)
+        return tifftags.read_directories(BytesIO(block)) if block else {}
+    except (OSError, struct.error, OverflowError, ValueError):
+        return {}
+
+
+def _find_in_jpeg(file: BinaryIO) -> bytes:
+    """The EXIF block of a JPEG file."""
+    file.seek(2)
+    while True:
+        mark, kind, length = struct.unpack(">BBH", file.read(4))
+        if mark != 0xFF or kind == _SCAN:
+            return b""
+        content = file.read(length - 2)
+        if kind == _APP1 and content.startswith(_EXIF_MARK):
+            return content[len(_EXIF_MARK) :]
+
+
+def _find_in_png(file: BinaryIO) -> bytes:
+    """The EXIF block of a PNG file."""
+    file.seek(len(_PNG))
+    while head := file.read(8):
+        length, kind = struct.unpack(">I4s", head)
+        if kind == b"eXIf":
+            return file.read(length)
+        file.seek(length + 4, SEEK_CUR)
+    return b""
+
+
+def embed(path: Path, format_name: str, metadata: Metadata) -> None:
+    """Put metadata into a panorama's file: OpenImageIO's "tiff", "jpeg" or "png"; others are left alone.
+
+    TIFF may be BigTIFF. Raises `OSError`, such as for a full disk.
+    """
+    if format_name == "tiff":
+        main = dict(metadata.exif.get(MAIN, {}))
+        if metadata.xmp:
+            main[XMP_TAG] = Value(1, metadata.xmp)
+        exif = {tag: value for tag, value in metadata.exif.get(EXIF, {}).items() if tag not in _NOT_IN_TIFF}
+        tifftags.add_directories(path, {**metadata.exif, MAIN: main, EXIF: exif})
+    elif format_name == "jpeg":
+        _insert_in_jpeg(path, metadata)
+    elif format_name == "png":
+        _insert_in_png(path, metadata)
+
+
+def _insert_in_jpeg(path: Path, metadata: Metadata) -> None:
+    """Behind JFIF's segment, which claims the first place.
+
+    Here and in PNG: one block of EXIF is allowed, so an empty one that OpenImageIO writes is replaced.
+    """
+    exif = {key: {**metadata.exif.get(key, {}), **tags} for key, tags in _JPEG_TAGS.items()}
+    block = _EXIF_MARK + tifftags.pack_directories({**metadata.exif, **exif})
+    segments = b""
+    for content in (block, _XMP_MARK + metadata.xmp if metadata.xmp else b""):
+        if 0 < len(content) <= _LONGEST:
+            segments += struct.pack(">BBH", 0xFF, _APP1, len(content) + 2) + content
+    with path.open("r+b") as file:
+        empty = len(_find_in_jpeg(file))
+        replaced = empty + 4 + len(_EXIF_MARK) if empty else 0
+        if not empty:
+            file.seek(2)
+            mark, kind, length = struct.unpack(">BBH", file.read(4))
+            file.seek(2 + (2 + length if (mark, kind) == (0xFF, _APP0) else 0))
+        _insert(file, file.tell() - replaced, segments, replaced)
+
+
+def _insert_in_png(path: Path, metadata: Metadata) -> None:
+    """Before the pixels: behind them, readers may overlook it."""
+    chunks = _chunk(b"eXIf", tifftags.pack_directories(metadata.exif))
+    if metadata.xmp:
+        chunks += _chunk(b"iTXt", b"XML:com.adobe.xmp\0\0\0\0\0" + metadata.xmp)
+    with path.open("r+b") as file:
+        empty = len(_find_in_png(file))
+        at = file.tell() - empty - 8 if empty else len(_PNG) + 25
+        _insert(file, at, chunks, replaced=empty + 12 if empty else 0)
+
+
+def _chunk(kind: bytes, content: bytes) -> bytes:
+    return struct.pack(">I", len(content)) + kind + content + struct.pack(">I", zlib.crc32(kind + content))
+
+
+def _insert(file: BinaryIO, at: int, data: bytes, replaced: int = 0) -> None:
+    """Put `data` into a file at `at`, in place of as many bytes as are `replaced`, which are fewer."""
+    end = file.seek(0, SEEK_END)
+    while end > at + replaced:
+        start = max(at + replaced, end - _BLOCK)
+        file.seek(start)
+        block = file.read(end - start)
+        file.seek(start - replaced + len(data))
+        file.write(block)
+        end = start
+    file.seek(at)
+    file.write(data)
