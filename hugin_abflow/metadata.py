@@ -84,7 +84,7 @@ def describe(plan: Plan) -> Metadata:
     """
     photo = plan.images[0].photo
     found = read_exif(photo)
-    if not found:
+    if not found and photo.is_file():
         _log.info("%s: no EXIF to copy into the panorama", photo)
     chosen = {
         directory: {tag: found[directory][tag] for tag in tags if tag in found.get(directory, {})}
