@@ -91,7 +91,8 @@ def _describe(path: Path, name: str, page: int, source: Any, place: tifftags.Pla
     _refuse_unusable(path, spec)
     left, top, canvas = spec.x, spec.y, None
     if place is not None:
-        left, top, canvas = place.x, place.y, place.canvas
+        # of several pages, nona gives the crop's size for the canvas's, and places on the canvas all the same
+        left, top, canvas = place.x, place.y, None if place.paged else place.canvas
     elif source.format_name() == "openexr" and spec.full_x == 0 and spec.full_y == 0:
         canvas = spec.full_width, spec.full_height
     rows = _Rows(path, page, spec)
