@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
@@ -10,28 +9,21 @@ from typing import Any, get_args
 
 import click
 
-from hugin_abflow import trace
+from hugin_abflow.batch.queue import find_projects
+from hugin_abflow.batch.run import Run, default_jobs, run
+from hugin_abflow.batch.task import Task
 from hugin_abflow.errors import AbflowError, ExitCode
 from hugin_abflow.images import COMPRESSIONS
-from hugin_abflow.merge import merge_project
 from hugin_abflow.metadata import PROGRAM, version
 from hugin_abflow.nona import Remap
 from hugin_abflow.opencl import list_devices
+from hugin_abflow.options import ARGUMENTS, Command, Option
 from hugin_abflow.settings import FlowQuality, MergeMode, Settings
-from hugin_abflow.terminal import (
-    catching,
-    complain,
-    display_progress,
-    interruptible,
-    messages,
-    phase_table,
-    print_path,
-    say,
-)
+from hugin_abflow.terminal import complain, interruptible, say
 
 EXIT_CODES = {
     ExitCode.OK: "every panorama was written",
-    ExitCode.FAILED: "any other error; with several projects: all failed, for different reasons",
+    ExitCode.FAILED: "any other error",
     ExitCode.USAGE: "the command line is wrong",
     ExitCode.PROJECT: "the project cannot be read, or makes no panorama",
     ExitCode.LAYERS_MISSING: "layers or photos are missing",
@@ -41,6 +33,7 @@ EXIT_CODES = {
     ExitCode.NONA: "nona is missing, or failed",
     ExitCode.DEVICE: "no usable OpenCL device",
     ExitCode.PARTIAL: "several projects: some succeeded, some failed",
+    ExitCode.ALL_FAILED: "several projects: all failed",
     ExitCode.INTERRUPTED: "interrupted (Ctrl-C, SIGTERM); nothing half-written is left",
 }
 
@@ -49,66 +42,10 @@ EXAMPLES = (
     ("hugin-abflow -o harbour.jpg --jpeg-quality 92 harbour.pto", "choose name and type"),
     ("hugin-abflow --prefix harbour harbour.pto", "use harbour0000.tif, harbour0001.tif ..."),
     ("hugin-abflow harbour.pto --layers a.tif b.tif c.tif", "use these layers"),
-    ("hugin-abflow */*.pto", "one panorama for each project"),
+    ("hugin-abflow --recursive shoot", "one panorama for each project in a folder and its folders"),
 )
 
 _DEFAULTS = Settings()
-
-
-class _Option(click.Option):
-    """An option that appears in --help under the heading `group`."""
-
-    def __init__(self, *arguments: Any, group: str, **keywords: Any) -> None:
-        super().__init__(*arguments, **keywords)
-        self.group = group
-
-
-class _Command(click.Command):
-    """A command whose help has headings, and whose `--layers` takes several files."""
-
-    def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
-        """Parse `args` after spreading `--layers`."""
-        return super().parse_args(ctx, spread_layers(args))
-
-    def format_options(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
-        """Write the options, a section for each group in order of first appearance."""
-        groups: dict[str, list[tuple[str, str]]] = {}
-        for parameter in self.get_params(ctx):
-            record = parameter.get_help_record(ctx)
-            if record is not None and isinstance(parameter, click.Option):
-                groups.setdefault(getattr(parameter, "group", "Information"), []).append(record)
-        for heading, records in groups.items():
-            with formatter.section(heading):
-                formatter.write_dl(records)
-
-    def format_epilog(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
-        """Write examples and exit codes."""
-        with formatter.section("Examples"):
-            for example, effect in EXAMPLES:
-                formatter.write(f"  {example}\n      {effect}\n")
-        with formatter.section("Exit codes"):
-            formatter.write_dl([(str(int(code)), text) for code, text in EXIT_CODES.items()])
-
-
-def spread_layers(arguments: Sequence[str]) -> list[str]:
-    """Write ``--layers a b`` as ``--layers a --layers b``, the only form that click understands.
-
-    The list ends at the next option, at ``--`` and at a name that ends in .pto: that is a project.
-    """
-    spread: list[str] = []
-    remaining = iter(arguments)
-    listing = False
-    for argument in remaining:
-        if argument == "--":
-            return [*spread, argument, *remaining]
-        if argument.startswith("-") and argument != "-":
-            listing = argument == "--layers" or argument.startswith("--layers=")
-        elif argument.lower().endswith(".pto"):
-            listing = False
-        elif listing and spread[-1] != "--layers":
-            spread.append("--layers")
-        spread.append(argument)
-    return spread
 
 
 def _print_devices(context: click.Context, parameter: click.Parameter, wanted: bool) -> None:
@@ -128,13 +65,14 @@ def _names_of_compressions() -> str:
 
 
 _file = click.Path(path_type=Path)
-_layers = partial(click.option, cls=_Option, group="Layers")
-_blending = partial(click.option, cls=_Option, group="Blending", show_default=True)
-_result = partial(click.option, cls=_Option, group="Result")
-_information = partial(click.option, cls=_Option, group="Information")
+_layers = partial(click.option, cls=Option, group="Layers")
+_blending = partial(click.option, cls=Option, group="Blending", show_default=True)
+_result = partial(click.option, cls=Option, group="Result")
+_batch = partial(click.option, cls=Option, group="Many projects")
+_information = partial(click.option, cls=Option, group="Information")
 
 
-@click.command(cls=_Command, add_help_option=False)
+@click.command(cls=Command, examples=EXAMPLES, exit_codes=EXIT_CODES, add_help_option=False)
 @click.argument("projects", metavar="PROJECT...", nargs=-1, required=True, type=_file)
 @_result(
     "-o",
@@ -253,6 +191,21 @@ _information = partial(click.option, cls=_Option, group="Information")
     help="The OpenCL device: its number in --list-devices, or a part of its name. "
     "[default: the fastest GPU, else the CPU]",
 )
+@_batch("--recursive", is_flag=True, help="Look for projects in the folders of folders, too.")
+@_batch(
+    "--jobs",
+    metavar="N",
+    type=click.IntRange(1, 64),
+    help="Projects at a time, 1 to 64: while one computes, layers of the next are made. "
+    f"[default: {default_jobs()}, or as many as there are processor cores]",
+)
+@_batch(
+    "--report",
+    metavar="FILE",
+    type=_file,
+    help="Write what became of each project, with times and figures, into FILE, as JSON.",
+)
+@_batch("--log", metavar="FILE", type=_file, help="Add all messages, with the time, to the end of FILE.")
 @_information(
     "--list-devices",
     is_flag=True,
@@ -275,14 +228,40 @@ _information = partial(click.option, cls=_Option, group="Information")
 @click.help_option("-h", "--help", help="Show this help and exit.")
 def command(
     projects: tuple[Path, ...],
-    output: Path | None,
-    compression: str | None,
-    jpeg_quality: int | None,
+    recursive: bool,
+    jobs: int | None,
+    report: Path | None,
+    log: Path | None,
+    quiet: bool,
+    verbose: bool,
+    profile: Path | None,
+    **chosen: Any,
+) -> ExitCode:
+    """Blend the photos of Hugin projects into panoramas, by optical flow.
+
+    PROJECT is a .pto file as Hugin saves it, or a folder of such files. Its photos must already be aligned;
+    they are remapped with Hugin's nona where no layers are at hand. Things that stand in different places in
+    two photos, because the camera moved, are brought together where the photos overlap instead of being cut
+    or shown twice.
+
+    The names of the panoramas are printed, a line each.
+    """
+    if quiet and verbose:
+        raise click.UsageError("-q and -v contradict each other")
+    options = _options(**chosen)
+    found = find_projects(projects, recursive)
+    if len(found) > 1 and (options["output"] or options["layers"]):
+        option = "-o" if options["output"] else "--layers"
+        raise click.UsageError(f"{option} is for one project, but there are {len(found)}")
+    how = Run(jobs, report, log, quiet, verbose, _arguments(), profile)
+    return run([Task(project, options) for project in found], how)
+
+
+def _options(
+    *,
     no_metadata: bool,
     prefix: str | None,
     layers: tuple[Path, ...],
-    remap: Remap,
-    keep_layers: bool,
     merge: MergeMode,
     exposure: str,
     guides: str,
@@ -293,25 +272,11 @@ def command(
     no_flow: bool,
     flow_quality: FlowQuality,
     device: str | None,
-    quiet: bool,
-    verbose: bool,
-    profile: Path | None,
-) -> ExitCode:
-    """Blend the photos of Hugin projects into panoramas, by optical flow.
-
-    PROJECT is a .pto file as Hugin saves it. Its photos must already be aligned; they are remapped with
-    Hugin's nona where no layers are at hand. Things that stand in different places in two photos, because the
-    camera moved, are brought together where the photos overlap instead of being cut or shown twice.
-
-    The names of the panoramas are printed, a line each.
-    """
-    if len(projects) > 1 and (output or layers):
-        option = "-o" if output else "--layers"
-        raise click.UsageError(f"{option} is for one project, but there are {len(projects)}")
+    **others: Any,
+) -> dict[str, Any]:
+    """The keywords of `merge_project` that the command's options mean; `others` are such by themselves."""
     if prefix is not None and layers:
         raise click.UsageError("--prefix and --layers both name the layers; give one of them")
-    if quiet and verbose:
-        raise click.UsageError("-q and -v contradict each other")
     settings = Settings(
         merge=merge,
         softmax_sharpness=softmax_sharpness,
@@ -324,39 +289,18 @@ def command(
         large_motion=large_motion == "on",
         device=device,
     )
-    merge_one = partial(
-        merge_project,
-        settings=settings,
-        output=output,
-        prefix=prefix,
-        layers=list(layers) or None,
-        remap=remap,
-        keep_layers=keep_layers,
-        compression=compression,
-        jpeg_quality=jpeg_quality,
-        metadata=not no_metadata,
-    )
-    codes = []
-    with messages(logging.INFO if verbose else logging.WARNING), trace.recording(profile):
-        for project in projects:
-            heading = f"{project.name}: " if len(projects) > 1 else ""
-            with (
-                catching(str(project), verbose) as failures,
-                display_progress(heading, quiet, verbose) as display,
-                phase_table(heading, trace.phases(display), verbose) as progress,
-            ):
-                panorama = merge_one(project, progress=progress)
-            if not failures and not quiet:
-                print_path(panorama)
-            codes.append(failures[0] if failures else ExitCode.OK)
-    return _combine(codes)
+    return {
+        "settings": settings,
+        "prefix": prefix,
+        "layers": list(layers) or None,
+        "metadata": not no_metadata,
+        **others,
+    }
 
 
-def _combine(codes: Sequence[ExitCode]) -> ExitCode:
-    """The exit code of a run whose projects ended with `codes`."""
-    if len(set(codes)) == 1:
-        return codes[0]
-    return ExitCode.PARTIAL if ExitCode.OK in codes else ExitCode.FAILED
+def _arguments() -> list[str]:
+    """What the command was called with, as click got it."""
+    return list(click.get_current_context().meta.get(ARGUMENTS, ()))
 
 
 def _run(arguments: Sequence[str] | None) -> int:

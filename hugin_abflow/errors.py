@@ -23,6 +23,7 @@ class ExitCode(IntEnum):
     NONA = 8  # nona is missing or failed
     DEVICE = 9  # no usable OpenCL device
     PARTIAL = 10  # several projects: some succeeded, some failed
+    ALL_FAILED = 11  # several projects: none succeeded
     INTERRUPTED = 130  # Ctrl-C
 
 

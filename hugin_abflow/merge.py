@@ -33,6 +33,8 @@ Method = Callable[
     [Device, Sequence[Layer], Canvas, Settings, Progress, Sequence[Guide]], Iterator[npt.NDArray[Any]]
 ]
 
+OpenDevice = Callable[[str | None], Device]
+
 
 def merge_project(
     path: Path | str,
@@ -47,6 +49,7 @@ def merge_project(
     jpeg_quality: int | None = None,
     metadata: bool = True,
     progress: Progress = silent,
+    open_device: OpenDevice | None = None,
 ) -> Path:
     """Turn a Hugin project into a panorama; returns its file.
 
@@ -55,6 +58,7 @@ def merge_project(
     compression, jpeg_quality    of the file, see `images.ImageWriter`; default: the project's, if the output
                     has the project's format.
     metadata        write EXIF and, for viewers of 360-degree panoramas, GPano; see `metadata.describe`.
+    open_device     gives the device that `settings.device` means; default: `Device`, a new one.
 
     The file appears when it is complete; inputs are never touched. Raises the `AbflowError` family:
     what the project, its layers, the device or the output can get wrong.
@@ -72,7 +76,7 @@ def merge_project(
             target, opened, plan.canvas, settings, projection=plan.projection,
             guides=partial(guides_between, plan, opened, settings),
             compression=compression, jpeg_quality=jpeg_quality,
-            metadata=describe(plan) if metadata else None, progress=progress,
+            metadata=describe(plan) if metadata else None, progress=progress, open_device=open_device,
         )  # fmt: skip
     return target
 
@@ -91,6 +95,7 @@ def write_panorama(
     jpeg_quality: int | None = None,
     metadata: Metadata | None = None,
     progress: Progress = silent,
+    open_device: OpenDevice | None = None,
 ) -> None:
     """Merge layers that fit the canvas into a file, which appears when it is complete.
 
@@ -98,6 +103,7 @@ def write_panorama(
     guides          gives the places that layers have in common; asked once the file can be written.
     method          merges the layers; default: what `settings.merge` says.
     depth, compression, jpeg_quality, metadata    of the file, see `images.ImageWriter`.
+    open_device     see `merge_project`.
 
     Raises `OutputError`, `ImageReadError` (a layer cannot be decoded), `DeviceError`.
     """
@@ -108,7 +114,7 @@ def write_panorama(
         compression=compression, jpeg_quality=jpeg_quality, metadata=metadata,
     ) as writer:  # fmt: skip
         _report(canvas, projection, layers, writer)
-        _write(writer, _bands(layers, canvas, settings, progress, guides(), method))
+        _write(writer, _bands(layers, canvas, settings, progress, guides(), method, open_device))
 
 
 def merge_layers(
@@ -139,9 +145,10 @@ def _bands(
     progress: Progress,
     guides: Sequence[Guide],
     method: Method | None = None,
+    open_device: OpenDevice | None = None,
 ) -> Iterator[npt.NDArray[Any]]:
     """The panorama's rows from top to bottom."""
-    device = Device(settings.device)
+    device = (open_device or Device)(settings.device)
     method = method or {"joint": joint.merge, "sequential": sequential.merge}[settings.merge]
     visible = False
     for rows in method(device, layers, canvas, settings, progress, guides):

@@ -246,7 +246,12 @@ class Device:
         self._times = _Times(self.queue) if timing else None
         self._kernels: dict[tuple[str, str, str], cl.Kernel] = {}
         self._arguments = threading.Lock()  # a kernel keeps its arguments from when they are set to its start
-        _log.info("device: %s (%s)", self.device.name.strip(), self.device.platform.name.strip())
+        _log.info("device: %s", self.name)
+
+    @property
+    def name(self) -> str:
+        """What device it is, and whose driver runs it."""
+        return f"{self.device.name.strip()} ({self.device.platform.name.strip()})"
 
     def empty(self, shape: Sequence[int], dtype: npt.DTypeLike = np.float32) -> Buffer:
         """An uninitialised array."""

@@ -12,7 +12,7 @@ import sys
 import threading
 import time
 import traceback
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager, suppress
 from functools import partial
 from pathlib import Path
@@ -51,39 +51,63 @@ def catching(task: str, verbose: bool) -> Iterator[list[ExitCode]]:
     failures: list[ExitCode] = []
     try:
         yield failures
-    except AbflowError as error:
-        complain(str(error))
-        failures.append(error.exit_code)
-    except MemoryError:
-        complain(f"{task}: not enough memory; close other programs, or make the panorama smaller in Hugin")
-        failures.append(ExitCode.FAILED)
-    except OSError as error:
-        complain(f"{task}: {error}")
-        failures.append(ExitCode.FAILED)
     except Exception as error:
-        if verbose:
+        if verbose and is_bug(error):
             say(traceback.format_exc().rstrip())
-        complain(
-            f"{task}: {type(error).__name__}: {error}\n"
-            f"This is a bug in {PROGRAM}; please report it with what the same command prints with -v."
-        )
-        failures.append(ExitCode.FAILED)
+        message, code = explain(task, error)
+        complain(message)
+        failures.append(code)
 
 
-class _MessageHandler(logging.Handler):
+def is_bug(error: Exception) -> bool:
+    """Whether an error is nobody's fault but ours."""
+    return not isinstance(error, AbflowError | MemoryError | OSError)
+
+
+def explain(task: str, error: Exception) -> tuple[str, ExitCode]:
+    """What went wrong in a task and what to do about it, and the exit code for it."""
+    if isinstance(error, AbflowError):
+        return str(error), error.exit_code
+    if isinstance(error, MemoryError):
+        remedy = "close other programs, or make the panorama smaller in Hugin"
+        return f"{task}: not enough memory; {remedy}", ExitCode.FAILED
+    if isinstance(error, OSError):
+        return f"{task}: {error}", ExitCode.FAILED
+    return (
+        f"{task}: {type(error).__name__}: {error}\n"
+        f"This is a bug in {PROGRAM}; please report it with what the same command prints with -v."
+    ), ExitCode.FAILED
+
+
+def print_message(record: logging.LogRecord) -> None:
+    """Print a log message to stderr."""
+    say(label(record.levelno) + record.getMessage())
+
+
+def label(level: int) -> str:
+    """What stands before a message of `logging`'s level."""
+    return f"{PROGRAM}: {logging.getLevelName(level).lower()}: " if level >= logging.WARNING else ""
+
+
+class _Handler(logging.Handler):
+    def __init__(self, show: Callable[[logging.LogRecord], None]) -> None:
+        super().__init__()
+        self._show = show
+
     def emit(self, record: logging.LogRecord) -> None:
-        label = f"{PROGRAM}: {record.levelname.lower()}: " if record.levelno >= logging.WARNING else ""
-        say(label + record.getMessage())
+        self._show(record)
 
 
 @contextmanager
-def messages(level: int, always: str | None = None) -> Iterator[None]:
-    """Print the package's log messages from `level` upwards to stderr; of the logger `always`, all."""
+def messages(
+    level: int, always: str | None = None, show: Callable[[logging.LogRecord], None] = print_message
+) -> Iterator[None]:
+    """Show the package's log messages from `level` upwards; of the logger `always`, all."""
     levels = {logging.getLogger("hugin_abflow"): level}
     if always:
         levels[logging.getLogger(always)] = logging.INFO
     before = {logger: logger.level for logger in levels}
-    handler = _MessageHandler()
+    handler = _Handler(show)
     logging.getLogger("hugin_abflow").addHandler(handler)
     for logger, its_level in levels.items():
         logger.setLevel(its_level)
@@ -95,38 +119,18 @@ def messages(level: int, always: str | None = None) -> Iterator[None]:
             logger.setLevel(its_level)
 
 
+def on_terminal() -> bool:
+    """Whether stderr is a terminal on which bars can be drawn."""
+    return sys.stderr is not None and sys.stderr.isatty() and os.environ.get("TERM") != "dumb"
+
+
 def display_progress(heading: str, quiet: bool, verbose: bool) -> AbstractContextManager[Progress]:
     """How phases are shown: bars on a terminal, lines with -v elsewhere, else not at all."""
-    on_terminal = sys.stderr is not None and sys.stderr.isatty() and os.environ.get("TERM") != "dumb"
     if quiet:
         return _as_given(silent)
-    if on_terminal:
+    if on_terminal():
         return _bars(heading)
     return _as_given(partial(_lines, heading) if verbose else silent)
-
-
-@contextmanager
-def phase_table(heading: str, progress: Progress, shown: bool) -> Iterator[Progress]:
-    """The same progress; if `shown`, a table of seconds and shares follows what ends well."""
-    if not shown:
-        yield progress
-        return
-    seconds: dict[str, float] = {}
-
-    @contextmanager
-    def timed(phase: str, total: int) -> Iterator[Advance]:
-        started = time.monotonic()
-        with progress(phase, total) as advance:
-            yield advance
-        seconds[phase] = seconds.get(phase, 0.0) + time.monotonic() - started
-
-    started = time.monotonic()
-    yield timed
-    whole = max(time.monotonic() - started, 1e-9)
-    seconds |= {"other": whole - sum(seconds.values()), "total": whole}
-    say(f"{heading}phase     seconds  share")
-    for phase, value in seconds.items():
-        say(f"{heading}{phase:<9}{value:8.2f}{value / whole:6.0%}")
 
 
 @contextmanager

@@ -10,7 +10,7 @@ import json
 import os
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, TextIO
@@ -21,6 +21,8 @@ from hugin_abflow.progress import Advance, Progress
 # What is told of: steps of a run; work on the device; files; copies between host and device.
 PHASE, KERNEL, FILE, TRANSFER = "phase", "kernel", "file", "transfer"
 
+Event = dict[str, Any]
+
 _recorder: _Recorder | None = None
 
 
@@ -28,7 +30,7 @@ class _Recorder:
     """Events of one run; times are in seconds of `time.perf_counter`."""
 
     def __init__(self) -> None:
-        self._events: list[dict[str, Any]] = []
+        self._events: list[Event] = []
         self._lanes: dict[str, int] = {}
         self._lock = threading.Lock()
 
@@ -42,12 +44,39 @@ class _Recorder:
                 }
             )  # fmt: skip
 
-    def write(self, file: TextIO) -> None:
+    def take(self) -> list[Event]:
+        """What came since the last call, after the names of the lanes."""
         names = [
             {"name": "thread_name", "ph": "M", "pid": os.getpid(), "tid": number, "args": {"name": lane}}
             for lane, number in self._lanes.items()
         ]
-        json.dump({"traceEvents": names + self._events, "displayTimeUnit": "ms"}, file)
+        with self._lock:
+            events, self._events = self._events, []
+        return names + events
+
+    def extend(self, events: Sequence[Event]) -> None:
+        with self._lock:
+            self._events += events
+
+    def write(self, file: TextIO) -> None:
+        json.dump({"traceEvents": self.take(), "displayTimeUnit": "ms"}, file)
+
+
+@contextmanager
+def collecting() -> Iterator[Callable[[], list[Event]]]:
+    """Record what happens inside, for another process; gives what gives all since the last call."""
+    global _recorder
+    recorder = _recorder = _Recorder()
+    try:
+        yield recorder.take
+    finally:
+        _recorder = None
+
+
+def extend(events: Sequence[Event]) -> None:
+    """Record what another process of this machine collected: all have one clock."""
+    if _recorder is not None:
+        _recorder.extend(events)
 
 
 @contextmanager

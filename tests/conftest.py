@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 import tifffile
 
+from hugin_abflow.batch import pool, run, task
 from hugin_abflow.layer import Layer, full_scale
 from hugin_abflow.opencl import Device
 from hugin_abflow.project import Plan
@@ -71,6 +72,20 @@ def photo_pixels(
 def device() -> Device:
     """The default device; kernels are built once per session."""
     return Device()
+
+
+Merge = Callable[..., Path]
+
+
+@pytest.fixture
+def replace(monkeypatch: pytest.MonkeyPatch) -> Callable[[Merge], None]:
+    """Put a function in the place of `merge_project`; all projects are then made in this process."""
+
+    def put(merge: Merge) -> None:
+        monkeypatch.setattr(task, "merge_project", merge)
+        monkeypatch.setattr(run, "Pool", pool.Alone)
+
+    return put
 
 
 ProjectMaker = Callable[..., Path]

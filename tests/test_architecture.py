@@ -11,13 +11,13 @@ import pytest
 
 ROOT = Path(__file__).resolve().parent.parent
 PACKAGE = ROOT / "hugin_abflow"
-MODULES = {path.stem for path in PACKAGE.glob("*.py")} - {"__init__"} | {"pto", "dropin"}
+MODULES = {path.stem for path in PACKAGE.glob("*.py")} - {"__init__"} | {"pto", "dropin", "batch"}
 KERNELS = {path.name for path in (ROOT / "kernels").glob("*.cl")}
 
 # The modules that may know a library; no other imports it.
 USERS = {
-    "click": {"cli", "terminal"},
-    "rich": {"terminal"},
+    "click": {"cli", "options", "terminal"},
+    "rich": {"batch", "terminal"},
     "OpenImageIO": {"images", "imagewriter"},
     "pyopencl": {"opencl"},
 }

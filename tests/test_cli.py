@@ -23,12 +23,6 @@ Replace = Callable[[Callable[..., Path]], None]
 
 
 @pytest.fixture
-def replace(monkeypatch: pytest.MonkeyPatch) -> Replace:
-    """Put a function in the place of `merge_project`."""
-    return lambda function: monkeypatch.setattr(cli, "merge_project", function)
-
-
-@pytest.fixture
 def calls(replace: Replace) -> Calls:
     """What `merge_project` is called with, while every project succeeds."""
     seen: Calls = []
@@ -60,7 +54,7 @@ def test_defaults_are_those_of_settings(calls: Calls) -> None:
     ((path, keywords),) = calls
     assert path == Path("a.pto")
     assert keywords.pop("settings") == Settings()
-    assert callable(keywords.pop("progress"))
+    assert callable(keywords.pop("progress")) and callable(keywords.pop("open_device"))
     assert keywords == {
         "output": None,
         "prefix": None,
@@ -166,12 +160,14 @@ def test_stdout_is_the_names_of_the_panoramas(calls: Calls, capsys: pytest.Captu
     assert cli.main(["a.pto", "with space.pto"]) == 0
     output = capsys.readouterr()
     assert output.out.splitlines() == ["a.tif", "with space.tif"]
-    assert output.err == ""
+    assert cli.main(["a.pto"]) == 0
+    assert capsys.readouterr() == ("a.tif\n", "")
 
 
 def test_quiet_prints_nothing(calls: Calls, capsys: pytest.CaptureFixture[str]) -> None:
-    assert cli.main(["-q", "a.pto"]) == 0
-    assert capsys.readouterr() == ("", "")
+    for projects in (["a.pto"], ["a.pto", "b.pto"]):
+        assert cli.main(["-q", *projects]) == 0
+        assert capsys.readouterr() == ("", "")
 
 
 def every_error() -> list[type[AbflowError]]:
@@ -227,6 +223,13 @@ def test_failure_stops_no_other_project(
     output = capsys.readouterr()
     assert output.out.split() == ["a.tif", "c.tif"]
     assert output.err.count("hugin-abflow: error: ") == 1
+    table = output.err.split("what went wrong")[1]
+    assert [row.split()[:2] for row in table.splitlines() if ".pto" in row.split(" ", 2)[1]] == [
+        ["a.pto", "made"],
+        ["b.pto", "failed"],
+        ["c.pto", "made"],
+    ]
+    assert str(error) in table
 
 
 @pytest.mark.parametrize(
@@ -235,9 +238,9 @@ def test_failure_stops_no_other_project(
         ([ExitCode.OK], ExitCode.OK),
         ([ExitCode.OK, ExitCode.OK], ExitCode.OK),
         ([ExitCode.OUTPUT], ExitCode.OUTPUT),
-        ([ExitCode.OUTPUT, ExitCode.OUTPUT], ExitCode.OUTPUT),
+        ([ExitCode.OUTPUT, ExitCode.OUTPUT], ExitCode.ALL_FAILED),
         ([ExitCode.OUTPUT, ExitCode.OK], ExitCode.PARTIAL),
-        ([ExitCode.OUTPUT, ExitCode.NONA], ExitCode.FAILED),
+        ([ExitCode.OUTPUT, ExitCode.NONA], ExitCode.ALL_FAILED),
     ],
 )
 def test_exit_code_of_several_projects(replace: Replace, codes: list[ExitCode], combined: ExitCode) -> None:
@@ -264,7 +267,15 @@ def test_help_is_grouped_and_complete(capsys: pytest.CaptureFixture[str]) -> Non
     assert cli.main(["--help"]) == 0
     text = capsys.readouterr().out
     headings = re.findall(r"^(\w[\w ]*):$", text, re.MULTILINE)
-    assert headings == ["Result", "Layers", "Blending", "Information", "Examples", "Exit codes"]
+    assert headings == [
+        "Result",
+        "Layers",
+        "Blending",
+        "Many projects",
+        "Information",
+        "Examples",
+        "Exit codes",
+    ]
     for parameter in cli.command.params:
         for name in (n for n in parameter.opts if n.startswith("-")):
             assert re.search(rf"^  (-\w, )?{name}\b", text, re.MULTILINE) or f"  {name}," in text
@@ -281,7 +292,10 @@ def test_defaults_in_help_are_bare(capsys: pytest.CaptureFixture[str]) -> None:
     assert "[default: (" not in text
 
 
-def test_examples_in_help_are_valid(calls: Calls) -> None:
+def test_examples_in_help_are_valid(calls: Calls, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "shoot" / "day").mkdir(parents=True)
+    (tmp_path / "shoot" / "day" / "a.pto").touch()
+    monkeypatch.chdir(tmp_path)
     for example, _ in cli.EXAMPLES:
         program, *arguments = example.split()
         assert program == "hugin-abflow"

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import re
 import shlex
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -41,11 +41,13 @@ def test_pages_are_reached_from_the_first() -> None:
     assert set(PAGES) == linked | {"hugin.md"} and "docs/hugin.md" in (ROOT / "README.md").read_text("utf-8")
 
 
-def test_commands_are_understood(monkeypatch: pytest.MonkeyPatch) -> None:
-    def succeed(path: Path, **keywords: Any) -> Path:
-        return path
-
-    monkeypatch.setattr(cli, "merge_project", succeed)
+def test_commands_are_understood(
+    replace: Callable[..., None], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    replace(lambda path, **keywords: path)
+    (tmp_path / "shoot").mkdir()
+    (tmp_path / "shoot" / "a.pto").touch()
+    monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(setup, "install", lambda *given: [])
     monkeypatch.setattr(setup, "uninstall", lambda *given: [])
     text = "\n".join(PAGES.values())

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import shlex
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -73,7 +74,7 @@ def test_no_other_option_is_documented() -> None:
 def test_options_are_in_the_groups_of_help(capsys: pytest.CaptureFixture[str]) -> None:
     cli.main(["--help"])
     text = capsys.readouterr().out.split("Examples:")[0]
-    in_help = re.findall(r"^(?:(\w+):|  (?:-\w, )?(--[\w-]+).*)$", text, re.MULTILINE)
+    in_help = re.findall(r"^(?:(\w[\w ]*):|  (?:-\w, )?(--[\w-]+).*)$", text, re.MULTILINE)
     in_readme = [
         (names.strip("*"), "") if names.startswith("**") else ("", re.findall(r"--[\w-]+", names)[0])
         for names, *_ in rows("Options")
@@ -85,11 +86,13 @@ def test_exit_codes_are_documented() -> None:
     assert rows("Exit codes") == [[str(int(code)), text] for code, text in cli.EXIT_CODES.items()]
 
 
-def test_commands_are_valid(monkeypatch: pytest.MonkeyPatch) -> None:
-    def succeed(path: Path, **keywords: Any) -> Path:
-        return path
-
-    monkeypatch.setattr(cli, "merge_project", succeed)
+def test_commands_are_valid(
+    replace: Callable[..., None], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    replace(lambda path, **keywords: path)
+    (tmp_path / "shoot").mkdir()
+    (tmp_path / "shoot" / "a.pto").touch()
+    monkeypatch.chdir(tmp_path)
     commands = re.findall(r"^ {4,}(hugin-abflow [^\[\n]*)$", README, re.MULTILINE)
     commands += re.findall(r"`(hugin-abflow [^`\n]*)`", README)
     assert len(commands) >= 4

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import threading
 from pathlib import Path
 from typing import Any
@@ -121,3 +122,19 @@ def test_a_profile_that_cannot_be_written_ends_the_run_before_it_starts(
     assert cli.main([str(project(tmp_path)), "--profile", str(tmp_path)]) == ExitCode.OUTPUT
     assert "name another" in capsys.readouterr().err
     assert not (tmp_path / "pano.tif").exists()
+
+
+def test_processes_side_by_side_have_one_trace(tmp_path: Path) -> None:
+    profile = tmp_path / "profile.json"
+    folders = [tmp_path / name for name in ("a", "b")]
+    for folder in folders:
+        folder.mkdir()
+    assert cli.main([*(str(project(f)) for f in folders), "--jobs", "2", "--profile", str(profile)]) == 0
+    found = events(profile)
+    processes = {event["pid"] for event in found}
+    assert len(processes) == 2 and os.getpid() not in processes
+    for process in processes:
+        own = [event for event in found if event["pid"] == process]
+        (flow,) = (event for event in own if event["name"] == "flow")
+        relaxed = [event for event in own if event["name"] == "flow_relax"]
+        assert relaxed and all(flow["ts"] - 1e3 <= event["ts"] <= end(flow) + 1e3 for event in relaxed)

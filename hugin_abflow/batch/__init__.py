@@ -1,0 +1,1 @@
+"""Many projects: found, stitched side by side, resumed, reported."""

@@ -1,0 +1,206 @@
+"""Processes of this machine that stitch projects side by side.
+
+While one project computes, the next one's layers are remapped and decoded, and the last one's panorama is
+encoded. Processes, not threads: a crash costs one attempt at one project.
+"""
+
+from __future__ import annotations
+
+import multiprocessing
+import signal
+import threading
+from collections import deque
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager, suppress
+from multiprocessing.connection import wait
+from multiprocessing.context import SpawnProcess
+from types import TracebackType
+from typing import Protocol
+
+from hugin_abflow import trace
+from hugin_abflow.batch.record import Record
+from hugin_abflow.batch.task import Listener, Task, perform
+from hugin_abflow.batch.worker import work
+from hugin_abflow.errors import ExitCode
+
+# A project is tried again once if its process dies or its device fails: both may be another project's fault.
+ATTEMPTS = 2
+# Time to tidy up after an interruption, seconds.
+_GRACE = 15.0
+
+
+class Watcher(Protocol):
+    """Who is told what becomes of tasks."""
+
+    def began(self, task: Task) -> Listener:
+        """A task begins; gives who is told how it goes on."""
+
+    def ended(self, task: Task, record: Record) -> None:
+        """A task is done."""
+
+
+class _Worker:
+    """A process with what it does at the moment."""
+
+    def __init__(self, level: int) -> None:
+        context = multiprocessing.get_context("spawn")
+        self.pipe, other = context.Pipe()
+        self.process: SpawnProcess = context.Process(
+            target=work, args=(other, level, trace.is_recording()), daemon=True
+        )
+        with _deaf():
+            self.process.start()
+        other.close()
+        self.task: Task | None = None
+        self._listener: Listener | None = None
+        self._attempt = 0
+
+    def begin(self, task: Task, attempt: int, listener: Listener) -> None:
+        """Have it stitch a project, for the first or second time."""
+        self.task, self._attempt, self._listener = task, attempt, listener
+        with suppress(OSError):  # dead already: the pipe says so when it is read
+            self.pipe.send(task)
+
+    def end(self) -> None:
+        """Let it go once it has nothing to do."""
+        with suppress(OSError):
+            self.pipe.send(None)
+
+    def hear(self) -> Record | None:
+        """Take in what it sends; gives the record when its project is done, or it is dead."""
+        assert self.task is not None
+        try:
+            name, *values = self.pipe.recv()
+        except (EOFError, OSError):
+            record = Record(self.task.project.absolute(), exit_code=ExitCode.FAILED)
+            record.message = (
+                f"{self.task.project}: the process that stitched it {self._why_dead()}; "
+                "run it alone with -v, and with fewer --jobs"
+            )
+        else:
+            if name != "ended":
+                getattr(self._listener, name)(*values)
+                return None
+            record, events = values
+            trace.extend(events)
+        record.attempts = self._attempt
+        return record
+
+    def release(self) -> Task:
+        """What it has done; it is free for another."""
+        task, self.task = self.task, None
+        assert task is not None
+        return task
+
+    def _why_dead(self) -> str:
+        """How the process ended, once its pipe is closed."""
+        self.process.join(_GRACE)
+        code = self.process.exitcode
+        if code is not None and code < 0:
+            name = signal.Signals(-code).name
+            memory = "; the system does that when memory runs out" if name == "SIGKILL" else ""
+            return f"was ended by {name}{memory}"
+        return f"ended with code {code}"
+
+
+class Pool:
+    """Up to `jobs` processes; `run` may be called again and again inside the ``with`` block.
+
+    level       of the messages that listeners get.
+    """
+
+    def __init__(self, jobs: int, level: int, watcher: Watcher) -> None:
+        self._jobs, self._level, self._watcher = jobs, level, watcher
+        self._workers: list[_Worker] = []
+
+    def __enter__(self) -> Pool:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        for worker in self._workers:
+            if kind is None:
+                worker.end()
+            else:
+                worker.pipe.close()  # on which it ends by itself, and tidies up
+        for worker in self._workers:
+            worker.process.join(_GRACE)
+            if worker.process.is_alive():
+                worker.process.kill()
+                worker.process.join()
+
+    def run(self, tasks: Iterable[Task]) -> Iterator[Record]:
+        """The records of the tasks, in the order in which they are done."""
+        waiting = deque((task, 1) for task in tasks)
+        while waiting or self._busy():
+            while waiting and (worker := self._free()):
+                begun, attempt = waiting.popleft()
+                worker.begin(begun, attempt, self._watcher.began(begun))
+            for pipe in wait([worker.pipe for worker in self._busy()]):
+                worker = next(one for one in self._workers if one.pipe is pipe)
+                record = worker.hear()
+                if record is None:
+                    continue
+                task = worker.release()
+                if worker.process.exitcode is not None:
+                    self._workers.remove(worker)
+                if self._retry(worker, record):
+                    waiting.append((task, record.attempts + 1))
+                    continue
+                self._watcher.ended(task, record)
+                yield record
+
+    def _retry(self, worker: _Worker, record: Record) -> bool:
+        """Whether another attempt may end better."""
+        broken = worker.process.exitcode is not None or record.exit_code == ExitCode.DEVICE
+        return broken and record.attempts < ATTEMPTS
+
+    def _busy(self) -> list[_Worker]:
+        return [worker for worker in self._workers if worker.task is not None]
+
+    def _free(self) -> _Worker | None:
+        """A process with nothing to do, a new one if there may be more."""
+        for worker in self._workers:
+            if worker.task is None:
+                return worker
+        if len(self._workers) < self._jobs:
+            self._workers.append(_Worker(self._level))
+            return self._workers[-1]
+        return None
+
+
+class Alone:
+    """The same in this process, one after the other: for one project, which needs no other."""
+
+    def __init__(self, jobs: int, level: int, watcher: Watcher) -> None:
+        self._level, self._watcher = level, watcher
+
+    def __enter__(self) -> Alone:
+        return self
+
+    def __exit__(self, *reason: object) -> None:
+        return
+
+    def run(self, tasks: Iterable[Task]) -> Iterator[Record]:
+        """The records of the tasks, one after the other."""
+        for task in tasks:
+            record = perform(task, self._watcher.began(task), self._level)
+            self._watcher.ended(task, record)
+            yield record
+
+
+@contextmanager
+def _deaf() -> Iterator[None]:
+    """Let processes that are started meanwhile ignore Ctrl-C, of which the pool tells them."""
+    if threading.current_thread() is not threading.main_thread():
+        yield  # only the main thread may set handlers
+        return
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)

@@ -1,0 +1,73 @@
+"""The noun: what became of one project."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any, Literal
+
+from hugin_abflow.errors import ExitCode
+
+Result = Literal["made", "skipped", "failed"]
+
+
+@dataclass
+class Record:
+    """What became of one project; plain values, as they stand in a report (docs/report.md).
+
+    project     its file, absolute.
+    result      "made", "skipped" (what was made before still holds) or "failed".
+    outputs     the files that were made, with "file" and "bytes".
+    inputs      the project, its photos, and layers that were there before, as `outputs`.
+    message     what went wrong and what to do; empty if nothing.
+    exit_code   what a run of this project alone ends with.
+    started     UTC, ISO 8601. seconds: the whole time, phases: of each phase.
+    memory      largest resident memory of the process, bytes; None where the system does not tell.
+    attempts    how often it was begun.
+    overlaps    figures of each overlap.
+    """
+
+    project: Path
+    result: Result = "failed"
+    outputs: list[dict[str, Any]] = field(default_factory=list)
+    inputs: list[dict[str, Any]] = field(default_factory=list)
+    message: str = ""
+    exit_code: ExitCode = ExitCode.OK
+    warnings: list[str] = field(default_factory=list)
+    started: str = ""
+    seconds: float = 0.0
+    phases: dict[str, float] = field(default_factory=dict)
+    memory: int | None = None
+    attempts: int = 1
+    settings: dict[str, Any] = field(default_factory=dict)
+    device: str = ""
+    versions: dict[str, str] = field(default_factory=dict)
+    overlaps: list[dict[str, Any]] = field(default_factory=list)
+
+    @property
+    def files(self) -> list[Path]:
+        """The panorama's files."""
+        return [Path(output["file"]) for output in self.outputs]
+
+    @property
+    def bytes(self) -> int:
+        """Size of the outputs together."""
+        return sum(int(output["bytes"]) for output in self.outputs)
+
+    def to_json(self) -> dict[str, Any]:
+        """Plain values for JSON."""
+        values = asdict(self)
+        for file in values["inputs"] + values["outputs"]:
+            file["file"] = str(Path(file["file"]).absolute())
+        return {**values, "project": str(self.project), "exit_code": int(self.exit_code)}
+
+    @classmethod
+    def from_json(cls, values: Mapping[str, Any]) -> Record:
+        """What `to_json` gave. Raises KeyError, TypeError or ValueError for anything else."""
+        known = {
+            **values,
+            "project": Path(values["project"]),
+            "exit_code": ExitCode(values["exit_code"]),
+        }
+        return cls(**known)

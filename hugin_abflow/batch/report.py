@@ -1,0 +1,92 @@
+"""What became of all projects: a table for people, JSON for programs (docs/report.md)."""
+
+from __future__ import annotations
+
+import json
+import os
+import secrets
+from collections.abc import Sequence
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+from hugin_abflow.batch.display import duration, size
+from hugin_abflow.batch.record import Record
+from hugin_abflow.errors import OutputError
+from hugin_abflow.metadata import PROGRAM, version
+
+SCHEMA = 1
+
+
+def print_table(records: Sequence[Record]) -> None:
+    """Projects, results, times, sizes, and what went wrong, on stderr."""
+    from rich import box  # takes a while to load, and is needed here only
+    from rich.console import Console
+    from rich.table import Table
+    from rich.text import Text
+
+    table = Table(box=box.SIMPLE_HEAD, pad_edge=False)
+    table.add_column("project", overflow="fold")
+    table.add_column("result")
+    table.add_column("time", justify="right")
+    table.add_column("size", justify="right")
+    table.add_column("what went wrong, what to do", overflow="fold")
+    for record in records:
+        table.add_row(
+            Text(_shown(record.project)),
+            record.result,
+            duration(record.seconds),
+            size(record.bytes) if record.outputs else "",
+            Text(record.message or "; ".join(record.warnings)),
+        )
+    console = Console(stderr=True)
+    if not console.is_terminal:
+        console.width = 160  # a file is read in an editor, which does not mind
+    console.print(table)
+
+
+def _shown(project: Path) -> str:
+    """The project's name from here, where that is shorter."""
+    try:
+        shown = str(project.relative_to(Path.cwd()))
+    except ValueError:
+        shown = str(project)
+    return shown.encode("utf-8", "replace").decode("utf-8")
+
+
+def write_report(path: Path, records: Sequence[Record], arguments: Sequence[str]) -> None:
+    """Write the report, whole or not at all. Raises `OutputError`."""
+    write_json(path, summary(records, arguments), "name another file with --report")
+
+
+def summary(records: Sequence[Record], arguments: Sequence[str]) -> dict[str, Any]:
+    """The report as plain values; `arguments`: of the command line."""
+    results = [record.result for record in records]
+    return {
+        "schema": SCHEMA,
+        "program": PROGRAM,
+        "version": version(),
+        "written": datetime.now(UTC).isoformat(timespec="seconds"),
+        "arguments": list(arguments),
+        "made": results.count("made"),
+        "skipped": results.count("skipped"),
+        "failed": results.count("failed"),
+        "projects": [record.to_json() for record in records],
+    }
+
+
+def write_json(path: Path, values: object, remedy: str) -> None:
+    """Write values as readable JSON, whole or not at all. Raises `OutputError`, which ends with `remedy`."""
+    # names that are not UTF-8 stay readable for JSON's readers as escapes
+    text = json.dumps(values, indent=2, ensure_ascii=False).encode("utf-8", "backslashreplace")
+    part = path.with_name(f".abflow-{secrets.token_hex(6)}{path.suffix}")
+    try:
+        with part.open("xb") as file:
+            file.write(text + b"\n")
+            file.flush()
+            os.fsync(file.fileno())  # else a power cut may leave an empty file of the final name
+        part.replace(path)
+    except OSError as error:
+        raise OutputError(f"{path} cannot be written: {error.strerror}; {remedy}") from None
+    finally:
+        part.unlink(missing_ok=True)

@@ -1,0 +1,82 @@
+"""A run: tasks go to those who perform them; results are printed, shown, reported."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass
+from pathlib import Path
+
+from hugin_abflow import trace
+from hugin_abflow.batch.display import choose_display, open_log
+from hugin_abflow.batch.pool import Alone, Pool
+from hugin_abflow.batch.record import Record
+from hugin_abflow.batch.report import print_table, write_report
+from hugin_abflow.batch.task import Task
+from hugin_abflow.errors import ExitCode
+from hugin_abflow.terminal import print_path
+
+
+@dataclass(frozen=True)
+class Run:
+    """What a command line says about the run as a whole.
+
+    jobs        projects at a time; None: as many as `default_jobs` says.
+    report      file for the report.
+    log         file to the end of which everything is written.
+    arguments   the command line, for the report.
+    profile     file for the trace, see trace.py.
+    """
+
+    jobs: int | None = None
+    report: Path | None = None
+    log: Path | None = None
+    quiet: bool = False
+    verbose: bool = False
+    arguments: Sequence[str] = ()
+    profile: Path | None = None
+
+
+def default_jobs() -> int:
+    """One project computes, the next one's layers are made, the last one's panorama is encoded."""
+    return min(3, os.cpu_count() or 1)
+
+
+def run(tasks: Sequence[Task], how: Run) -> ExitCode:
+    """Perform tasks, at least one; print the panoramas' names on stdout. Raises `OutputError` for a log or a
+    report that cannot be written.
+    """
+    records: list[Record] = []
+    order = {task.project.absolute(): place for place, task in enumerate(tasks)}
+    lone = len(tasks) == 1
+    with ExitStack() as stack:
+        log = stack.enter_context(open_log(how.log))
+        stack.enter_context(trace.recording(how.profile))
+        try:
+            with choose_display(lone, how.quiet, how.verbose, log) as display:
+                display.expect(len(tasks))
+                jobs = min(len(tasks), how.jobs or default_jobs())
+                with (Alone if lone else Pool)(jobs, display.level, display) as performers:
+                    for record in performers.run(tasks):
+                        records.append(record)
+                        if not how.quiet:
+                            for file in record.files:
+                                print_path(file)
+        finally:
+            records.sort(key=lambda record: order[record.project])
+            if how.report:
+                write_report(how.report, records, how.arguments)
+    if not lone and not how.quiet:
+        print_table(records)
+    return combine([record.exit_code for record in records])
+
+
+def combine(codes: Sequence[ExitCode]) -> ExitCode:
+    """The exit code of a run whose projects ended with `codes`."""
+    if len(codes) == 1:
+        return codes[0]
+    failed = sum(code != ExitCode.OK for code in codes)
+    if failed:
+        return ExitCode.ALL_FAILED if failed == len(codes) else ExitCode.PARTIAL
+    return ExitCode.OK

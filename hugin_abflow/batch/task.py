@@ -1,0 +1,155 @@
+"""One project, stitched in this process: from a task to a record."""
+
+from __future__ import annotations
+
+import logging
+import platform
+import time
+import traceback
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, suppress
+from dataclasses import asdict, dataclass, field
+from datetime import UTC, datetime
+from functools import cache
+from pathlib import Path
+from typing import Any, Protocol
+
+from hugin_abflow import nona, trace
+from hugin_abflow.batch import memory
+from hugin_abflow.batch.record import Record
+from hugin_abflow.errors import AbflowError, DeviceError
+from hugin_abflow.merge import merge_project
+from hugin_abflow.metadata import version
+from hugin_abflow.opencl import Device
+from hugin_abflow.progress import Advance
+from hugin_abflow.project import read_plan
+from hugin_abflow.settings import Settings
+from hugin_abflow.terminal import explain, is_bug, messages
+
+_log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class Task:
+    """One project and how it is stitched; travels between processes.
+
+    project     the file, as the user named it.
+    options     keywords of `merge_project`.
+    """
+
+    project: Path
+    options: Mapping[str, Any] = field(default_factory=dict)
+
+
+class Listener(Protocol):
+    """Who is told how a task goes on. Called by several threads, one at a time."""
+
+    def phase_began(self, name: str, total: int) -> None:
+        """A phase of `total` units begins."""
+
+    def advanced(self, name: str, units: int) -> None:
+        """So many more units of a phase are done."""
+
+    def phase_ended(self, name: str, seconds: float) -> None:
+        """A phase is done."""
+
+    def message(self, level: int, text: str) -> None:
+        """A message of `logging`'s level."""
+
+
+def perform(task: Task, listener: Listener, level: int = logging.WARNING) -> Record:
+    """Stitch the project of a task. Errors end in the record; only interruptions are raised.
+
+    level       of the messages that `listener` gets; an error is no message but in the record.
+    """
+    record = Record(task.project.absolute(), started=datetime.now(UTC).isoformat(timespec="seconds"))
+    record.settings = settings_of(task)
+    began = time.monotonic()
+    memory.reset_peak()
+
+    def show(said: logging.LogRecord) -> None:
+        if said.levelno >= logging.WARNING:
+            record.warnings.append(said.getMessage())
+        listener.message(said.levelno, said.getMessage())
+
+    with messages(level, show=show):
+        try:
+            _stitch(task, record, listener)
+        except Exception as error:
+            if isinstance(error, DeviceError):
+                _device.cache_clear()  # a lost device does not come back; its successor may
+            if is_bug(error):
+                _log.info("%s", traceback.format_exc().rstrip())
+            record.message, record.exit_code = explain(str(task.project), error)
+    record.inputs = _inputs(task.project)
+    record.seconds = round(time.monotonic() - began, 3)
+    record.memory = memory.peak()
+    return record
+
+
+def _stitch(task: Task, record: Record, listener: Listener) -> None:
+    """Fill in the record while the panorama is made."""
+    record.versions = _versions()
+
+    def open_device(wanted: str | None) -> Device:
+        device = _device(wanted, trace.is_recording())
+        record.device = device.name
+        return device
+
+    @contextmanager
+    def progress(phase: str, total: int) -> Iterator[Advance]:
+        began = time.monotonic()
+        listener.phase_began(phase, total)
+        yield lambda units: listener.advanced(phase, units)
+        seconds = time.monotonic() - began
+        record.phases[phase] = round(record.phases.get(phase, 0.0) + seconds, 3)
+        listener.phase_ended(phase, seconds)
+
+    made = merge_project(
+        task.project, **task.options, progress=trace.phases(progress), open_device=open_device
+    )
+    record.outputs = _sizes([made])
+    record.result = "made"
+
+
+def settings_of(task: Task) -> dict[str, Any]:
+    """All options of a task as plain values for JSON, those of the engine among them."""
+    values: dict[str, Any] = {}
+    for name, value in task.options.items():
+        values |= asdict(value) if isinstance(value, Settings) else {name: value}
+    return {name: _plain(value) for name, value in sorted(values.items())}
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, list | tuple):
+        return [_plain(item) for item in value]
+    return str(value) if isinstance(value, Path) else value
+
+
+def _inputs(project: Path) -> list[dict[str, Any]]:
+    """The project and its photos, as far as they are there."""
+    with suppress(AbflowError, OSError):
+        photos = [image.photo for image in read_plan(project).images]
+        return _sizes([project, *(photo for photo in photos if photo.is_file())])
+    return []
+
+
+def _sizes(files: list[Path]) -> list[dict[str, Any]]:
+    """Files, and how large they are."""
+    return [{"file": str(file), "bytes": file.stat().st_size if file.is_file() else 0} for file in files]
+
+
+@cache
+def _device(wanted: str | None, timed: bool) -> Device:
+    """The device, with its kernels, for all projects of this process; `timed`: one that tells its times."""
+    return Device(wanted)
+
+
+@cache
+def _versions() -> dict[str, str]:
+    return {
+        "hugin-abflow": version(),
+        "nona": nona.probe() or "not installed",
+        "python": platform.python_version(),
+        "system": platform.platform(),
+    }

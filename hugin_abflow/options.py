@@ -1,0 +1,81 @@
+"""Click's options and commands as ours are: help with headings, and options that take several files."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import click
+
+# Where a context keeps the arguments as they were given.
+ARGUMENTS = "hugin_abflow.arguments"
+
+
+class Option(click.Option):
+    """An option that appears in --help under the heading `group`."""
+
+    def __init__(self, *arguments: Any, group: str, **keywords: Any) -> None:
+        super().__init__(*arguments, **keywords)
+        self.group = group
+
+
+class Command(click.Command):
+    """A command whose help has headings, and whose `--layers` takes several files.
+
+    examples    commands and what they do, exit_codes: and what they mean; shown at the end of the help.
+    """
+
+    def __init__(
+        self,
+        *arguments: Any,
+        examples: Sequence[tuple[str, str]],
+        exit_codes: Mapping[Any, str],
+        **keywords: Any,
+    ) -> None:
+        super().__init__(*arguments, **keywords)
+        self.examples, self.exit_codes = examples, exit_codes
+
+    def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
+        """Parse `args` after spreading `--layers`."""
+        ctx.meta[ARGUMENTS] = list(args)
+        return super().parse_args(ctx, spread_layers(args))
+
+    def format_options(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        """Write the options, a section for each group in order of first appearance."""
+        groups: dict[str, list[tuple[str, str]]] = {}
+        for parameter in self.get_params(ctx):
+            record = parameter.get_help_record(ctx)
+            if record is not None and isinstance(parameter, click.Option):
+                groups.setdefault(getattr(parameter, "group", "Information"), []).append(record)
+        for heading, records in groups.items():
+            with formatter.section(heading):
+                formatter.write_dl(records)
+
+    def format_epilog(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        """Write examples and exit codes."""
+        with formatter.section("Examples"):
+            for example, effect in self.examples:
+                formatter.write(f"  {example}\n      {effect}\n")
+        with formatter.section("Exit codes"):
+            formatter.write_dl([(str(int(code)), text) for code, text in self.exit_codes.items()])
+
+
+def spread_layers(arguments: Sequence[str]) -> list[str]:
+    """Write ``--layers a b`` as ``--layers a --layers b``, the only form that click understands.
+
+    The list ends at the next option, at ``--`` and at a name that ends in .pto: that is a project.
+    """
+    spread: list[str] = []
+    remaining = iter(arguments)
+    listing = False
+    for argument in remaining:
+        if argument == "--":
+            return [*spread, argument, *remaining]
+        if argument.startswith("-") and argument != "-":
+            listing = argument == "--layers" or argument.startswith("--layers=")
+        elif argument.lower().endswith(".pto"):
+            listing = False
+        elif listing and spread[-1] != "--layers":
+            spread.append("--layers")
+        spread.append(argument)
+    return spread

@@ -1,0 +1,78 @@
+"""The report: its fields are the documented ones, and it is whole or not there."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from shoots import write_project
+
+from hugin_abflow import cli
+from hugin_abflow.batch.record import Record
+from hugin_abflow.batch.report import SCHEMA, summary, write_report
+from hugin_abflow.errors import ExitCode, OutputError
+
+PAGE = (Path(__file__).resolve().parent.parent / "docs" / "report.md").read_text("utf-8")
+
+
+def documented(heading: str) -> set[str]:
+    """The fields in the table of a section of docs/report.md."""
+    section = PAGE.split(f"## {heading}\n")[1].split("\n## ")[0]
+    return set(re.findall(r"^\| `(\w+)` \|", section, re.MULTILINE))
+
+
+def test_every_field_is_documented() -> None:
+    report = summary([Record(Path("a.pto"))], ["a.pto"])
+    assert set(report) == documented("The run")
+    assert set(report["projects"][0]) == documented("A project")
+    assert f"`schema` is {SCHEMA}" in PAGE
+
+
+def test_report_of_a_run(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    projects = [write_project(tmp_path / f"{name}.pto") for name in "ab"]
+    (tmp_path / "b0001.tif").unlink()
+    (tmp_path / "b0000.tif").write_bytes(b"no picture")
+    report = tmp_path / "report.json"
+    arguments = [*map(str, projects), "--remap", "never", "--report", str(report)]
+    assert cli.main(arguments) == ExitCode.PARTIAL
+    written = json.loads(report.read_text("utf-8"))
+    assert (written["schema"], written["made"], written["failed"], written["skipped"]) == (SCHEMA, 1, 1, 0)
+    assert written["arguments"] == arguments
+    made, failed = written["projects"]
+    assert made["project"] == str(projects[0]) and made["result"] == "made" and made["exit_code"] == 0
+    assert made["outputs"] == [
+        {"file": str(tmp_path / "a.tif"), "bytes": (tmp_path / "a.tif").stat().st_size}
+    ]
+    assert made["settings"]["merge"] == "joint" and made["settings"]["remap"] == "never"
+    assert made["versions"]["hugin-abflow"] and made["device"] and made["memory"] > 0
+    assert set(made["phases"]) == {"read", "flow", "align", "blend"}
+    assert failed["result"] == "failed" and "b0000.tif" in failed["message"]
+    assert failed["exit_code"] == ExitCode.IMAGE_READ and failed["outputs"] == []
+    assert failed["warnings"] == ["no layer of image 1 (right.png): it is left out"]
+    assert "b0000.tif" in capsys.readouterr().err
+
+
+def test_report_that_cannot_be_written_is_told(
+    replace: Callable[..., None], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    replace(lambda path, **keywords: path.with_suffix(".tif"))
+    assert cli.main(["a.pto", "--report", str(tmp_path / "no" / "r.json")]) == ExitCode.OUTPUT
+    output = capsys.readouterr()
+    assert output.out == "a.tif\n" and "--report" in output.err
+
+
+def test_report_is_replaced_whole(tmp_path: Path) -> None:
+    report = tmp_path / "r.json"
+    report.write_text("older")
+    write_report(report, [Record(Path("caf\udce9 Küste.pto"))], [])
+    text = report.read_text("utf-8")
+    assert "Küste" in text and json.loads(text)["projects"][0]["project"] == "caf\udce9 Küste.pto"
+    assert [path.name for path in tmp_path.iterdir()] == ["r.json"]
+    report.unlink()
+    report.mkdir()
+    with pytest.raises(OutputError, match="--report"):
+        write_report(report, [], [])
+    assert [path.name for path in tmp_path.iterdir()] == ["r.json"]
