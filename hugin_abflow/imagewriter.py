@@ -9,7 +9,6 @@ import contextlib
 import errno
 import logging
 import os
-import secrets
 import shutil
 from pathlib import Path
 from types import TracebackType
@@ -23,6 +22,7 @@ from hugin_abflow import tifftags, trace
 from hugin_abflow.errors import OutputError
 from hugin_abflow.exif import Metadata, embed
 from hugin_abflow.layer import full_scale
+from hugin_abflow.scratch import part_beside
 
 Pixels = npt.NDArray[Any]
 
@@ -121,6 +121,7 @@ class ImageWriter:
         self._clipped = False
         self._output: Any = None
         self._final = self._part = self.path
+        self._scratch = contextlib.ExitStack()
 
     def _make_spec(
         self, offset: tuple[int, int], icc: bytes | None, canvas_size: tuple[int, int] | None
@@ -166,8 +167,7 @@ class ImageWriter:
     def __enter__(self) -> ImageWriter:
         # through a link: replace what it points to, not the link
         self._final = self.path.resolve()
-        self._part = self._final.with_name(f".abflow-{secrets.token_hex(6)}{self.path.suffix}")
-        if not named_in_unicode(self._part):
+        if not named_in_unicode(self._final.parent):
             raise OutputError(
                 f"{self.path} cannot be written: the path of its folder is not valid UTF-8; rename that, "
                 "or choose another with -o"
@@ -178,8 +178,8 @@ class ImageWriter:
             # a device or a pipe, reached by a link: the rename would take its place
             if self._final.exists() and not self._final.is_file():
                 raise OutputError(f"{self.path} is no ordinary file; name one with -o")
-            # made here, not by OpenImageIO: a clear reason, and never somebody else's file
-            os.close(os.open(self._part, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o666))
+            # made here, not by OpenImageIO: a clear reason
+            self._part = self._scratch.enter_context(part_beside(self._final, self.path.suffix))
         except OSError as error:
             raise OutputError(
                 f"{self.path} cannot be written: {self._final.parent}: {error.strerror}; "
@@ -286,7 +286,7 @@ class ImageWriter:
         if output is not None:
             with contextlib.suppress(RuntimeError):
                 output.close()
-        self._part.unlink(missing_ok=True)
+        self._scratch.close()
 
     def _failure(self, why: str) -> OutputError:
         reason = (why.strip() or "no reason given").splitlines()[0]  # PNG's writer adds a line for each block

@@ -7,10 +7,9 @@ import os
 import re
 import shutil
 import subprocess
-import tempfile
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal, get_args
@@ -30,6 +29,7 @@ from hugin_abflow.images import read_layers
 from hugin_abflow.layer import Canvas, Layer
 from hugin_abflow.progress import Progress, silent
 from hugin_abflow.project import Plan, PlannedImage
+from hugin_abflow.scratch import part_beside, work_folder
 
 log = logging.getLogger("hugin_abflow.nona")
 
@@ -74,7 +74,7 @@ def open_layers(
     "always" together with named layers).
     """
     _check_request(remap, named=bool(prefix or layers))
-    with _work_folder() as folder:
+    with work_folder() as folder:
         if layers:
             files = _named_files(layers)
         elif prefix:
@@ -125,17 +125,6 @@ def _check_request(remap: str, named: bool) -> None:
         raise SettingsError(
             "layers are named and shall be made; leave out --prefix and --layers, or --remap always"
         )
-
-
-@contextmanager
-def _work_folder() -> Iterator[Path]:
-    """A folder for nona's layers; nothing is left of it."""
-    # asked each time: Python remembers the first TMPDIR that it saw
-    root = os.environ.get("TMPDIR", "")
-    with tempfile.TemporaryDirectory(
-        prefix="hugin-abflow-", dir=root if Path(root).is_dir() and root else None, ignore_cleanup_errors=True
-    ) as folder:
-        yield Path(folder)
 
 
 # ------------------------------------------------------------------------------------- finding
@@ -432,19 +421,25 @@ def _keep(plan: Plan, prefix: str, made: dict[int, Path]) -> dict[int, Path]:
     kept = {}
     for index, path in made.items():
         final = _layer_path(prefix, index, path.suffix)
-        part = final.with_name(f".abflow-{os.getpid()}{path.suffix}")
         if final.resolve() in photos:
             raise OutputError(
                 f"{final} is a photo, the layer cannot be kept by that name; rename the project"
             )
         try:
-            shutil.move(path, part)
-            part.replace(final)
+            _move(path, final)
         except OSError as error:
             raise OutputError(
                 f"{final} cannot be written: {error.strerror}; leave out --keep-layers or free the folder"
             ) from None
-        finally:
-            part.unlink(missing_ok=True)
         kept[index] = final
     return kept
+
+
+def _move(path: Path, final: Path) -> None:
+    """Move a file, to another file system too; it appears when it is whole."""
+    with suppress(OSError):
+        path.replace(final)
+        return
+    with part_beside(final) as part:
+        shutil.copyfile(path, part)
+        part.replace(final)

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import json
+import os
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
 from hugin_abflow.errors import ExitCode
+from hugin_abflow.scratch import part_beside
 
 Result = Literal["made", "skipped", "failed"]
 
@@ -71,3 +74,15 @@ class Record:
             "exit_code": ExitCode(values["exit_code"]),
         }
         return cls(**known)
+
+
+def write_json(path: Path, values: object) -> None:
+    """Write values as readable JSON, whole or not at all. Raises OSError."""
+    # names that are not UTF-8 stay readable for JSON's readers as escapes
+    text = json.dumps(values, indent=2, ensure_ascii=False).encode("utf-8", "backslashreplace")
+    with part_beside(path) as part:
+        with part.open("wb") as file:
+            file.write(text + b"\n")
+            file.flush()
+            os.fsync(file.fileno())  # else a power cut may leave an empty file of the final name
+        part.replace(path)

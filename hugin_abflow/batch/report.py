@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-import json
-import os
-import secrets
 from collections.abc import Sequence
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
 from hugin_abflow.batch.display import duration, size
-from hugin_abflow.batch.record import Record
+from hugin_abflow.batch.record import Record, write_json
 from hugin_abflow.errors import OutputError
 from hugin_abflow.metadata import PROGRAM, version
 
@@ -56,7 +53,12 @@ def _shown(project: Path) -> str:
 
 def write_report(path: Path, records: Sequence[Record], arguments: Sequence[str]) -> None:
     """Write the report, whole or not at all. Raises `OutputError`."""
-    write_json(path, summary(records, arguments), "name another file with --report")
+    try:
+        write_json(path, summary(records, arguments))
+    except OSError as error:
+        raise OutputError(
+            f"{path} cannot be written: {error.strerror}; name another file with --report"
+        ) from None
 
 
 def summary(records: Sequence[Record], arguments: Sequence[str]) -> dict[str, Any]:
@@ -73,20 +75,3 @@ def summary(records: Sequence[Record], arguments: Sequence[str]) -> dict[str, An
         "failed": results.count("failed"),
         "projects": [record.to_json() for record in records],
     }
-
-
-def write_json(path: Path, values: object, remedy: str) -> None:
-    """Write values as readable JSON, whole or not at all. Raises `OutputError`, which ends with `remedy`."""
-    # names that are not UTF-8 stay readable for JSON's readers as escapes
-    text = json.dumps(values, indent=2, ensure_ascii=False).encode("utf-8", "backslashreplace")
-    part = path.with_name(f".abflow-{secrets.token_hex(6)}{path.suffix}")
-    try:
-        with part.open("xb") as file:
-            file.write(text + b"\n")
-            file.flush()
-            os.fsync(file.fileno())  # else a power cut may leave an empty file of the final name
-        part.replace(path)
-    except OSError as error:
-        raise OutputError(f"{path} cannot be written: {error.strerror}; {remedy}") from None
-    finally:
-        part.unlink(missing_ok=True)

@@ -1,0 +1,123 @@
+"""Temporary files and folders: locked while in use, so that the next run knows what a killed one left behind.
+
+A lock goes with its process, however that ends. Leftovers of other computers, whose locks a shared folder
+need not show, are taken for such only after a week.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import platform
+import re
+import secrets
+import shutil
+import sys
+import tempfile
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+
+_HOST = hashlib.blake2b(platform.node().encode(), digest_size=4).hexdigest()
+_PART = re.compile(r"\.abflow-([0-9a-f]{8})-[0-9a-f]{12}(\.\w+)?")
+_FOLDER = re.compile(r"hugin-abflow-([0-9a-f]{8})-\w+")
+_LOCK = "in use"
+_WEEK = 7 * 24 * 3600.0
+
+
+@contextmanager
+def part_beside(final: Path, suffix: str | None = None) -> Iterator[Path]:
+    """A new, empty file beside `final`, to be written and renamed; nothing else is left of it.
+
+    suffix      of its name; default: that of `final`.
+
+    What killed runs left in the folder is removed. Raises OSError.
+    """
+    sweep(final.parent)
+    part, descriptor = _create(final, final.suffix if suffix is None else suffix)
+    try:
+        yield part
+    finally:
+        part.unlink(missing_ok=True)
+        if descriptor is not None:
+            os.close(descriptor)
+
+
+def _create(final: Path, suffix: str) -> tuple[Path, int | None]:
+    """A file that is in use until the descriptor is closed; Windows needs none."""
+    while True:
+        part = final.with_name(f".abflow-{_HOST}-{secrets.token_hex(6)}{suffix}")
+        descriptor = os.open(part, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o666)  # never somebody else's file
+        if sys.platform == "win32":
+            os.close(descriptor)  # else it could not be renamed; what is written there cannot be removed
+            return part, None
+        _lock(descriptor)
+        if os.fstat(descriptor).st_nlink:
+            return part, descriptor
+        os.close(descriptor)  # swept before it was locked
+
+
+@contextmanager
+def work_folder() -> Iterator[Path]:
+    """A folder for temporary files under TMPDIR; nothing is left of it. Raises OSError."""
+    # asked each time: Python remembers the first TMPDIR that it saw
+    named = os.environ.get("TMPDIR", "")
+    root = Path(named if named and Path(named).is_dir() else tempfile.gettempdir())
+    sweep(root)
+    while True:
+        folder = Path(tempfile.mkdtemp(prefix=f"hugin-abflow-{_HOST}-", dir=root))
+        descriptor = os.open(folder / _LOCK, os.O_CREAT | os.O_WRONLY, 0o600)
+        _lock(descriptor)
+        if (folder / _LOCK).exists():
+            break
+        os.close(descriptor)  # swept before it was locked
+    try:
+        yield folder
+    finally:
+        os.close(descriptor)
+        shutil.rmtree(folder, ignore_errors=True)
+
+
+def sweep(folder: Path) -> None:
+    """Remove temporary files and folders in `folder` that nobody uses any more."""
+    with suppress(OSError), os.scandir(folder) as entries:
+        for entry in entries:
+            if (found := _PART.fullmatch(entry.name)) and entry.is_file(follow_symlinks=False):
+                if _abandoned(Path(entry.path), found[1]):
+                    Path(entry.path).unlink(missing_ok=True)
+            elif (found := _FOLDER.fullmatch(entry.name)) and entry.is_dir(follow_symlinks=False):
+                lock = Path(entry.path) / _LOCK
+                # without its lock a folder was made just now, or is being removed
+                if lock.is_file() and _abandoned(lock, found[1]):
+                    shutil.rmtree(entry.path, ignore_errors=True)
+
+
+def _abandoned(path: Path, host: str) -> bool:
+    """Whether nobody holds the lock of a file."""
+    try:
+        if host != _HOST and time.time() - path.stat().st_mtime < _WEEK:
+            return False
+        if sys.platform == "win32":
+            path.unlink()  # refused while it is open
+            return True
+        descriptor = os.open(path, os.O_RDWR)
+    except OSError:
+        return False
+    try:
+        return _lock(descriptor, wait=False)
+    finally:
+        os.close(descriptor)
+
+
+def _lock(descriptor: int, wait: bool = True) -> bool:
+    """Lock an open file; false if that is not possible (or, without `wait`, not now)."""
+    if sys.platform == "win32":
+        return True
+    import fcntl  # Unix alone has it
+
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))
+    except OSError:  # held by another, or a file system without locks: then nothing is ever removed
+        return False
+    return True

@@ -1,0 +1,123 @@
+"""Temporary files and folders: what is in use stays, what nobody uses goes."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from conftest import age, names_in
+
+from hugin_abflow import scratch
+from hugin_abflow.scratch import part_beside, sweep, work_folder
+
+# A process that makes both kinds, says so, and waits to be killed.
+HOLDER = """
+import sys, time
+from pathlib import Path
+from hugin_abflow.scratch import part_beside, work_folder
+with part_beside(Path(sys.argv[1]) / "pano.tif") as part, work_folder() as folder:
+    part.write_text("half"), (folder / "layer.tif").write_text("half")
+    print("ready", flush=True)
+    time.sleep(60)
+"""
+
+
+@pytest.fixture
+def root(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.setenv("TMPDIR", str(tmp_path))
+    return tmp_path
+
+
+def hold(root: Path) -> subprocess.Popen[str]:
+    child = subprocess.Popen([sys.executable, "-c", HOLDER, root], stdout=subprocess.PIPE, text=True)
+    assert child.stdout is not None and child.stdout.readline() == "ready\n"
+    return child
+
+
+def test_nothing_is_left(root: Path) -> None:
+    final = root / "pano.tif"
+    with part_beside(final) as part, work_folder() as folder:
+        assert part.parent == root and part.suffix == ".tif" and part.read_bytes() == b""
+        assert folder.parent == root
+        part.write_text("whole")
+        part.replace(final)
+    assert names_in(root) == ["pano.tif"] and final.read_text() == "whole"
+
+
+def test_what_fails_leaves_nothing(root: Path) -> None:
+    with pytest.raises(ZeroDivisionError), part_beside(root / "a.tif", ".png") as part, work_folder():
+        assert part.suffix == ".png"
+        raise ZeroDivisionError
+    assert names_in(root) == []
+
+
+def test_what_is_in_use_stays_and_what_was_left_goes(root: Path) -> None:
+    child = hold(root)
+    before = names_in(root)
+    assert len(before) == 2
+    sweep(root)
+    with part_beside(root / "other.tif"), work_folder():  # the next run sweeps
+        pass
+    assert names_in(root) == before
+    child.kill()
+    child.wait()
+    assert names_in(root) == before  # nobody tidied up
+    with work_folder():
+        pass
+    assert names_in(root) == []
+
+
+@pytest.mark.skipif(os.name == "nt", reason="Windows has no SIGSTOP")
+def test_a_run_that_is_stopped_still_uses_its_files(root: Path) -> None:
+    child = hold(root)
+    child.send_signal(signal.SIGSTOP)
+    before = names_in(root)
+    sweep(root)
+    assert names_in(root) == before
+    child.kill()
+    child.wait()
+
+
+def test_leftovers_of_other_computers_go_after_a_week(root: Path) -> None:
+    foreign = root / ".abflow-0123abcd-0123456789ab.tif"
+    foreign.touch()
+    sweep(root)
+    assert foreign.exists()
+    age(foreign, 8 * 24 * 3600)
+    sweep(root)
+    assert not foreign.exists()
+
+
+def test_what_is_not_ours_stays(root: Path) -> None:
+    """Names alike, a link, a folder that is only just being made."""
+    (root / "target").touch()
+    link = f".abflow-{scratch._HOST}-0123456789ab.tif"
+    (root / link).symlink_to(root / "target")
+    (root / ".abflow").mkdir()
+    (root / ".abflow-notes.txt").touch()
+    (root / f"hugin-abflow-{scratch._HOST}-abcdefgh").mkdir()
+    before = names_in(root)
+    sweep(root)
+    assert names_in(root) == before
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="another mechanism there")
+def test_file_system_without_locks_keeps_everything(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    import fcntl
+
+    def refuse(descriptor: int, how: int) -> None:
+        raise OSError(37, "No locks available")
+
+    monkeypatch.setattr(fcntl, "flock", refuse)
+    left = root / f".abflow-{scratch._HOST}-0123456789ab.tif"
+    left.touch()
+    with part_beside(root / "a.tif") as part:
+        assert part.exists() and left.exists()
+
+
+def test_folder_that_cannot_be_listed_is_no_error(root: Path) -> None:
+    sweep(root / "gone")
