@@ -193,6 +193,13 @@ _information = partial(click.option, cls=Option, group="Information")
 )
 @_batch("--recursive", is_flag=True, help="Look for projects in the folders of folders, too.")
 @_batch(
+    "--resume",
+    is_flag=True,
+    help="Skip panoramas that still hold: same project, photos, settings and version as when they were made. "
+    "This is what happens where several projects or a folder are named.",
+)
+@_batch("--force", is_flag=True, help="Make all panoramas anew, those that still hold, too.")
+@_batch(
     "--jobs",
     metavar="N",
     type=click.IntRange(1, 64),
@@ -229,6 +236,8 @@ _information = partial(click.option, cls=Option, group="Information")
 def command(
     projects: tuple[Path, ...],
     recursive: bool,
+    resume: bool,
+    force: bool,
     jobs: int | None,
     report: Path | None,
     log: Path | None,
@@ -248,13 +257,16 @@ def command(
     """
     if quiet and verbose:
         raise click.UsageError("-q and -v contradict each other")
+    if resume and force:
+        raise click.UsageError("--resume and --force contradict each other")
     options = _options(**chosen)
     found = find_projects(projects, recursive)
     if len(found) > 1 and (options["output"] or options["layers"]):
         option = "-o" if options["output"] else "--layers"
         raise click.UsageError(f"{option} is for one project, but there are {len(found)}")
     how = Run(jobs, report, log, quiet, verbose, _arguments(), profile)
-    return run([Task(project, options) for project in found], how)
+    remember = resume or force or len(found) > 1 or any(place.is_dir() for place in projects)
+    return run([Task(project, options, remember and not force, remember) for project in found], how)
 
 
 def _options(

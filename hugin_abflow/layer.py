@@ -6,6 +6,7 @@ covers [x, x+1) x [y, y+1), so its centre is at (x + 0.5, y + 0.5).
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -14,7 +15,9 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from hugin_abflow.errors import ImageReadError
+from hugin_abflow.errors import ImageReadError, LayersMismatchError
+
+_log = logging.getLogger(__name__)
 
 # Rows `top` to `bottom` (exclusive) of a layer: (bottom - top, width, channels + 1), alpha last.
 RowReader = Callable[[int, int], npt.NDArray[Any]]
@@ -145,3 +148,35 @@ def bounding_box(layers: Sequence[Layer]) -> Box:
         max(box.right for box in boxes),
         max(box.bottom for box in boxes),
     )
+
+
+def check_layers(canvas: Canvas, layers: Sequence[Layer]) -> None:
+    """Raise `LayersMismatchError` unless the layers fit the canvas and each other.
+
+    Canvas size (where a layer's file tells it), place inside the canvas, depth, number of channels.
+    """
+    size = f"{canvas.width}x{canvas.height}"
+    again = "make the layers again with nona, or leave the file out"
+    for layer in layers:
+        name, box, first = layer.file or layer.name, layer.box, layers[0]
+        if layer.canvas_size not in (None, (canvas.width, canvas.height)):
+            made_for = "{}x{}".format(*layer.canvas_size or ())
+            raise LayersMismatchError(
+                f"{name} was made for a canvas of {made_for}, the project's is {size}; {again}"
+            )
+        if min(box.left, box.top) < 0 or box.right > canvas.width or box.bottom > canvas.height:
+            raise LayersMismatchError(
+                f"{name} covers columns {box.left} to {box.right} and rows {box.top} to {box.bottom}, "
+                f"outside the canvas of {size}; {again}"
+            )
+        if layer.dtype != first.dtype:
+            raise LayersMismatchError(
+                f"{name} has {layer.dtype} samples, {first.name} has {first.dtype}; {again}"
+            )
+        if layer.channels != first.channels:
+            kinds = {1: "grey", 3: "RGB"}
+            raise LayersMismatchError(
+                f"{name} is {kinds[layer.channels]}, {first.name} is {kinds[first.channels]}; {again}"
+            )
+        if layer.icc != first.icc:
+            _log.warning("%s and %s differ in ICC profile; the first layer's is used", name, first.name)

@@ -17,7 +17,6 @@ from typing import Literal, get_args
 from hugin_abflow import pto, tifftags
 from hugin_abflow.errors import (
     ImageReadError,
-    LayersMismatchError,
     LayersMissingError,
     NonaFailedError,
     NonaMissingError,
@@ -26,7 +25,7 @@ from hugin_abflow.errors import (
     SettingsError,
 )
 from hugin_abflow.images import read_layers
-from hugin_abflow.layer import Canvas, Layer
+from hugin_abflow.layer import Layer, check_layers
 from hugin_abflow.progress import Progress, silent
 from hugin_abflow.project import Plan, PlannedImage
 from hugin_abflow.scratch import part_beside, work_folder
@@ -84,38 +83,6 @@ def open_layers(
         opened = [layer for file in files for layer in read_layers(file)]
         check_layers(plan.canvas, opened)
         yield opened
-
-
-def check_layers(canvas: Canvas, layers: Sequence[Layer]) -> None:
-    """Raise `LayersMismatchError` unless the layers fit the canvas and each other.
-
-    Canvas size (where a layer's file tells it), place inside the canvas, depth, number of channels.
-    """
-    size = f"{canvas.width}x{canvas.height}"
-    again = "make the layers again with nona, or leave the file out"
-    for layer in layers:
-        name, box, first = layer.file or layer.name, layer.box, layers[0]
-        if layer.canvas_size not in (None, (canvas.width, canvas.height)):
-            made_for = "{}x{}".format(*layer.canvas_size or ())
-            raise LayersMismatchError(
-                f"{name} was made for a canvas of {made_for}, the project's is {size}; {again}"
-            )
-        if min(box.left, box.top) < 0 or box.right > canvas.width or box.bottom > canvas.height:
-            raise LayersMismatchError(
-                f"{name} covers columns {box.left} to {box.right} and rows {box.top} to {box.bottom}, "
-                f"outside the canvas of {size}; {again}"
-            )
-        if layer.dtype != first.dtype:
-            raise LayersMismatchError(
-                f"{name} has {layer.dtype} samples, {first.name} has {first.dtype}; {again}"
-            )
-        if layer.channels != first.channels:
-            kinds = {1: "grey", 3: "RGB"}
-            raise LayersMismatchError(
-                f"{name} is {kinds[layer.channels]}, {first.name} is {kinds[first.channels]}; {again}"
-            )
-        if layer.icc != first.icc:
-            log.warning("%s and %s differ in ICC profile; the first layer's is used", name, first.name)
 
 
 def _check_request(remap: str, named: bool) -> None:
@@ -198,6 +165,20 @@ def _find(plan: Plan) -> _Found | None:
     names = [f"{name}_hdr_" for name in names if plan.hdr] + names  # what hugin_executor calls them
     found = [layers for name in names if (layers := _find_under(plan, str(plan.folder / name)))]
     return min(found, key=lambda f: (bool(f.missing(plan)), bool(f.stale(plan))), default=None)
+
+
+def layers_there(
+    plan: Plan, prefix: str | Path | None, layers: Sequence[str | Path] | None, remap: Remap
+) -> list[Path]:
+    """The files that `open_layers` would find with these arguments; they may be stale, or not be there."""
+    if layers:
+        return [Path(path) for path in layers]
+    if prefix:
+        under = (_find_under(plan, place) for place in _places(plan, os.fspath(prefix)))
+        found = next((layers for layers in under if layers), None)
+    else:
+        found = None if remap == "always" else _find(plan)
+    return found.in_order() if found else []
 
 
 def _layers_by_prefix(plan: Plan, prefix: str | Path) -> _Found:

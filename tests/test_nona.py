@@ -24,8 +24,8 @@ from hugin_abflow.errors import (
     PhotoMissingError,
 )
 from hugin_abflow.images import read_layers, write_image
-from hugin_abflow.layer import Box, Canvas, Layer
-from hugin_abflow.nona import check_layers, open_layers
+from hugin_abflow.layer import Box, Canvas, Layer, check_layers
+from hugin_abflow.nona import open_layers
 from hugin_abflow.project import read_plan
 
 pytestmark = pytest.mark.usefixtures("temporary")

@@ -17,12 +17,12 @@ from typing import Any, Protocol
 from hugin_abflow import nona, trace
 from hugin_abflow.batch import memory
 from hugin_abflow.batch.record import Record
+from hugin_abflow.batch.state import State
 from hugin_abflow.errors import AbflowError, DeviceError
 from hugin_abflow.merge import merge_project
 from hugin_abflow.metadata import version
 from hugin_abflow.opencl import Device
 from hugin_abflow.progress import Advance
-from hugin_abflow.project import read_plan
 from hugin_abflow.settings import Settings
 from hugin_abflow.terminal import explain, is_bug, messages
 
@@ -35,10 +35,13 @@ class Task:
 
     project     the file, as the user named it.
     options     keywords of `merge_project`.
+    resume      leave what was made before as it is if it still holds. remember: so that this can be told.
     """
 
     project: Path
     options: Mapping[str, Any] = field(default_factory=dict)
+    resume: bool = False
+    remember: bool = False
 
 
 class Listener(Protocol):
@@ -74,17 +77,32 @@ def perform(task: Task, listener: Listener, level: int = logging.WARNING) -> Rec
 
     with messages(level, show=show):
         try:
-            _stitch(task, record, listener)
+            state = _state(task)
+            if state:
+                record.inputs = _sizes(state.inputs())
+            if state and (task.resume or task.remember):
+                state.begin()
+            if not (state and task.resume and state.restore(record)):
+                _stitch(task, record, listener)
+                if state and task.remember:
+                    state.save(record)
         except Exception as error:
+            record.result = "failed"
             if isinstance(error, DeviceError):
                 _device.cache_clear()  # a lost device does not come back; its successor may
             if is_bug(error):
                 _log.info("%s", traceback.format_exc().rstrip())
             record.message, record.exit_code = explain(str(task.project), error)
-    record.inputs = _inputs(task.project)
     record.seconds = round(time.monotonic() - began, 3)
     record.memory = memory.peak()
     return record
+
+
+def _state(task: Task) -> State | None:
+    """What is remembered of the project; None where it cannot be read, of which `merge_project` tells."""
+    with suppress(AbflowError, OSError):
+        return State(task.project, task.options, settings_of(task))
+    return None
 
 
 def _stitch(task: Task, record: Record, listener: Listener) -> None:
@@ -123,15 +141,7 @@ def settings_of(task: Task) -> dict[str, Any]:
 def _plain(value: Any) -> Any:
     if isinstance(value, list | tuple):
         return [_plain(item) for item in value]
-    return str(value) if isinstance(value, Path) else value
-
-
-def _inputs(project: Path) -> list[dict[str, Any]]:
-    """The project and its photos, as far as they are there."""
-    with suppress(AbflowError, OSError):
-        photos = [image.photo for image in read_plan(project).images]
-        return _sizes([project, *(photo for photo in photos if photo.is_file())])
-    return []
+    return value if value is None or isinstance(value, bool | int | float | str) else str(value)
 
 
 def _sizes(files: list[Path]) -> list[dict[str, Any]]:

@@ -13,10 +13,9 @@ from hugin_abflow.dropin.weights import MaskedMerge
 from hugin_abflow.errors import CommandLineError, ExitCode, LayersMismatchError, LayersMissingError
 from hugin_abflow.guides import Guide
 from hugin_abflow.images import read_layers
-from hugin_abflow.layer import Box, Canvas, Layer, bounding_box
+from hugin_abflow.layer import Box, Canvas, Layer, bounding_box, check_layers
 from hugin_abflow.merge import guides_between, refuse_input, write_panorama
 from hugin_abflow.metadata import PROGRAM, describe, version
-from hugin_abflow.nona import check_layers
 from hugin_abflow.progress import Progress
 from hugin_abflow.project import read_plan
 from hugin_abflow.settings import Settings

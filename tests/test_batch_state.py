@@ -1,0 +1,220 @@
+"""What still holds is skipped, and nothing else: changes of inputs, settings and panoramas are seen."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import tifffile
+from conftest import age, names_in
+from shoots import HEIGHT, WIDTH, write_project
+
+from hugin_abflow.batch import state, task
+from hugin_abflow.batch.record import Record
+from hugin_abflow.batch.task import Task, perform
+from hugin_abflow.settings import Settings
+
+Make = Callable[..., Record]
+PHOTO = np.full((120, 120, 3), 7, np.uint8)
+
+
+class Deaf:
+    def phase_began(self, name: str, total: int) -> None: ...
+    def advanced(self, name: str, units: int) -> None: ...
+    def phase_ended(self, name: str, seconds: float) -> None: ...
+    def message(self, level: int, text: str) -> None: ...
+
+
+@pytest.fixture
+def shoot(tmp_path: Path) -> Path:
+    folder = tmp_path / "shoot"
+    write_project(folder / "tiny.pto")
+    tifffile.imwrite(folder / "right.png", PHOTO)
+    for file in folder.iterdir():
+        age(file, 60)
+    return folder
+
+
+@pytest.fixture
+def make(shoot: Path, monkeypatch: pytest.MonkeyPatch) -> Make:
+    """Stitch tiny.pto as a batch does; a panorama is written, but quickly."""
+
+    def merge(path: Path, output: Path | None = None, **keywords: Any) -> Path:
+        target = output or path.with_suffix(".tif")
+        pixels = np.zeros((HEIGHT, WIDTH, 4), np.uint8) + np.uint8(len(list(path.parent.iterdir())))
+        tifffile.imwrite(target, pixels, photometric="rgb", extrasamples=["unassalpha"])
+        return target
+
+    monkeypatch.setattr(task, "merge_project", merge)
+
+    def run(folder: Path = shoot, resume: bool = True, **options: object) -> Record:
+        keywords = {"settings": Settings(), "output": None, "remap": "auto"} | options
+        return perform(Task(folder / "tiny.pto", keywords, resume, remember=True), Deaf())
+
+    return run
+
+
+def test_what_holds_is_skipped_and_recorded_as_it_was(make: Make, shoot: Path) -> None:
+    first = make()
+    assert first.result == "made" and first.warnings == []
+    written = (shoot / "tiny.tif").stat()
+    second = make()
+    assert second.result == "skipped" and second.exit_code == 0 and second.warnings == []
+    assert second.outputs == [{"file": str(shoot / "tiny.tif"), "bytes": written.st_size}]
+    assert [Path(entry["file"]).name for entry in second.inputs] == [
+        "tiny.pto", "right.png", "tiny0000.tif", "tiny0001.tif",
+    ]  # fmt: skip
+    assert (shoot / "tiny.tif").stat().st_mtime_ns == written.st_mtime_ns
+    assert make(resume=False).result == "made"
+
+
+def test_state_is_readable_and_lies_beside_the_panorama(make: Make, shoot: Path, tmp_path: Path) -> None:
+    make()
+    assert names_in(shoot / ".abflow") == ["tiny.pto.json"]
+    known = json.loads((shoot / ".abflow" / "tiny.pto.json").read_text("utf-8"))
+    assert known["settings"]["merge"] == "joint" and known["version"]
+    assert [entry["file"] for entry in known["outputs"]] == ["tiny.tif"]
+    elsewhere = tmp_path / "elsewhere"
+    elsewhere.mkdir()
+    assert make(output=elsewhere / "big.tif").result == "made"
+    assert names_in(elsewhere) == [".abflow", "big.tif"]
+    assert names_in(elsewhere / ".abflow") == ["big.tif.json"]
+    assert make(output=elsewhere / "big.tif").result == make().result == "skipped"
+
+
+@pytest.mark.parametrize("name", ["tiny.pto", "right.png", "tiny0000.tif"])
+def test_changed_input_is_seen_even_with_the_old_size(make: Make, shoot: Path, name: str) -> None:
+    make()
+    content = bytearray((shoot / name).read_bytes())
+    content[-3 if name == "tiny.pto" else 100] ^= 1
+    (shoot / name).write_bytes(bytes(content))
+    assert make().result == "made"
+    assert make().result == "skipped"
+
+
+def test_touched_input_is_not_changed(make: Make, shoot: Path) -> None:
+    make()
+    for name in ("tiny.pto", "right.png", "tiny0000.tif", "tiny.tif"):
+        os.utime(shoot / name)
+    assert make().result == "skipped"
+
+
+def test_new_and_lost_inputs_are_seen(make: Make, shoot: Path) -> None:
+    make()
+    tifffile.imwrite(shoot / "left.png", PHOTO)
+    assert make().result == "made"
+    (shoot / "tiny0001.tif").unlink()
+    assert make().result == "made"
+    assert make().result == "skipped"
+
+
+def test_input_that_changes_meanwhile_counts_as_changed(
+    make: Make, shoot: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    merge = task.merge_project
+
+    def slow(path: Path, **keywords: Any) -> Path:
+        (shoot / "right.png").write_bytes(b"saved again while the panorama was made")
+        return merge(path, **keywords)
+
+    monkeypatch.setattr(task, "merge_project", slow)
+    make()
+    monkeypatch.setattr(task, "merge_project", merge)
+    assert make().result == "made"
+
+
+def test_layers_that_were_kept_are_no_change(
+    make: Make, shoot: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (shoot / "tiny0001.tif").rename(shoot / "made by nona")
+    merge = task.merge_project
+
+    def keep(path: Path, **keywords: Any) -> Path:
+        shutil.copy(shoot / "made by nona", shoot / "tiny0001.tif")
+        return merge(path, **keywords)
+
+    monkeypatch.setattr(task, "merge_project", keep)
+    assert make(keep_layers=True).result == "made"
+    assert make(keep_layers=True).result == "skipped"
+
+
+@pytest.mark.parametrize(
+    "options",
+    [{"settings": Settings(seam=False)}, {"jpeg_quality": 80}, {"prefix": "tiny"}, {"metadata": False}],
+    ids=str,
+)
+def test_another_setting_makes_another_panorama(make: Make, options: dict[str, Any]) -> None:
+    make()
+    assert make(**options).result == "made"
+    assert make(**options).result == "skipped"
+
+
+@pytest.mark.parametrize(
+    "options", [{"settings": Settings(device="0", band_rows=64)}, {"remap": "never"}], ids=str
+)
+def test_how_the_work_is_done_does_not_count(make: Make, options: dict[str, Any]) -> None:
+    make()
+    assert make(**options).result == "skipped"
+
+
+def test_another_version_makes_another_panorama(make: Make, monkeypatch: pytest.MonkeyPatch) -> None:
+    make()
+    monkeypatch.setattr(state, "version", lambda: "99.0")
+    assert make().result == "made"
+
+
+def test_panorama_that_is_gone_or_damaged_is_made_again(make: Make, shoot: Path) -> None:
+    make()
+    (shoot / "tiny.tif").unlink()
+    assert make().result == "made"
+    whole = (shoot / "tiny.tif").read_bytes()
+    for damaged in (whole[: len(whole) // 2], b""):
+        (shoot / "tiny.tif").write_bytes(damaged)
+        assert make().result == "made"
+        assert len((shoot / "tiny.tif").read_bytes()) == len(whole)
+
+
+def test_panorama_that_was_retouched_is_left_as_it_is(make: Make, shoot: Path) -> None:
+    make()
+    tifffile.imwrite(shoot / "tiny.tif", PHOTO)
+    record = make()
+    assert record.result == "skipped" and "--force" in record.warnings[0]
+    assert (tifffile.imread(shoot / "tiny.tif") == PHOTO).all()
+
+
+@pytest.mark.parametrize(
+    "text", ["", "[]", "{", '{"schema": 1}', '{"schema": 1, "hash": 3, "inputs": [1], "outputs": "x"}']
+)
+def test_state_of_somebody_else_is_none(make: Make, shoot: Path, text: str) -> None:
+    make()
+    (shoot / ".abflow" / "tiny.pto.json").write_text(text)
+    assert make().result == "made"
+
+
+def test_folder_can_be_moved_as_a_whole(make: Make, shoot: Path) -> None:
+    make()
+    moved = shoot.rename(shoot.with_name("archive"))
+    record = make(folder=moved)
+    assert record.result == "skipped" and record.files == [moved / "tiny.tif"]
+
+
+def test_failure_is_not_remembered(make: Make, shoot: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail(path: Path, **keywords: Any) -> Path:
+        raise RuntimeError("a bug")
+
+    monkeypatch.setattr(task, "merge_project", fail)
+    assert make().result == "failed"
+    assert not (shoot / ".abflow").exists()
+
+
+def test_state_that_cannot_be_written_is_a_warning(make: Make, shoot: Path) -> None:
+    (shoot / ".abflow").write_text("a file where the folder belongs")
+    record = make()
+    assert record.result == "made" and record.exit_code == 0
+    assert "will be made again" in record.warnings[0]
