@@ -10,6 +10,7 @@ import errno
 import logging
 import os
 import shutil
+import struct
 from pathlib import Path
 from types import TracebackType
 from typing import Any
@@ -279,6 +280,8 @@ class ImageWriter:
             self._part.replace(self._final)
         except OSError as error:
             raise self._failure(error.strerror or str(error)) from None
+        except struct.error:  # libtiff does not tell when it could not write the last of a file
+            raise self._failure("the file is incomplete") from None
 
     def _discard(self) -> None:
         """Close and remove what is not finished; nothing is left of it after `_finish`."""

@@ -6,6 +6,7 @@ import logging
 import os
 import re
 import shutil
+import signal
 import subprocess
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
@@ -390,8 +391,9 @@ def _made(plan: Plan, folder: Path) -> dict[int, Path]:
 
 def _failure(plan: Plan, folder: Path, code: int, lines: list[str]) -> NonaFailedError:
     said = "\n  ".join(lines) or "(nothing)"
+    how = f"was killed ({signal.Signals(-code).name})" if code < 0 else f"failed (exit code {code})"
     return NonaFailedError(
-        f"nona failed on {plan.file} (exit code {code}); it wrote into {folder.parent}, TMPDIR chooses "
+        f"nona {how} on {plan.file}; it wrote into {folder.parent}, TMPDIR chooses "
         f"another folder. Its last lines:\n  {said}"
     )
 

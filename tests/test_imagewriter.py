@@ -376,15 +376,18 @@ def test_a_name_may_be_no_unicode_but_its_folder_must(tmp_path):
     assert folder.with_suffix(".tif").is_file()
 
 
-@pytest.mark.parametrize("ending", [".tif", ".png"])
-def test_full_disk(tmp_path, ending):
-    """A limit on file size stands for a full disk."""
+@pytest.mark.parametrize(("ending", "share"), [(".tif", 0.5), (".tif", 0.9999), (".png", 0.5)])
+def test_full_disk(tmp_path, ending, share):
+    """A limit on file size stands for a full disk: in the middle, and where only the end does not fit."""
     resource = pytest.importorskip("resource")
     import signal
 
     old_action = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
     soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, hard))
+    write_image(tmp_path / f"a{ending}", noise(np.uint16, width=401, height=301))
+    size = (tmp_path / f"a{ending}").stat().st_size
+    (tmp_path / f"a{ending}").unlink()
+    resource.setrlimit(resource.RLIMIT_FSIZE, (int(size * share), hard))
     try:
         with pytest.raises(OutputError, match=rf"a\{ending} cannot be written: [^\n]*;"):
             write_image(tmp_path / f"a{ending}", noise(np.uint16, width=401, height=301))

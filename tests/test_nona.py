@@ -227,7 +227,7 @@ def test_nona_fails(make_project, nona):
     plan = read_plan(make_project())
     plan.images[2].photo.write_bytes(b"no photo")
     with (
-        pytest.raises(NonaFailedError, match=r"nona failed on .*pano\.pto \(exit code 1\)") as error,
+        pytest.raises(NonaFailedError, match=r"nona failed \(exit code 1\) on .*pano\.pto;") as error,
         open_layers(plan),
     ):
         pass

@@ -77,11 +77,7 @@ def perform(task: Task, listener: Listener, level: int = logging.WARNING) -> Rec
 
     with messages(level, show=show):
         try:
-            state = _state(task)
-            if state:
-                record.inputs = _sizes(state.inputs())
-            if state and (task.resume or task.remember):
-                state.begin()
+            state = _state(task, record)
             if not (state and task.resume and state.restore(record)):
                 _stitch(task, record, listener)
                 if state and task.remember:
@@ -98,10 +94,16 @@ def perform(task: Task, listener: Listener, level: int = logging.WARNING) -> Rec
     return record
 
 
-def _state(task: Task) -> State | None:
-    """What is remembered of the project; None where it cannot be read, of which `merge_project` tells."""
+def _state(task: Task, record: Record) -> State | None:
+    """What is remembered of the project; tells `record` of the inputs. None where one of them cannot be read,
+    of which `merge_project` tells.
+    """
     with suppress(AbflowError, OSError):
-        return State(task.project, task.options, settings_of(task))
+        state = State(task.project, task.options, settings_of(task))
+        record.inputs = _sizes(state.inputs())
+        if task.resume or task.remember:
+            state.begin()
+        return state
     return None
 
 

@@ -1,0 +1,261 @@
+"""What goes wrong in the middle of a night: a clear error for one project, the others made, nothing lost or
+half-written, and the next run goes on where this one ended."""
+
+from __future__ import annotations
+
+import json
+import os
+import shlex
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pyopencl as cl
+import pytest
+import tifffile
+from conftest import names_in
+from shoots import HEIGHT, WIDTH, write_project
+from test_batch_pool import Watch, perform, posix, stand_in, tasks_in
+
+from hugin_abflow import opencl
+from hugin_abflow.batch import pool, task, worker
+from hugin_abflow.errors import ExitCode
+
+linux = pytest.mark.skipif(sys.platform != "linux", reason="needs Linux's file systems")
+
+
+@pytest.fixture
+def shoot(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+    """A folder of eight projects, b0 to b7. No temporary file is left in the end."""
+    scratch = tmp_path / "scratch"
+    scratch.mkdir()
+    monkeypatch.setenv("TMPDIR", str(scratch))
+    folder = tmp_path / "shoot"
+    for number in range(8):
+        write_project(folder / f"b{number}.pto")
+    yield folder
+    assert names_in(scratch) == []
+    assert temporary(folder) == []
+
+
+def temporary(folder: Path) -> list[str]:
+    return [str(path) for path in folder.rglob(".abflow-*")]
+
+
+def command(*arguments: object) -> list[str]:
+    return [sys.executable, "-m", "hugin_abflow", *map(str, arguments)]
+
+
+def run(*arguments: object) -> tuple[int, str]:
+    done = subprocess.run(command(*arguments), capture_output=True, text=True, timeout=120)
+    assert "Traceback" not in done.stderr
+    return done.returncode, done.stderr
+
+
+def results(report: Path) -> dict[str, dict[str, Any]]:
+    """Of a report, by the projects' names."""
+    found = json.loads(report.read_text("utf-8"))["projects"]
+    return {Path(record["project"]).stem: record for record in found}
+
+
+def whole(folder: Path) -> list[str]:
+    """The panoramas that are there, each of which is complete."""
+    made = sorted(folder.glob("b?.tif"))
+    assert all(tifffile.imread(path).shape == (HEIGHT, WIDTH, 4) for path in made)
+    return [path.stem for path in made]
+
+
+@linux
+def test_each_fault_fails_its_project_alone(shoot: Path, tmp_path: Path) -> None:
+    for ending in ("0000", "0001"):
+        (shoot / f"b1{ending}.tif").unlink()  # its photos are not there either
+    layer = shoot / "b20000.tif"
+    layer.write_bytes(layer.read_bytes()[:60_000])
+    (shoot / "b30000.tif").unlink()
+    (shoot / "b30000.tif").symlink_to("/proc/self/mem")  # as on a disk with errors
+    (shoot / "b4.pto").write_bytes(b"\x89PNG\r\n\x1a\n")
+    report = tmp_path / "report.json"
+    code, said = run(shoot, "--jobs", 2, "--report", report)
+    assert code == ExitCode.PARTIAL
+    found = results(report)
+    for name, its_code, part in (
+        ("b1", ExitCode.LAYERS_MISSING, "left.png (image 0) is not there"),
+        ("b2", ExitCode.IMAGE_READ, "b20000.tif cannot be read"),
+        ("b3", ExitCode.IMAGE_READ, "b30000.tif cannot be read"),
+        ("b4", ExitCode.PROJECT, "b4.pto: found"),
+    ):
+        record = found.pop(name)
+        assert (record["result"], record["exit_code"]) == ("failed", its_code)
+        assert part in record["message"] and record["message"] in said
+    assert {record["result"] for record in found.values()} == {"made"}
+    assert whole(shoot) == sorted(found) == ["b0", "b5", "b6", "b7"]
+
+
+@posix
+def test_nona_that_is_killed_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    stand_in(tmp_path, "kill -9 $$", monkeypatch)
+    for name in ("left.png", "right.png"):
+        (tmp_path / name).write_bytes(b"nobody looks at this")
+    killed = tasks_in(tmp_path, "a", remap="always")
+    records, _ = perform([*killed, *tasks_in(tmp_path, "b")], 1)
+    assert records["a"].exit_code == ExitCode.NONA and "was killed (SIGKILL)" in records["a"].message
+    assert records["a"].attempts == 1 and records["b"].result == "made"
+
+
+def mounted(shoot: Path, size: str, script: str, *arguments: object) -> subprocess.CompletedProcess[str]:
+    """Run the program on a part of `shoot` on a small disk, after the shell's `script`; list the disk."""
+    disk = shoot.parent / "disk"
+    disk.mkdir()
+    words = shlex.join(command(disk, *arguments))
+    inside = (
+        f"mount -t tmpfs -o size={size} none {shlex.quote(str(disk))} && "
+        f"cp {shlex.quote(str(shoot))}/b[0-2]* {shlex.quote(str(disk))} && cd {shlex.quote(str(disk))} && "
+        f"{script} {{ {words} >/dev/null; echo $?; ls -A; }}"
+    )
+    done = subprocess.run(
+        ["unshare", "--user", "--map-root-user", "--mount", "sh", "-c", inside],
+        capture_output=True,
+        text=True,
+        timeout=120,
+    )
+    if "unshare" in done.stderr or "mount:" in done.stderr:
+        pytest.skip(f"no disk of its own can be mounted here: {done.stderr.strip()}")
+    assert "Traceback" not in done.stderr
+    return done
+
+
+@linux
+def test_full_disk(shoot: Path) -> None:
+    """Room for three projects and one panorama and a half."""
+    room = sum(path.stat().st_size for path in shoot.glob("b[0-2]*")) + WIDTH * HEIGHT * 4
+    done = mounted(shoot, f"{room // 1024 + 100}k", "", "--jobs", 1, "--compression", "none")
+    code, *names = done.stdout.split()
+    assert code == str(ExitCode.PARTIAL), done.stderr
+    assert [name for name in names if name in ("b0.tif", "b1.tif", "b2.tif")] == ["b0.tif"]
+    assert "b1.tif cannot be written: " in done.stderr and "is there room in the folder" in done.stderr
+    assert [name for name in names if name.startswith(".abflow-")] == []
+
+
+@linux
+def test_folder_that_cannot_be_written(shoot: Path) -> None:
+    done = mounted(shoot, "9m", "mount -o remount,ro . &&")
+    code, *names = done.stdout.split()
+    assert code == str(ExitCode.ALL_FAILED)
+    assert done.stderr.count("hugin-abflow: error: ") == 3
+    assert "Read-only file system" in done.stderr and "choose another folder" in done.stderr
+    assert [name for name in names if "abflow" in name or name == "b0.tif"] == []
+
+
+def lose_device(after: int) -> None:
+    """Let the device fail once, after so many kernels."""
+    real = cl.enqueue_nd_range_kernel
+    left = [after]
+
+    def enqueue(*arguments: Any) -> Any:
+        left[0] -= 1
+        if left[0] == 0:
+            code = cl.status_code.DEVICE_NOT_AVAILABLE
+            raise cl.RuntimeError(cl._cl._ErrorRecord("lost", code, "clEnqueueNDRangeKernel"))
+        return real(*arguments)
+
+    opencl.cl.enqueue_nd_range_kernel = enqueue
+
+
+def work_with_lost_device(*arguments: Any) -> None:
+    """A worker whose device is lost in its first project."""
+    lose_device(after=4)
+    worker.work(*arguments)
+
+
+def test_lost_device_costs_an_attempt(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(pool, "work", work_with_lost_device)
+    records, watch = perform(tasks_in(tmp_path, "a", "b"), 1)
+    assert {name: (r.result, r.attempts) for name, r in records.items()} == {
+        "a": ("made", 2),
+        "b": ("made", 1),
+    }
+    assert watch.begun == ["a", "b", "a"]
+    assert temporary(tmp_path) == []
+
+
+def test_lost_device_is_told_and_not_used_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(opencl.cl, "enqueue_nd_range_kernel", opencl.cl.enqueue_nd_range_kernel)
+    task._device.cache_clear()
+    first, second = tasks_in(tmp_path, "a", "b")
+    lose_device(after=4)
+    listener = Watch().began(first)
+    record = task.perform(first, listener)
+    assert record.exit_code == ExitCode.DEVICE and "the OpenCL device failed" in record.message
+    assert temporary(tmp_path) == [] and not (tmp_path / "a.tif").exists()
+    assert task._device.cache_info().currsize == 0
+    assert task.perform(second, listener).result == "made"
+
+
+def started(*arguments: object) -> subprocess.Popen[str]:
+    """A run with its processes in a group of their own."""
+    return subprocess.Popen(
+        command(*arguments), stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True
+    )
+
+
+def wait_for(folder: Path, count: int, child: subprocess.Popen[str]) -> None:
+    deadline = time.monotonic() + 60
+    while len(list(folder.glob("b?.tif"))) < count and child.poll() is None and time.monotonic() < deadline:
+        time.sleep(0.01)
+
+
+def group_is_gone(number: int) -> bool:
+    deadline = time.monotonic() + 30
+    while time.monotonic() < deadline:
+        try:
+            os.killpg(number, 0)
+        except ProcessLookupError:
+            return True
+        time.sleep(0.05)
+    return False
+
+
+@posix
+@pytest.mark.parametrize("which", ["everything", "the pool"])
+def test_killed_run_goes_on_where_it_was(shoot: Path, tmp_path: Path, which: str) -> None:
+    child = started(shoot, "--jobs", 2)
+    wait_for(shoot, 3, child)
+    if which == "everything":
+        os.killpg(child.pid, signal.SIGKILL)
+    else:
+        child.kill()  # its processes notice, and tidy up
+    child.communicate(timeout=30)
+    assert child.returncode == -signal.SIGKILL and group_is_gone(child.pid)
+    before = whole(shoot)
+    assert 3 <= len(before) < 8
+    if which == "the pool":
+        assert temporary(shoot) == []
+    remembered = [name.split(".")[0] for name in names_in(shoot / ".abflow") if name.endswith(".json")]
+    assert set(remembered) <= set(before) and len(remembered) >= 1
+    times = {name: (shoot / f"{name}.tif").stat().st_mtime_ns for name in remembered}
+    report = tmp_path / "report.json"
+    assert run(shoot, "--jobs", 2, "--report", report)[0] == 0
+    found = {name: record["result"] for name, record in results(report).items()}
+    assert found == {f"b{n}": "skipped" if f"b{n}" in remembered else "made" for n in range(8)}
+    assert whole(shoot) == [f"b{n}" for n in range(8)]
+    assert {name: (shoot / f"{name}.tif").stat().st_mtime_ns for name in remembered} == times
+    assert len({(shoot / f"b{n}.tif").read_bytes() for n in range(8)}) == 1  # all show the same
+
+
+@posix
+def test_control_c_reaches_all_and_leaves_nothing(shoot: Path, tmp_path: Path) -> None:
+    """On a terminal every process of the run gets it."""
+    report = tmp_path / "report.json"
+    child = started(shoot, "--jobs", 2, "--report", report)
+    wait_for(shoot, 3, child)  # so that one process has done two, and told of the first
+    os.killpg(child.pid, signal.SIGINT)
+    _, said = child.communicate(timeout=30)
+    assert child.returncode == ExitCode.INTERRUPTED and "Traceback" not in said, said
+    assert said.splitlines()[-1] == "hugin-abflow: interrupted"
+    assert group_is_gone(child.pid) and temporary(shoot) == []
+    made = [name for name, record in results(report).items() if record["result"] == "made"]
+    assert made and set(made) <= set(whole(shoot))
