@@ -64,19 +64,21 @@ def bands(
     full: Grid,
     grid: Grid,
     gain_grid: Grid,
+    shoulder: float,
     crop: Box,
     settings: Settings,
     advance: Advance,
 ) -> Iterator[npt.NDArray[Any]]:
     """Rows of the panorama, from the crop's top to its bottom: (rows, crop width, channels + 1) in the
-    layers' dtype, alpha last. `crop` is in canvas pixels; `advance` counts rows.
+    layers' dtype, alpha last. `crop` is in canvas pixels; `advance` counts rows. `shoulder` is that of the
+    exposure scale (colour.py).
     """
     height = settings.band_rows or max(_LEAST_ROWS, _BAND_PIXELS // crop.width)
     top = crop.top
     while top < crop.bottom:
         rest = Box(crop.left, top, crop.right, crop.bottom)
         try:
-            for out in _bands(device, layers, full, grid, gain_grid, rest, height, settings):
+            for out in _bands(device, layers, full, grid, gain_grid, shoulder, rest, height, settings):
                 yield out
                 advance(len(out))
                 top += len(out)
@@ -92,6 +94,7 @@ def _bands(
     full: Grid,
     grid: Grid,
     gain_grid: Grid,
+    shoulder: float,
     crop: Box,
     height: int,
     settings: Settings,
@@ -127,7 +130,7 @@ def _bands(
                 "blend", "blend_band", size, rows, device.upload(table[used]), len(used), ways, gained,
                 columns, lines, full.border, full.lens, grid.border, gain_grid.border,
                 (part.left, part.top, *size), (region.left, region.top),
-                int(settings.interpolation == "nearest"), share, out, options=options,
+                shoulder, int(settings.interpolation == "nearest"), share, out, options=options,
             )  # fmt: skip
             yield out.get().astype(first.dtype, copy=False)
 

@@ -8,13 +8,18 @@ through each layer, smoothly, and fades out. It is the minimum of
 
 with d_ab the measured difference of the aligned layers: a sparse linear system, solved directly. Where there
 is no difference it is exactly zero.
+
+Cameras' curves level off towards white, by which log odds move colours as exposure does; others run straight
+into it. The scale's shoulder, between both, is the one that leaves the least of the differences: else a
+gain is too large for bright things and too small for dark ones beside them, and steps remain.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -42,23 +47,59 @@ _SPREAD = 0.3
 _ROUNDS = ((0.1, 4.0), (1.0, 3.0), (100.0, 2.5))
 # The same, slower and stricter: what lies far from it is no exposure but something that only one layer shows.
 _STRICT = ((0.01, 4.0), (0.03, 2.5), (0.3, 1.6), (3.0, 1.2), (100.0, 1.0))
+# Weight of a clipped cell against smoothness: what it tells is a bound, of a brightness that nobody knows.
+_BOUND = 0.1
 # The correction fades out over this share of the canvas's width; a trend hardly does.
 _FADE, _TREND_FADE = 0.12, 1.0
 # All gains shrink towards 0 by this, at most a quarter of an 8-bit level, so that small ones are exactly 0.
 _NEGLIGIBLE = 1e-3
 
-# Of two layers, by their indices, a - b per cell of the colour grid, on the exposure scale:
-# (height, width, 4), r, g, b and a weight 0..1.
-Difference = tuple[int, int, npt.NDArray[np.float64]]
+# Shoulders of the exposure scale that are tried for integer images, and by how much better than the first,
+# which keeps white, another one has to explain the differences.
+_SHOULDERS = (1.0, 0.75, 0.5, 0.25)
+_BETTER = 0.8
+# Misfit, of full scale, that halves the trust in a cell.
+_MISFIT = 0.05
+
+
+@dataclass(frozen=True)
+class Difference:
+    """How layers a and b (indices) differ, float64 (height, width, 4) on the colour grid.
+
+    values  a - b on the exposure scale, r, g, b, and a weight 0..1.
+    beyond  the same where only one of them is clipped, a if the weight is positive, b if it is negative: at
+            least that much.
+    """
+
+    a: int
+    b: int
+    values: npt.NDArray[np.float64]
+    beyond: npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Measured:
+    """What the layers' overlaps tell of their exposure.
+
+    grid        the colour grid.
+    inside      (layers, height, width): the cells of each layer.
+    shoulder    of the exposure scale (common.cl).
+    """
+
+    grid: Grid
+    inside: npt.NDArray[np.bool_]
+    shoulder: float
+    differences: tuple[Difference, ...]
 
 
 @dataclass(frozen=True)
 class Correction:
-    """grid: the colour grid. gains: per layer, float32 (height, width, 4) on the exposure scale: r, g, b and
-    an unused 0; None: no correction.
+    """grid: the colour grid. shoulder: of the exposure scale. gains: per layer, float32 (height, width, 4) on
+    this scale: r, g, b and an unused 0; None: no correction.
     """
 
     grid: Grid
+    shoulder: float
     gains: tuple[Buffer | None, ...]
 
 
@@ -73,47 +114,50 @@ def clipping(layer: Layer) -> float:
     return _CLIPPED if layer.dtype.kind == "u" else math.inf
 
 
-def differences(
+def measure(
     device: Device,
     layers: Sequence[WorkingLayer],
     fields: Sequence[Buffer],
     pairs: Sequence[Pair],
     grid: Grid,
     covered: npt.NDArray[np.bool_],
-) -> list[Difference]:
-    """Measure the overlaps of the aligned layers. fields: of geometry.py, whose weights do not count here.
+) -> Measured:
+    """Compare the aligned layers in their overlaps. fields: of geometry.py, whose weights do not count here.
     covered: (layers, height, width) on any grid over the same region.
     """
     cells = colour_grid(grid, covered)
-    return [(pair.a, pair.b, _difference(device, layers, fields, pair, grid, cells)) for pair in pairs]
+    overlaps = [_Overlap(device, layers, fields, pair, grid, cells) for pair in pairs]
+    shoulder = _shoulder(overlaps) if layers[0].layer.dtype.kind == "u" else 0.0
+    differences = tuple(overlap.difference(shoulder) for overlap in overlaps)
+    return Measured(cells, on_cells(covered, cells, np.logical_or), shoulder, differences)
 
 
 def correction(
     device: Device,
-    measured: Sequence[Difference],
-    grid: Grid,
-    covered: npt.NDArray[np.bool_],
+    measured: Measured,
     settings: Settings,
     ignored: npt.NDArray[np.bool_] | None = None,
     strict: bool = False,
 ) -> Correction:
     """Solve for the gains of all layers.
 
-    measured, covered: of `differences`.
     ignored: (height, width) on any grid over the same region: what is no evidence, none of a cell's.
     strict: leave out what may not be exposure, to see it.
     With `settings.exposure` off there is no correction.
     """
-    cells = colour_grid(grid, covered)
+    cells, inside = measured.grid, measured.inside
+    none = Correction(cells, measured.shoulder, (None,) * len(inside))
     if not settings.exposure:
-        return Correction(cells, (None,) * len(covered))
+        return none
+    differences = measured.differences
     if ignored is not None:
-        counts = ~on_cells(ignored[None], cells, np.logical_or)[0]
-        measured = [(a, b, values * counts[..., None]) for a, b, values in measured]
-    if not any(np.any(d[..., :3] * d[..., 3:]) for _, _, d in measured):
-        return Correction(cells, (None,) * len(covered))
-    inside = on_cells(covered, cells, np.logical_or)
-    gains = solve(measured, inside, cells, _STRICT if strict else _ROUNDS)
+        counts = ~on_cells(ignored[None], cells, np.logical_or)[0, ..., None]
+        differences = tuple(
+            replace(d, values=d.values * counts, beyond=d.beyond * counts) for d in differences
+        )
+    if not any(np.any(v[..., :3] * v[..., 3:]) for d in differences for v in (d.values, d.beyond)):
+        return none
+    gains = solve(replace(measured, differences=differences), _STRICT if strict else _ROUNDS)
     gains = np.sign(gains) * np.maximum(np.abs(gains) - _NEGLIGIBLE, 0)
     result: list[Buffer | None] = []
     for gain, mask in zip(gains, inside, strict=True):
@@ -123,40 +167,65 @@ def correction(
         packed = np.zeros((*cells.shape, 4), np.float32)
         packed[..., :3] = _extend(gain, mask, cells.wraps)
         result.append(device.upload(packed))
-    return Correction(cells, tuple(result))
+    return replace(none, gains=tuple(result))
 
 
-def _difference(
-    device: Device,
-    layers: Sequence[WorkingLayer],
-    fields: Sequence[Buffer],
-    pair: Pair,
-    grid: Grid,
-    cells: Grid,
-) -> npt.NDArray[np.float64]:
-    """Difference a - b of a pair's aligned layers on the exposure scale, per cell of the grid `cells`.
+@dataclass(frozen=True)
+class _Overlap:
+    """Two aligned layers, to be compared per cell of the grid `cells`."""
 
-    (height, width, 4): r, g, b and a weight 0..1: the share of the cell's pixels that both layers show
-    unclipped, less where their differences scatter.
-    """
-    a, b = layers[pair.a], layers[pair.b]
-    integer = a.layer.dtype.kind == "u"
-    values = device.empty((*cells.shape, 4))
-    device.run(
-        "colour", "colour_difference", cells.border[:2],
-        a.pixels, fields[pair.a], a.box, b.pixels, fields[pair.b], b.box, grid.border, grid.lens,
-        cells.border, int(integer), clipping(a.layer), _SPREAD, values,
-    )  # fmt: skip
-    return values.get().astype(np.float64)
+    device: Device
+    layers: Sequence[WorkingLayer]
+    fields: Sequence[Buffer]
+    pair: Pair
+    grid: Grid
+    cells: Grid
+
+    @property
+    def _clipping(self) -> float:
+        return clipping(self.layers[self.pair.a].layer)
+
+    @property
+    def _sides(self) -> list[Any]:
+        """What both kernels begin with."""
+        pairs = [(self.layers[k], self.fields[k]) for k in (self.pair.a, self.pair.b)]
+        sides = [value for layer, field in pairs for value in (layer.pixels, field, layer.box)]
+        return [*sides, self.grid.border, self.grid.lens, self.cells.border]
+
+    def difference(self, shoulder: float) -> Difference:
+        """The difference on the exposure scale of a shoulder."""
+        values, beyond = (self.device.empty((*self.cells.shape, 4)) for _ in range(2))
+        self.device.run(
+            "colour", "colour_difference", self.cells.border[:2],
+            *self._sides, shoulder, self._clipping, _SPREAD, values, beyond,
+        )  # fmt: skip
+        host = (v.get().astype(np.float64) for v in (values, beyond))
+        return Difference(self.pair.a, self.pair.b, *host)
+
+    def misfit(self) -> npt.NDArray[np.float64]:
+        """What is left of the difference on the scale of each of _SHOULDERS: (cells, shoulders)."""
+        misfit = self.device.empty((*self.cells.shape, 4))
+        self.device.run(
+            "colour", "colour_misfit", self.cells.border[:2],
+            *self._sides, _SHOULDERS, self._clipping, misfit,
+        )  # fmt: skip
+        return misfit.get().astype(np.float64).reshape(-1, len(_SHOULDERS))
 
 
-def solve(
-    measured: Sequence[Difference],
-    inside: npt.NDArray[np.bool_],
-    cells: Grid,
-    rounds: Sequence[tuple[float, float]] = _ROUNDS,
-) -> npt.NDArray[np.float64]:
+def _shoulder(overlaps: Sequence[_Overlap]) -> float:
+    """The shoulder that explains the layers' differences best; the first, where none is clearly better."""
+    if not overlaps:
+        return _SHOULDERS[0]
+    misfit = np.concatenate([overlap.misfit() for overlap in overlaps])
+    # what no scale explains is no exposure, and counts for as little as it tells
+    total = (misfit / (1 + misfit.min(1, keepdims=True) / _MISFIT**2)).sum(0)
+    best = int(np.argmin(total))
+    return _SHOULDERS[best if total[best] < _BETTER * total[0] else 0]
+
+
+def solve(measured: Measured, rounds: Sequence[tuple[float, float]] = _ROUNDS) -> npt.NDArray[np.float64]:
     """Gains (layers, height, width, 3) for differences."""
+    cells, inside, differences = measured.grid, measured.inside, measured.differences
     latitude = cells.lens[2] - (np.arange(cells.height) + 0.5) * cells.lens[3]
     area = np.maximum(np.cos(latitude), 0.02)[:, None] if cells.lens[1] else np.ones((cells.height, 1))
     # a cell's sides: steps along a row are shorter near a pole, so neighbours there are bound closer
@@ -171,25 +240,60 @@ def solve(
         [(number, np.roll(number, -1, 2), east), (number, np.roll(number, -1, 1), south)], count
     )
     # what a layer is measured to be beside its own cells binds nothing else
-    evidence = [d[..., 3] * area * (inside[a] & inside[b]) for a, b, d in measured]
+    evidence = [d.values[..., 3] * area * (inside[d.a] & inside[d.b]) for d in differences]
     link, weight = _steps(
-        [(number[a], number[b], e) for (a, b, _), e in zip(measured, evidence, strict=True)], count
+        [(number[d.a], number[d.b], e) for d, e in zip(differences, evidence, strict=True)], count
     )
-    difference = np.concatenate([d[e > 0, :3] for (_, _, d), e in zip(measured, evidence, strict=True)])
+    difference = np.concatenate([d.values[e > 0, :3] for d, e in zip(differences, evidence, strict=True)])
+    bounds = _Bounds(measured, number, area, count)
     smooth = step.T @ diags_array(stiffness) @ step
     round_ = cells.circumference / (cells.lens[1] or 1.0)  # cells
     solution = np.zeros((count, 3))
     for data, limit in rounds:
         fade = _TREND_FADE if rounds is _STRICT and data < rounds[-1][0] else _FADE
         hold = (inside * area)[inside] / max(1.0, fade * round_) ** 2
-        off = np.linalg.norm(link @ solution + difference, axis=1) if solution.any() else 0.0
-        trusted = data * weight * np.maximum(0.0, 1 - (off / limit) ** 2) ** 2  # Tukey's biweight
-        matrix = diags_array(hold) + smooth + link.T @ diags_array(trusted) @ link
+        off = link @ solution + difference if solution.any() else np.zeros_like(difference)
+        trusted = data * weight * _biweight(off, limit)
+        held, pull = bounds.active(solution, limit)
+        matrix = diags_array(hold + held) + smooth + link.T @ diags_array(trusted) @ link
         factors = splu(matrix.tocsc(), "MMD_AT_PLUS_A", diag_pivot_thresh=0, options={"SymmetricMode": True})
-        solution = factors.solve(-(link.T @ (trusted[:, None] * difference)))
+        solution = factors.solve(pull - link.T @ (trusted[:, None] * difference))
     result = np.zeros((*inside.shape, 3))
     result[inside] = solution
     return result
+
+
+class _Bounds:
+    """Where only one of two layers is clipped, the other is to be raised by their difference at least."""
+
+    def __init__(
+        self, measured: Measured, number: npt.NDArray[np.intp], area: npt.NDArray[np.float64], count: int
+    ) -> None:
+        unknowns, targets, weights = [], [], []
+        for d in measured.differences:
+            for other, sign in ((d.b, 1.0), (d.a, -1.0)):
+                weight = np.maximum(sign * d.beyond[..., 3], 0) * area * measured.inside[other]
+                unknowns.append(number[other][weight > 0])
+                targets.append(sign * d.beyond[weight > 0, :3])
+                weights.append(weight[weight > 0])
+        self._count = count
+        self._unknowns, self._targets, self._weights = map(np.concatenate, (unknowns, targets, weights))
+
+    def active(
+        self, solution: npt.NDArray[np.float64], limit: float
+    ) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
+        """How strongly each unknown of a solution is held, (count,), and pulled, (count, 3)."""
+        short = self._targets - solution[self._unknowns]
+        weight = _BOUND * self._weights * (short.mean(1) > 0) * _biweight(short, limit)
+        held, pull = np.zeros(self._count), np.zeros((self._count, 3))
+        np.add.at(held, self._unknowns, weight)
+        np.add.at(pull, self._unknowns, weight[:, None] * self._targets)
+        return held, pull
+
+
+def _biweight(off: npt.NDArray[np.float64], limit: float) -> npt.NDArray[np.float64]:
+    """Tukey's biweight of vectors (n, 3): 1 at 0, nothing from `limit` on."""
+    return np.asarray(np.maximum(0.0, 1 - (np.square(off).sum(1) / limit**2)) ** 2)
 
 
 def _steps(

@@ -62,6 +62,7 @@ class Prepared:
     full: Grid
     grid: Grid
     gain_grid: Grid
+    shoulder: float
 
 
 def merge(
@@ -87,7 +88,7 @@ def bands(
     with progress("blend", canvas.crop.height) as advance:
         yield from blend.bands(
             device, prepared.layers, prepared.full, prepared.grid, prepared.gain_grid,
-            canvas.crop, settings, advance,
+            prepared.shoulder, canvas.crop, settings, advance,
         )  # fmt: skip
 
 
@@ -150,7 +151,7 @@ def prepare(
         ]
         advance(1)
     final += [_unblended(device, everything[i]) for i in range(len(everything)) if i not in used]
-    return Prepared(tuple(final), full, grid, correction.grid)
+    return Prepared(tuple(final), full, grid, correction.grid, correction.shoulder)
 
 
 def _align(
@@ -172,8 +173,8 @@ def _align(
     coefficients = transition.narrow(device, layers, whole, flows, grid, settings)
     fields = geometry.fields(device, layers, coefficients, flows, grid, settings)
     del whole, coefficients  # as large as the layers, and not needed again
-    measured = colour.differences(device, layers, fields, pairs, grid, masks.host)
-    correct = partial(colour.correction, device, measured, grid, masks.host)
+    measured = colour.measure(device, layers, fields, pairs, grid, masks.host)
+    correct = partial(colour.correction, device, measured)
     # exposure explains a difference whether it is corrected or not
     exposure = replace(settings, exposure=True)
     for _ in range(_SEAM_ROUNDS if settings.seam else 0):

@@ -213,11 +213,10 @@ def _difference(
     sides: list[Any] = []
     for k in (pair.a, pair.b):
         sides += [layers[k].pixels, fields[k], layers[k].box, correction.gains[k] or none]
-    integer = layers[pair.a].layer.dtype.kind == "u"
     clipped = math.inf if squared else clipping(layers[pair.a].layer)
     device.run(
         "seam", "seam_difference", cells.border[:2], *sides, grid.border, grid.lens,
-        correction.grid.border, cells.border, int(integer), clipped, int(squared), difference,
+        correction.grid.border, cells.border, correction.shoulder, clipped, int(squared), difference,
     )  # fmt: skip
     return difference.get().astype(np.float64)
 

@@ -144,8 +144,8 @@ static inline float3 blend_gain(__global const float4 *gains, __global const ble
 }
 
 /* Smooth exposure correction of a colour in stored units. */
-static inline float3 blend_correct(float3 c, float3 gain) {
-    return blend_any(gain) ? exposure_raise(c, exponential(gain.xyzz).xyz - 1.0f, WHITE, INTEGER) : c;
+static inline float3 blend_correct(float3 c, float3 gain, float shoulder) {
+    return blend_any(gain) ? exposure_raise(c, exponential(gain.xyzz).xyz - 1.0f, WHITE, shoulder) : c;
 }
 
 /* atan2 of a positive x; a few terms of the series do where the angle is small, as it nearly always is. */
@@ -204,6 +204,7 @@ __kernel void blend_band(
     int4 field_border, int4 gain_border, /* working grid; colour grid */
     int4 band,                           /* the band's place: left, top, run size */
     int2 origin,                         /* the region's place on the canvas */
+    float shoulder,                      /* of the exposure scale */
     int nearest,                         /* 1: nearest-neighbour sampling */
     float share,                         /* of all weight, below which a layer is hidden */
     __global blend_pixel *out)           /* (band.w, band.z) */
@@ -231,7 +232,7 @@ __kernel void blend_band(
     int corrected = 0;
     if (reference.w != 0.0f) {
         const float3 gain = blend_gain(gains, layers + first, y, cell, gain_border);
-        reference.xyz = blend_correct(reference.xyz, gain);
+        reference.xyz = blend_correct(reference.xyz, gain, shoulder);
         corrected = blend_any(gain);
     }
     float4 sum = (float4)(0.0f);
@@ -260,7 +261,7 @@ __kernel void blend_band(
                 if (w <= 0.0f)
                     continue;
                 const float3 gain = blend_gain(gains, layers + k, y, cell, gain_border);
-                sum += (float4)((blend_correct(c.xyz, gain) - reference.xyz) * w, w);
+                sum += (float4)((blend_correct(c.xyz, gain, shoulder) - reference.xyz) * w, w);
                 corrected |= blend_any(gain);
             }
             if (sum.w >= 0.5f * total)

@@ -1,35 +1,49 @@
 /* How two aligned layers differ in exposure and colour, per cell of a coarse colour grid. */
 
+static inline bool colour_clips(float4 c, float clipped) {
+    return c.x > clipped || c.y > clipped || c.z > clipped;
+}
+
 /* Mean difference a - b on the exposure scale over the pixels of a cell (every second one in x and y) that both
    layers show unclipped, and how far it can be trusted: less where the pixels disagree among themselves, that
-   is, where the layers do not show the same thing. */
+   is, where the layers do not show the same thing. The same where one of them is clipped, if that is most of
+   the cell: the other has to be raised by that much at least. */
 __kernel void colour_difference(__global const float4 *layer_a, __global const float4 *field_a, int4 box_a,
                                 __global const float4 *layer_b, __global const float4 *field_b, int4 box_b,
                                 int4 border, float4 lens,   /* working grid */
                                 int4 cells,                 /* colour grid, run size */
-                                int integer,                /* which exposure scale */
-                                float clipped,              /* brighter samples are not used */
+                                float shoulder,             /* of the exposure scale */
+                                float clipped,              /* brighter samples may have been any brighter */
                                 float spread,               /* disagreement that halves the trust */
-                                __global float4 *difference) /* (cells.y, cells.x): r, g, b, weight 0..1 */
+                                __global float4 *difference, /* (cells.y, cells.x): r, g, b, weight 0..1 */
+                                __global float4 *beyond)     /* the same; weight > 0: a is clipped, < 0: b */
 {
     const int cx = get_global_id(0), cy = get_global_id(1);
     if (cx >= cells.x || cy >= cells.y)
         return;
     const int left = cx * border.x / cells.x, right = (cx + 1) * border.x / cells.x;
     const int top = cy * border.y / cells.y, bottom = (cy + 1) * border.y / cells.y;
-    float3 sum = (float3)(0.0f);
-    float squares = 0.0f, n = 0.0f, tried = 0.0f;
+    float3 sum = (float3)(0.0f), more = (float3)(0.0f), less = (float3)(0.0f);
+    float squares = 0.0f, n = 0.0f, tried = 0.0f, above = 0.0f, below = 0.0f;
     for (int y = top; y < bottom; y += 2)
         for (int x = left; x < right; x += 2) {
             tried += 1.0f;
             float4 a, b;
-            if (!layer_pair(layer_a, field_a, box_a, layer_b, field_b, box_b, (int2)(x, y), border, lens, &a, &b) ||
-                a.x > clipped || a.y > clipped || a.z > clipped || b.x > clipped || b.y > clipped || b.z > clipped)
+            if (!layer_pair(layer_a, field_a, box_a, layer_b, field_b, box_b, (int2)(x, y), border, lens, &a, &b))
                 continue;
-            const float3 d = exposure_scale(a.xyz, integer) - exposure_scale(b.xyz, integer);
-            sum += d;
-            squares += square3(d);
-            n += 1.0f;
+            const float3 d = exposure_scale(a.xyz, shoulder) - exposure_scale(b.xyz, shoulder);
+            const bool clips_a = colour_clips(a, clipped), clips_b = colour_clips(b, clipped);
+            if (clips_a && !clips_b) {
+                more += d;
+                above += 1.0f;
+            } else if (clips_b && !clips_a) {
+                less += d;
+                below += 1.0f;
+            } else if (!clips_a) {
+                sum += d;
+                squares += square3(d);
+                n += 1.0f;
+            }
         }
     float4 result = (float4)(0.0f);
     if (n > 0.0f) {
@@ -38,4 +52,53 @@ __kernel void colour_difference(__global const float4 *layer_a, __global const f
         result = (float4)(mean, n / tried / (1.0f + GREATEST(variance, 0.0f) / (spread * spread)));
     }
     difference[cy * cells.x + cx] = result;
+    result = (float4)(0.0f);
+    if (2.0f * above > tried)
+        result = (float4)(more / above, 2.0f * above / tried - 1.0f);
+    if (2.0f * below > tried)
+        result = (float4)(less / below, 1.0f - 2.0f * below / tried);
+    beyond[cy * cells.x + cx] = result;
+}
+
+/* How far exposure scales of four shoulders are from explaining the difference of two aligned layers: per cell
+   the mean square, of full scale, of what one gain for the cell leaves of it. */
+__kernel void colour_misfit(__global const float4 *layer_a, __global const float4 *field_a, int4 box_a,
+                            __global const float4 *layer_b, __global const float4 *field_b, int4 box_b,
+                            int4 border, float4 lens,  /* working grid */
+                            int4 cells,                /* colour grid, run size */
+                            float4 shoulders,
+                            float clipped,             /* brighter samples are not used */
+                            __global float4 *misfit)   /* (cells.y, cells.x), for each shoulder */
+{
+    const int cx = get_global_id(0), cy = get_global_id(1);
+    if (cx >= cells.x || cy >= cells.y)
+        return;
+    const int left = cx * border.x / cells.x, right = (cx + 1) * border.x / cells.x;
+    const int top = cy * border.y / cells.y, bottom = (cy + 1) * border.y / cells.y;
+    float4 weight[3], first[3], second[3];
+    for (int k = 0; k < 3; ++k)
+        weight[k] = first[k] = second[k] = (float4)(0.0f);
+    float tried = 0.0f;
+    for (int y = top; y < bottom; y += 4)
+        for (int x = left; x < right; x += 4) {
+            tried += 1.0f;
+            float4 a, b;
+            if (!layer_pair(layer_a, field_a, box_a, layer_b, field_b, box_b, (int2)(x, y), border, lens, &a, &b) ||
+                colour_clips(a, clipped) || colour_clips(b, clipped))
+                continue;
+            const float p[3] = {a.x, a.y, a.z}, q[3] = {b.x, b.y, b.z};
+            for (int k = 0; k < 3; ++k) {
+                const float u = GREATEST(p[k], EXPOSURE_FLOOR), v = GREATEST(q[k], EXPOSURE_FLOOR);
+                const float m = 0.5f * (u + v);
+                const float4 d = log(u * (1.0f - shoulders * v) / (v * (1.0f - shoulders * u)));
+                const float4 slope = m * (1.0f - shoulders * m); /* of the colour over the scale */
+                weight[k] += slope * slope;
+                first[k] += slope * slope * d;
+                second[k] += slope * slope * d * d;
+            }
+        }
+    float4 left_over = (float4)(0.0f);
+    for (int k = 0; k < 3; ++k)
+        left_over += second[k] - first[k] * first[k] / GREATEST(weight[k], (float4)(1e-12f));
+    misfit[cy * cells.x + cx] = left_over / GREATEST(tried, 1.0f);
 }

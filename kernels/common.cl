@@ -235,25 +235,28 @@ static inline bool layer_pair(__global const float4 *layer_a, __global const flo
     return a->w != 0.0f && b->w != 0.0f;
 }
 
-/* The scale on which exposure differences are smooth fields, c in 0..1 of full scale. Integer images: log odds,
-   floats: log. The floor keeps dark noise, and what is nearly white, calm where differences are measured. */
+/* The scale on which exposure differences are smooth fields, c in 0..1 of full scale: log odds of shoulder * c.
+   Integer images: 1 where the camera's curve levels off towards white, less where it runs straight into it.
+   Floats: 0, which is log. The floor keeps dark noise, and what is nearly white, calm where differences are
+   measured. */
 #define EXPOSURE_FLOOR 0.02f
 
-static inline float3 exposure_scale(float3 c, int integer) {
-    const float3 low = GREATEST(c, (float3)(0.0f)) + EXPOSURE_FLOOR, rest = 1.0f - c;
-    return log(integer ? low / (GREATEST(rest, (float3)(0.0f)) + EXPOSURE_FLOOR) : low);
+static inline float3 exposure_scale(float3 c, float shoulder) {
+    const float3 low = GREATEST(c, (float3)(0.0f)) + EXPOSURE_FLOOR;
+    return log(low / (GREATEST(1.0f - shoulder * c, (float3)(0.0f)) + EXPOSURE_FLOOR));
 }
 
-/* Multiply by 1 + rise the odds of an integer image's colour, or a float's value. Black and an integer image's
-   white stay, so that nothing clips or turns grey; exactly c where the rise is 0. */
-static inline float3 exposure_raise(float3 c, float3 rise, float white, int integer) {
-    const float3 low = c < white ? c : white;
-    return c + c * rise * (integer ? (white - low) / (white + low * rise) : 1.0f);
+/* Multiply these odds by 1 + rise, floats by it themselves. Black stays, and an integer image is not raised
+   beyond white; with a shoulder of 1 white stays as well. Exactly c where the rise is 0. */
+static inline float3 exposure_raise(float3 c, float3 rise, float white, float shoulder) {
+    const float3 low = shoulder * (c < white ? c : white);
+    const float3 v = c + c * rise * ((white - low) / (white + low * rise));
+    return shoulder > 0.0f && v > white ? (c < white ? white : c) : v;
 }
 
 /* Add a gain on the exposure scale. */
-static inline float3 exposure_shift(float3 c, float3 gain, int integer) {
-    return exposure_raise(c, exponential(gain.xyzz).xyz - 1.0f, 1.0f, integer);
+static inline float3 exposure_shift(float3 c, float3 gain, float shoulder) {
+    return exposure_raise(c, exponential(gain.xyzz).xyz - 1.0f, 1.0f, shoulder);
 }
 
 /* Catmull-Rom weights of the four taps around fraction t: exactly (0, 1, 0, 0) at t = 0. */

@@ -1,10 +1,10 @@
 /* Where one layer is taken whole. */
 
 /* A colour as a difference of it is seen: integer images are coded so already, floats are linear light. */
-static inline float3 seam_look(float3 c, float3 gain, int integer) {
-    c = exposure_shift(c, gain, integer);
+static inline float3 seam_look(float3 c, float3 gain, float shoulder) {
+    c = exposure_shift(c, gain, shoulder);
     c = GREATEST(c, (float3)(0.0f));
-    return integer ? c : (float3)(ROOT(c.x), ROOT(c.y), ROOT(c.z));
+    return shoulder > 0.0f ? c : (float3)(ROOT(c.x), ROOT(c.y), ROOT(c.z));
 }
 
 /* Mean difference a - b of two aligned, corrected layers over the pixels of a cell (every second one in x and y)
@@ -15,7 +15,7 @@ __kernel void seam_difference(__global const float4 *layer_a, __global const flo
                               __global const float4 *gain_b, /* (colours.y, colours.x) */
                               int4 border, float4 lens,    /* working grid */
                               int4 colours, int4 cells,    /* grid of the gains; seam grid, run size */
-                              int integer,                 /* which exposure scale */
+                              float shoulder,              /* of the exposure scale */
                               float clipped,               /* brighter samples are not used */
                               int squared,                 /* 1: texture that is a little off counts as well */
                               __global float4 *difference) /* (cells.y, cells.x): r, g, b, share */
@@ -36,7 +36,7 @@ __kernel void seam_difference(__global const float4 *layer_a, __global const flo
             if (!layer_pair(layer_a, field_a, box_a, layer_b, field_b, box_b, (int2)(x, y), border, lens, &a, &b) ||
                 any(a.xyz > clipped) || any(b.xyz > clipped))
                 continue;
-            const float3 d = seam_look(a.xyz, gain_a[g].xyz, integer) - seam_look(b.xyz, gain_b[g].xyz, integer);
+            const float3 d = seam_look(a.xyz, gain_a[g].xyz, shoulder) - seam_look(b.xyz, gain_b[g].xyz, shoulder);
             sum += squared ? d * d : d;
             n += 1.0f;
         }

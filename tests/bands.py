@@ -64,8 +64,9 @@ def blend_layer(
 def merged(
     device: Device, layers: list[BlendLayer], full: Grid, grid: Grid, crop: Box | None = None, rows: int = 0
 ) -> np.ndarray:
+    shoulder = float(layers[0].layer.dtype.kind == "u")
     parts = blend.bands(
-        device, layers, full, grid, grid.resized(7, 5), crop or full.region, Settings(band_rows=rows),
-        lambda units: None,
+        device, layers, full, grid, grid.resized(7, 5), shoulder, crop or full.region,
+        Settings(band_rows=rows), lambda units: None,
     )  # fmt: skip
     return np.concatenate(list(parts))

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from grids import GRIDS, on_device, patches, plane, random_layer, sphere
 from reference import common
-from reference.colour import colour_difference
+from reference.colour import colour_difference, colour_misfit
 from scipy import ndimage
 from tolerances import POSITION, assert_close
 
@@ -42,64 +43,109 @@ def displacement(seed: int, box: tuple[int, int, int, int], grid: Grid) -> np.nd
     return field.astype(np.float32)
 
 
+def two_sides(name: str, lamps: bool = False) -> list:
+    """Two layers that overlap, with their fields and boxes, as kernels take them; lamps: bright on one side."""
+    grid = GRIDS[name]
+    sides: list = []
+    for i, box in enumerate(((0, 0, 60, grid.height), (9, 1, grid.width - 9, grid.height - 1))):
+        pixels = smooth_layer(3 * i, box[2], box[3])
+        if lamps:
+            bright = np.s_[:, 21:] if i else np.s_[:, :30]
+            pixels[bright][..., :3] = 0.95 * (pixels[bright][..., 3:] > 0)
+        sides += [pixels, displacement(7 + i, box, grid), box]
+    return sides
+
+
+def uploaded(device: Device, sides: list) -> list:
+    return [device.upload(one) if isinstance(one, np.ndarray) else one for one in sides]
+
+
 @pytest.mark.parametrize("name", list(GRIDS))
-@pytest.mark.parametrize("integer", [0, 1])
-def test_difference_equals_its_twin(device: Device, name: str, integer: int) -> None:
+@pytest.mark.parametrize(("shoulder", "lamps"), [(0.0, False), (0.5, False), (1.0, False), (1.0, True)])
+def test_difference_equals_its_twin(device: Device, name: str, shoulder: float, lamps: bool) -> None:
     grid = GRIDS[name]
     cells = grid.resized(7, 3)
-    boxes = ((0, 0, 60, grid.height), (9, 1, grid.width - 9, grid.height - 1))
-    layers = [smooth_layer(3 * i, b[2], b[3]) for i, b in enumerate(boxes)]
-    fields = [displacement(7 + i, b, grid) for i, b in enumerate(boxes)]
-    clipped = CLIPPED if integer else 1e30
+    sides = two_sides(name, lamps)
+    clipped = CLIPPED if shoulder else 1e30
+    results = [device.empty((3, 7, 4)) for _ in range(2)]
+    device.run(
+        "colour", "colour_difference", (7, 3), *uploaded(device, sides),
+        grid.border, grid.lens, cells.border, shoulder, clipped, SPREAD, *results,
+    )  # fmt: skip
+    expected = colour_difference(*sides, grid.border, grid.lens, cells.border, shoulder, clipped, SPREAD)
+    if lamps:
+        assert set(np.sign(expected[1][..., 3]).ravel()) >= {-1, 1}
+    else:
+        assert (expected[0][..., 3] > 0.01).mean() > 0.4
+    for result, twin in zip(results, expected, strict=True):
+        # a pixel more or less at a mask's rim is one of some 30 of a cell
+        assert_close(result.get(), twin, 10 * POSITION, decisions=0.05)
+        assert np.abs(result.get() - twin).max() < 0.1
+
+
+@pytest.mark.parametrize("name", list(GRIDS))
+def test_misfit_equals_its_twin(device: Device, name: str) -> None:
+    grid = GRIDS[name]
+    cells = grid.resized(7, 3)
+    sides = two_sides(name)
+    shoulders = (1.0, 0.75, 0.5, 0.25)
     result = device.empty((3, 7, 4))
     device.run(
-        "colour", "colour_difference", (7, 3),
-        device.upload(layers[0]), device.upload(fields[0]), boxes[0],
-        device.upload(layers[1]), device.upload(fields[1]), boxes[1],
-        grid.border, grid.lens, cells.border, integer, clipped, SPREAD, result,
+        "colour", "colour_misfit", (7, 3), *uploaded(device, sides),
+        grid.border, grid.lens, cells.border, shoulders, CLIPPED, result,
     )  # fmt: skip
-    expected = colour_difference(
-        layers[0], fields[0], boxes[0], layers[1], fields[1], boxes[1],
-        grid.border, grid.lens, cells.border, integer, clipped, SPREAD,
-    )  # fmt: skip
-    assert (expected[..., 3] > 0.01).mean() > 0.4
-    # a pixel more or less at a mask's rim is one of some 30 of a cell
-    assert_close(result.get(), expected, 10 * POSITION, decisions=0.05)
-    assert np.abs(result.get() - expected).max() < 0.1
+    expected = colour_misfit(*sides, grid.border, grid.lens, cells.border, shoulders, CLIPPED)
+    assert (expected > 1e-3).mean() > 0.4
+    assert_close(result.get(), expected, 10 * POSITION, decisions=0.1)
 
 
-def share(c: np.ndarray, integer: int) -> np.ndarray:
+@pytest.mark.parametrize("shoulder", [1.0, 0.75, 0.5, 0.25])
+def test_twin_of_misfit_knows_the_scale(shoulder: float) -> None:
+    """Layers that differ by one gain on a scale: on that one nothing is left, on others it is."""
+    grid = plane()
+    a = smooth_layer(20, 77, 53).astype(np.float64)
+    a[..., :3] = 0.1 + 0.5 * a[..., :3]
+    b = a.copy()
+    b[..., :3] = common.exposure_shift(a[..., :3], np.array([0.4, 0.2, 0.3]), shoulder)
+    still, box, shoulders = np.zeros_like(a), (0, 0, 77, 53), (1.0, 0.75, 0.5, 0.25)
+    sides = [a, still, box, b, still, box]
+    misfit = colour_misfit(*sides, grid.border, grid.lens, (7, 3, 0, 0), shoulders, 9).sum((0, 1))
+    right = shoulders.index(shoulder)
+    assert misfit[right] < 1e-9
+    assert (np.delete(misfit, right) > 1e-4).all()
+
+
+def share(c: np.ndarray, shoulder: float) -> np.ndarray:
     """How much of a small shift of colours c the exposure scale shows: its slope over the shift's own.
 
     The shift keeps black and white, the scale has a floor under both: dark and nearly white pixels show less
     of a gain than they get, so that their noise is no gain.
     """
     floor = common.EXPOSURE_FLOOR
-    if integer:
-        return c * (1 - c) * (1 / (c + floor) + 1 / (1 - c + floor))
-    return c / (c + floor)
+    rest = 1 - shoulder * c
+    return c * rest * (1 / (c + floor) + shoulder / (rest + floor))
 
 
-@pytest.mark.parametrize("integer", [0, 1])
-def test_twin_of_difference_measures_a_gain(integer: int) -> None:
+@pytest.mark.parametrize("shoulder", [0.0, 0.5, 1.0])
+def test_twin_of_difference_measures_a_gain(shoulder: float) -> None:
     """Layers that differ by a shift: that shift less what the floor hides, trusted by usable pixels."""
     grid = plane()
     a = smooth_layer(20, 77, 53).astype(np.float64)
     gains = np.array([0.3, -0.1, 0.2])
     b, middle = a.copy(), a.copy()
-    b[..., :3] = common.exposure_shift(a[..., :3], -gains, integer)
-    middle[..., :3] = common.exposure_shift(a[..., :3], -gains / 2, integer)
+    b[..., :3] = common.exposure_shift(a[..., :3], -gains, shoulder)
+    middle[..., :3] = common.exposure_shift(a[..., :3], -gains / 2, shoulder)
     still = np.zeros_like(a)
     box = (0, 0, 77, 53)
-    result = colour_difference(
-        a, still, box, b, still, box, grid.border, grid.lens, (7, 3, 0, 0), integer, 9, SPREAD
+    result, _ = colour_difference(
+        a, still, box, b, still, box, grid.border, grid.lens, (7, 3, 0, 0), shoulder, 9, SPREAD
     )
     known = result[..., 3] > 0
     assert known.mean() > 0.8
     for j, i in np.argwhere(known):
         cell = np.s_[j * 53 // 3 : (j + 1) * 53 // 3 : 2, i * 11 : (i + 1) * 11 : 2]
         used = a[cell][..., 3] > 0
-        shown = share(middle[cell][used][:, :3], integer).mean(0)
+        shown = share(middle[cell][used][:, :3], shoulder).mean(0)
         assert (shown > 0.8).all()
         # the slope in the middle of the way stands for all of it: good to the third order of the gain
         assert np.allclose(result[j, i, :3], shown * gains, atol=2e-3)
@@ -109,32 +155,35 @@ def test_twin_of_difference_measures_a_gain(integer: int) -> None:
 def test_twins_of_the_exposure_scale(monkeypatch: pytest.MonkeyPatch) -> None:
     """A shift keeps black, white and colours' order; on the scale, but for its floor, it is one."""
     c = np.linspace(0.0, 1.0, 101)
-    for integer in (0, 1):
+    for shoulder in (0.0, 0.5, 1.0):
         for gain in (-0.7, 0.4):
-            moved = common.exposure_shift(c, np.full_like(c, gain), integer)
-            assert moved[0] == 0 and (np.diff(moved) > 0).all()
-            if integer:
+            moved = common.exposure_shift(c, np.full_like(c, gain), shoulder)
+            known = moved < 1 if 0 < shoulder < 1 else moved <= 1
+            assert moved[0] == 0 and (np.diff(moved[known]) > 0).all()
+            if shoulder:
+                assert moved.max() <= 1
+            if shoulder == 1:
                 assert moved[-1] == 1
-            known = moved <= 1
-            scales = [common.exposure_scale(v[known], integer) for v in (c, moved)]
+            scales = [common.exposure_scale(v[known], shoulder) for v in (c, moved)]
             seen = (scales[1] - scales[0]) / gain
             # as the slope nowhere between c and moved is beyond these, the difference is not either
-            slopes = share(np.linspace(c, moved, 201)[:, known], integer)
+            slopes = share(np.linspace(c, moved, 201)[:, known], shoulder)
             assert (seen >= slopes.min(0) - 1e-9).all() and (seen <= slopes.max(0) + 1e-9).all()
-            back = common.exposure_shift(moved, np.full_like(c, -gain), integer)
+            back = common.exposure_shift(moved, np.full_like(c, -gain), shoulder)
             assert np.allclose(back[known], c[known])
-        assert np.array_equal(common.exposure_shift(c, np.zeros_like(c), integer), c)
+        assert np.array_equal(common.exposure_shift(c, np.zeros_like(c), shoulder), c)
     monkeypatch.setattr(common, "EXPOSURE_FLOOR", 0.0)
     c = c[1:-1]
-    for integer in (0, 1):
-        moved = common.exposure_shift(c, np.full_like(c, 0.4), integer)
+    for shoulder in (0.0, 0.5, 1.0):
+        moved = common.exposure_shift(c, np.full_like(c, 0.4), shoulder)
         known = moved < 1
-        scales = [common.exposure_scale(v[known], integer) for v in (c, moved)]
+        scales = [common.exposure_scale(v[known], shoulder) for v in (c, moved)]
         assert np.allclose(scales[1] - scales[0], 0.4)
 
 
-def dense_gains(measured: list, inside: np.ndarray, cells: Grid, rounds: tuple) -> np.ndarray:
+def dense_gains(measured: colour.Measured, rounds: tuple) -> np.ndarray:
     """The minimum of the sum in colour.py, by least squares over all cells of all layers."""
+    cells, inside = measured.grid, measured.inside
     _, height, width = inside.shape
     index = np.arange(inside.size).reshape(inside.shape)
     latitude = cells.lens[2] - (np.arange(height) + 0.5) * cells.lens[3]
@@ -161,30 +210,43 @@ def dense_gains(measured: list, inside: np.ndarray, cells: Grid, rounds: tuple) 
                 term(1 / area[y], {index[k, y, x]: 1, index[k, y, right]: -1}, nothing)
             if y + 1 < height and inside[k, y + 1, x]:
                 term(math.sqrt(area[y] * area[y + 1]), {index[k, y, x]: 1, index[k, y + 1, x]: -1}, nothing)
-        for a, b, d in measured:
+        for one in measured.differences:
+            a, b, d = one.a, one.b, one.values
             for y, x in np.argwhere(d[..., 3] > 0):
                 off = solution[a, y, x] - solution[b, y, x] + d[y, x, :3]
                 distance = np.linalg.norm(off) if solution.any() else 0.0
                 trust = (1 - (distance / limit) ** 2) ** 2 if distance < limit else 0.0
                 weight = data * area[y] * d[y, x, 3] * trust
                 term(weight, {index[a, y, x]: 1, index[b, y, x]: -1}, -d[y, x, :3])
+            for y, x in np.argwhere(one.beyond[..., 3]):
+                sign = np.sign(one.beyond[y, x, 3])
+                raised = (b if sign > 0 else a), y, x
+                least = sign * one.beyond[y, x, :3]
+                short = least - solution[raised]
+                if inside[raised] and short.mean() > 0 and np.linalg.norm(short) < limit:
+                    trust = (1 - (np.linalg.norm(short) / limit) ** 2) ** 2
+                    weight = colour._BOUND * area[y] * abs(one.beyond[y, x, 3]) * trust
+                    term(weight, {index[raised]: 1}, least)
         solution = np.linalg.lstsq(np.array(rows), np.array(targets), rcond=None)[0].reshape(*inside.shape, 3)
     return solution
 
 
-def overlapping(seed: int, cells: Grid) -> tuple[list, np.ndarray]:
+def overlapping(seed: int, cells: Grid) -> colour.Measured:
     """Measured differences of three layers, and which cells each covers."""
     random = np.random.default_rng(seed)
     inside = np.zeros((3, cells.height, cells.width), bool)
     inside[0, :, :6], inside[1, :, 4:], inside[2, 1:3, :3] = True, True, True
     inside[2, 1:3, -2:] = True
-    measured = []
+    differences = []
     for a, b in ((0, 1), (0, 2), (1, 2)):
         d = random.normal(size=(cells.height, cells.width, 4)) * 0.1 + [0.3, -0.2, 0.1, 0]
         d[..., 3] = random.random(d.shape[:2]) * (inside[a] & inside[b])
         d[0, 4, :3] += 2  # somebody who moved
-        measured.append((a, b, d))
-    return measured, inside
+        beyond = np.zeros_like(d)
+        beyond[3:, ::2] = [0.9, 0.5, 0.7, 0.6]  # a is clipped
+        beyond[4:, 1::2] = [-0.2, -0.6, -0.8, -0.9]
+        differences.append(colour.Difference(a, b, d, beyond * (inside[a] & inside[b])[..., None]))
+    return colour.Measured(cells, inside, 1.0, tuple(differences))
 
 
 CELLS = {
@@ -198,12 +260,12 @@ CELLS = {
 @pytest.mark.parametrize("name", list(CELLS))
 def test_solve_is_dense_least_squares(name: str, rounds: tuple[tuple[float, float], ...]) -> None:
     cells = CELLS[name]
-    measured, inside = overlapping(0, cells)
-    gains = colour.solve(measured, inside, cells, rounds)
-    expected = dense_gains(measured, inside, cells, rounds)
+    measured = overlapping(0, cells)
+    gains = colour.solve(measured, rounds)
+    expected = dense_gains(measured, rounds)
     assert np.abs(expected).max() > 0.05
     assert np.allclose(gains, expected, atol=1e-7)
-    assert not gains[~inside].any()
+    assert not gains[~measured.inside].any()
 
 
 def test_cells_grow_where_many_layers_lie_on_each_other() -> None:
@@ -214,18 +276,43 @@ def test_cells_grow_where_many_layers_lie_on_each_other() -> None:
 
 @pytest.mark.parametrize("shift", [1, 4])
 def test_turning_a_panorama_turns_its_gains(shift: int) -> None:
-    measured, inside = overlapping(2, CELLS["sphere"])
-    gains = colour.solve(measured, inside, CELLS["sphere"])
-    turned = [(a, b, np.roll(d, shift, 1)) for a, b, d in measured]
-    again = colour.solve(turned, np.roll(inside, shift, 2), CELLS["sphere"])
+    measured = overlapping(2, CELLS["sphere"])
+    gains = colour.solve(measured)
+    turned = [
+        replace(d, values=np.roll(d.values, shift, 1), beyond=np.roll(d.beyond, shift, 1))
+        for d in measured.differences
+    ]
+    inside = np.roll(measured.inside, shift, 2)
+    again = colour.solve(replace(measured, inside=inside, differences=tuple(turned)))
     assert np.allclose(np.roll(gains, shift, 2), again, atol=1e-6)
 
 
 def test_no_difference_is_exactly_no_gain() -> None:
-    measured, inside = overlapping(3, CELLS["plane"])
-    for _, _, d in measured:
-        d[..., :3] = 0
-    assert not colour.solve(measured, inside, CELLS["plane"]).any()
+    measured = overlapping(3, CELLS["plane"])
+    for d in measured.differences:
+        d.values[..., :3] = d.beyond[..., :3] = 0
+    assert not colour.solve(measured).any()
+
+
+def test_what_is_clipped_is_a_bound_for_the_other() -> None:
+    """A layer is raised towards one that is clipped, and not held where it is brighter than it has to be."""
+    inside = np.zeros((2, 5, 9), bool)
+    inside[0, :, :6], inside[1, :, 3:] = True, True
+    overlap = inside.all(0)[..., None]
+    beyond = overlap * [-0.6, -0.5, -0.7, -0.9]  # layer 1 is clipped
+    nothing = np.zeros_like(beyond)
+
+    def solve(values: np.ndarray, beyond: np.ndarray) -> np.ndarray:
+        difference = colour.Difference(0, 1, values, beyond)
+        return colour.solve(colour.Measured(CELLS["plane"], inside, 1.0, (difference,)))
+
+    raised, other = solve(nothing, beyond)
+    assert (raised[:, 3:6] > 0.02).all() and (raised <= 0.7).all()
+    assert not other.any()
+    brighter = overlap * [-1.3, -1.3, -1.3, 1.0]
+    less = beyond * [0.1, 0.1, 0.1, 1.0]
+    assert (solve(brighter, nothing)[0][:, 3:6] > 0.1).all()
+    assert np.allclose(solve(brighter, less), solve(brighter, nothing), atol=0.02)
 
 
 def test_gains_reach_two_cells_beyond_a_layer() -> None:
@@ -252,19 +339,19 @@ def test_cells_that_a_layer_reaches_into() -> None:
     assert inside[1, 4, 8]
 
 
-def scene_of(gain: float, integer: int) -> np.ndarray:
+def scene_of(gain: float, shoulder: float) -> np.ndarray:
     """A smooth scene, (208, 768, 3), moved by `gain` on the exposure scale."""
     x, y = common.pixels(768, 208)
     grey = 0.5 + 0.25 * np.sin(x / 9 + y / 17) + 0.1 * np.cos(y / 5)
     colours = np.stack([grey, 0.9 * grey, 0.8 * grey], -1)
-    return common.exposure_shift(colours, np.full_like(colours, gain), integer)
+    return common.exposure_shift(colours, np.full_like(colours, gain), shoulder)
 
 
 def exposed(device: Device, gain: float, dtype: type = np.uint8) -> tuple[list[WorkingLayer], Grid]:
     """Two views of one smooth scene; the second is moved by `gain` on the exposure scale."""
     opaque = np.ones((208, 768, 1))
-    integer = int(np.dtype(dtype).kind == "u")
-    left, right = (np.concatenate([scene_of(g, integer), opaque], 2) for g in (0.0, gain))
+    shoulder = float(np.dtype(dtype).kind == "u")
+    left, right = (np.concatenate([scene_of(g, shoulder), opaque], 2) for g in (0.0, gain))
     layers = [(left[:, :448], 0), (right[:, 320:], 320)]
     return [on_device(device, pixels, x, 0, dtype) for pixels, x in layers], plane(768, 208)
 
@@ -282,8 +369,8 @@ def corrected(
     zero = device.zeros((found.height, found.width, 2))
     fields = [device.zeros(layer.pixels.shape) for layer in layers]
     flows = [PairFlow(0, 1, found, zero, zero)]
-    measured = colour.differences(device, layers, fields, flows, grid, covered)
-    return colour.correction(device, measured, grid, covered, settings, ignored)
+    measured = colour.measure(device, layers, fields, flows, grid, covered)
+    return colour.correction(device, measured, settings, ignored)
 
 
 @pytest.mark.parametrize(("gain", "dtype"), [(0.5, np.uint8), (-0.3, np.uint16), (0.7, np.float32)])
@@ -293,13 +380,13 @@ def test_overlaps_agree_after_correction(device: Device, gain: float, dtype: typ
     result = corrected(device, layers, grid, Settings())
     a, b = (one.get()[..., :3] if one else None for one in result.gains)
     assert result.grid.shape == (13, 48)
-    integer = int(np.dtype(dtype).kind == "u")
+    shoulder = float(np.dtype(dtype).kind == "u")
     overlap = np.s_[:, 336:432]  # columns 21 to 26 of the cells, which both layers fill
-    shown = share(scene_of(gain / 2, integer)[overlap], integer).reshape(13, 16, 6, 16, 3).mean((1, 3))
+    shown = share(scene_of(gain / 2, shoulder)[overlap], shoulder).reshape(13, 16, 6, 16, 3).mean((1, 3))
     assert np.allclose((a - b)[:, 21:27] / gain, shown, atol=0.03)
-    views = scene_of(0.0, integer)[overlap], scene_of(gain, integer)[overlap]
+    views = scene_of(0.0, shoulder)[overlap], scene_of(gain, shoulder)[overlap]
     finer = (np.kron(g[:, 21:27], np.ones((16, 16, 1))) for g in (a, b))
-    matched = [common.exposure_shift(v, g, integer) for v, g in zip(views, finer, strict=True)]
+    matched = [common.exposure_shift(v, g, shoulder) for v, g in zip(views, finer, strict=True)]
     # what the floor of the scale hides, a twentieth, is left
     assert np.abs(matched[0] - matched[1]).mean() < 0.07 * np.abs(views[0] - views[1]).mean()
     assert np.allclose(a[:, 24] / gain, 0.5, atol=0.1)

@@ -43,10 +43,10 @@ def test_twin_of_yield_reads_scipys_zoom() -> None:
 
 
 @pytest.mark.parametrize("name", list(GRIDS))
-@pytest.mark.parametrize("integer", [0, 1])
+@pytest.mark.parametrize("shoulder", [0.0, 0.5, 1.0])
 @pytest.mark.parametrize(("clipped", "squared"), [(0.8, 0), (math.inf, 0), (math.inf, 1)])
 def test_difference_equals_its_twin(
-    device: Device, name: str, integer: int, clipped: float, squared: int
+    device: Device, name: str, shoulder: float, clipped: float, squared: int
 ) -> None:
     grid = GRIDS[name]
     cells, colours = grid.resized(10, 7).border, grid.resized(5, 3).border
@@ -62,10 +62,10 @@ def test_difference_equals_its_twin(
     out = device.empty((7, 10, 4))
     uploaded = [device.upload(one) if isinstance(one, np.ndarray) else one for one in sides]
     device.run(
-        "seam", "seam_difference", (10, 7), *uploaded, grid.border, grid.lens, colours, cells, integer,
+        "seam", "seam_difference", (10, 7), *uploaded, grid.border, grid.lens, colours, cells, shoulder,
         clipped, squared, out,
     )  # fmt: skip
-    expected = seam_difference(*sides, grid.border, grid.lens, colours, cells, integer, clipped, squared)
+    expected = seam_difference(*sides, grid.border, grid.lens, colours, cells, shoulder, clipped, squared)
     assert (expected[..., 3] > 0).mean() > 0.4
     # a pixel more or less at a mask's rim is one of some ten of a cell
     assert_close(out.get(), expected, 10 * POSITION, decisions=0.05)

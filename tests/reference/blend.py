@@ -77,9 +77,9 @@ def position(x: Array, y: Array, displacement: Array, scale: Numbers, lens: Numb
     return there_x - turn * np.rint((there_x - x) / turn), there_y
 
 
-def correct(colour: Array, gain: Array, white: float) -> Array:
-    """Colour in stored units with its exposure corrected; integer samples are told by their full scale."""
-    return np.where(gain == 0, colour, exposure_shift(colour / white, gain, int(white > 1)) * white)
+def correct(colour: Array, gain: Array, white: float, shoulder: float) -> Array:
+    """Colour in stored units with its exposure corrected."""
+    return np.where(gain == 0, colour, exposure_shift(colour / white, gain, shoulder) * white)
 
 
 def blend_rows(
@@ -123,6 +123,7 @@ def blend_band(
     gain_border: Sequence[int],
     band: Sequence[int],
     origin: Sequence[int],
+    shoulder: float,
     nearest: int,
     share: float,
     white: float,
@@ -144,7 +145,7 @@ def blend_band(
         own = take(opaque_, place, columns, rows)
         colour = sample(opaque_, place, *position(x, y, f[..., :3], scale, lens), border, nearest)
         colour = np.where(f[..., :3].any(-1, keepdims=True), colour, own)
-        looks = [correct(c[..., :3], exposure, white) for c in (own, colour)]
+        looks = [correct(c[..., :3], exposure, white, shoulder) for c in (own, colour)]
         seen.append((own[..., 3] > 0, looks, f[..., 3], colour[..., 3], (exposure != 0).any(-1)))
     count = sum(layer[0].astype(int) for layer in seen)
     reference, corrected, known = np.zeros((*x.shape, 3)), np.zeros(x.shape, bool), np.zeros(x.shape, bool)

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from typing import Any
 
 import numpy as np
 
-from reference.common import Array, Numbers, exposure_scale, layer_seen, pixels
+from reference.common import EXPOSURE_FLOOR, Array, Numbers, exposure_scale, layer_seen, pixels
 
 
 def colour_difference(
@@ -19,26 +20,85 @@ def colour_difference(
     border: Sequence[int],
     lens: Numbers,
     cells: Sequence[int],
-    integer: int,
+    shoulder: float,
     clipped: float,
     spread: float,
+) -> tuple[Array, Array]:
+    """Mean difference a - b of every cell's pixels, every other one in x and y, and its weight; the same of
+    those that one layer shows clipped, where these are most.
+    """
+    a, b, clips_a, clips_b, known = _seen(
+        layer_a, field_a, box_a, layer_b, field_b, box_b, border, lens, clipped
+    )
+    difference = exposure_scale(a, shoulder) - exposure_scale(b, shoulder)
+    result, beyond = np.zeros((2, cells[1], cells[0], 4))
+    for place, part in _parts(border, cells, 2):
+        count = known[part].size
+        values = difference[part][(known & ~clips_a & ~clips_b)[part]]
+        if len(values):
+            result[place] = [*values.mean(0), len(values) / count / (1 + values.var(0).sum() / spread**2)]
+        for sign, alone in ((1, clips_a & ~clips_b), (-1, clips_b & ~clips_a)):
+            values = difference[part][(known & alone)[part]]
+            if 2 * len(values) > count:
+                beyond[place] = [*values.mean(0), sign * (2 * len(values) / count - 1)]
+    return result, beyond
+
+
+def colour_misfit(
+    layer_a: Array,
+    field_a: Array,
+    box_a: Sequence[int],
+    layer_b: Array,
+    field_b: Array,
+    box_b: Sequence[int],
+    border: Sequence[int],
+    lens: Numbers,
+    cells: Sequence[int],
+    shoulders: Numbers,
+    clipped: float,
 ) -> Array:
-    """Mean difference a - b of every cell's pixels, every other one in x and y, and its weight."""
+    """What the best gain of a cell leaves of the difference, by weighted least squares on each scale."""
+    a, b, clips_a, clips_b, known = _seen(
+        layer_a, field_a, box_a, layer_b, field_b, box_b, border, lens, clipped
+    )
+    a, b = np.maximum(a, EXPOSURE_FLOOR), np.maximum(b, EXPOSURE_FLOOR)
+    result = np.zeros((cells[1], cells[0], len(shoulders)))
+    for place, part in _parts(border, cells, 4):
+        usable = (known & ~clips_a & ~clips_b)[part]
+        u, v = a[part][usable], b[part][usable]
+        for k, shoulder in enumerate(shoulders):
+            difference = np.log(u / (1 - shoulder * u)) - np.log(v / (1 - shoulder * v))
+            slope = (u + v) / 2 * (1 - shoulder * (u + v) / 2)
+            for channel in range(3 if len(u) else 0):
+                weights = slope[:, channel] ** 2
+                mean = np.average(difference[:, channel], weights=weights)
+                squares = weights * (difference[:, channel] - mean) ** 2
+                result[(*place, k)] += squares.sum() / known[part].size
+    return result
+
+
+def _seen(
+    layer_a: Array,
+    field_a: Array,
+    box_a: Sequence[int],
+    layer_b: Array,
+    field_b: Array,
+    box_b: Sequence[int],
+    border: Sequence[int],
+    lens: Numbers,
+    clipped: float,
+) -> tuple[Array, Array, Array, Array, Array]:
+    """Colours of both aligned layers, where each is clipped, and where both are."""
     columns, rows = pixels(border[0], border[1])
     a = layer_seen(layer_a, field_a, box_a, columns, rows, border, lens)
     b = layer_seen(layer_b, field_b, box_b, columns, rows, border, lens)
-    usable = (
-        (a[..., 3] > 0) & (b[..., 3] > 0) & (a[..., :3].max(-1) <= clipped) & (b[..., :3].max(-1) <= clipped)
-    )
-    difference = exposure_scale(a[..., :3], integer) - exposure_scale(b[..., :3], integer)
-    result = np.zeros((cells[1], cells[0], 4))
+    clips = (one[..., :3].max(-1) > clipped for one in (a, b))
+    return a[..., :3], b[..., :3], *clips, (a[..., 3] > 0) & (b[..., 3] > 0)
+
+
+def _parts(border: Sequence[int], cells: Sequence[int], every: int) -> Iterator[tuple[tuple[int, int], Any]]:
+    """Each cell's place, and which pixels are read for it."""
     for j, i in np.ndindex(cells[1], cells[0]):
         left, right = (k * border[0] // cells[0] for k in (i, i + 1))
         top, bottom = (k * border[1] // cells[1] for k in (j, j + 1))
-        part = np.s_[top:bottom:2, left:right:2]
-        values = difference[part][usable[part]]
-        if len(values):
-            variance = values.var(0).sum()
-            trust = len(values) / usable[part].size / (1 + variance / spread**2)
-            result[j, i] = [*values.mean(0), trust]
-    return result
+        yield (j, i), np.s_[top:bottom:every, left:right:every]

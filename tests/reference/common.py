@@ -131,19 +131,18 @@ def layer_seen(
 EXPOSURE_FLOOR = 0.02
 
 
-def exposure_scale(c: Array, integer: int) -> Array:
-    """Log, or log odds for integer images, of colours in 0..1 of full scale, on a floor."""
-    low = np.log(np.maximum(c, 0) + EXPOSURE_FLOOR)
-    return low - np.log(np.maximum(1 - c, 0) + EXPOSURE_FLOOR) if integer else low
+def exposure_scale(c: Array, shoulder: float) -> Array:
+    """Log odds of shoulder * c, c in 0..1 of full scale, on a floor."""
+    return np.log((np.maximum(c, 0) + EXPOSURE_FLOOR) / (np.maximum(1 - shoulder * c, 0) + EXPOSURE_FLOOR))
 
 
-def exposure_shift(c: Array, gain: Array, integer: int) -> Array:
-    """Colours moved by `gain` on that scale, black and white in their place."""
-    factor = np.exp(gain)
-    if not integer:
-        return np.where(gain == 0, c, c * factor)
-    black = 1 - np.minimum(c, 1)
-    return np.where(gain == 0, c, c * factor / (black + (1 - black) * factor))
+def exposure_shift(c: Array, gain: Array, shoulder: float) -> Array:
+    """Colours moved by `gain` on that scale; those of integer images not beyond white."""
+    odds = np.minimum(c, 1) * shoulder
+    moved = c * np.exp(gain) / (1 - odds + odds * np.exp(gain))
+    if shoulder:
+        moved = np.minimum(moved, np.maximum(c, 1))
+    return np.where(gain == 0, c, moved)
 
 
 def pixels(width: int, height: int, left: int = 0, top: int = 0) -> tuple[Array, Array]:

@@ -22,7 +22,7 @@ def seam_difference(
     lens: Numbers,
     colours: Sequence[int],
     cells: Sequence[int],
-    integer: int,
+    shoulder: float,
     clipped: float,
     squared: int,
 ) -> Array:
@@ -41,8 +41,8 @@ def seam_difference(
         seen = layer_seen(layer, field, box, columns, rows, border, lens)
         usable &= (seen[..., 3] > 0) & (seen[..., :3] <= clipped).all(-1)
         here = gain[gain_row[cell[1]][:, None], gain_column[cell[0]][None], :3].astype(np.float64)
-        shifted = exposure_shift(seen[..., :3], here, integer)
-        looks.append(shifted if integer else np.sqrt(np.maximum(shifted, 0)))
+        shifted = exposure_shift(seen[..., :3], here, shoulder)
+        looks.append(shifted if shoulder else np.sqrt(np.maximum(shifted, 0)))
     result = np.zeros((cells[1], cells[0], 4))
     for j, i in np.ndindex(cells[1], cells[0]):
         left, right = (k * border[0] // cells[0] for k in (i, i + 1))
