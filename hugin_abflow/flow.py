@@ -9,7 +9,7 @@ large for that comes from search.py.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -17,7 +17,7 @@ import numpy as np
 from hugin_abflow import pyramid, search
 from hugin_abflow.opencl import Buffer, Device
 from hugin_abflow.pyramid import Level
-from hugin_abflow.search import SearchParameters
+from hugin_abflow.search import Grid, SearchParameters
 
 
 @dataclass(frozen=True)
@@ -40,8 +40,61 @@ class FlowParameters:
     search: SearchParameters = field(default_factory=SearchParameters)
 
 
-# Changes a level's linear system, (level, left side, right side) of kernel flow_system, before it is solved.
-Pull = Callable[[int, Buffer, Buffer], None]
+# Work items that relax a row together: many, but few beyond the row's end. Rows of a board are whole groups.
+_ROW_GROUP = 64
+# Planes of a board, as of kernels/common.cl.
+_PLANES = 22
+# Bytes of a board up to which both ways are solved at a time: what does not stay in a CPU's cache is slower.
+_TOGETHER = 1 << 23
+
+
+@dataclass(frozen=True)
+class Board:
+    """Linear systems of one grid with the flows that solve them, one for each way (kernels/common.cl).
+
+    planes  float32 (ways, 2, height, planes, pitch).
+    grid    (width, height, wraps, 0).
+    """
+
+    planes: Buffer
+    grid: Grid
+
+    @classmethod
+    def of(cls, device: Device, ways: int, grid: Grid) -> Board:
+        """A board of zeros."""
+        pitch = -(-((grid[0] + 1) // 2 + 1) // _ROW_GROUP) * _ROW_GROUP
+        return cls(device.zeros((ways, 2, grid[1], _PLANES, pitch)), grid)
+
+    @property
+    def pitch(self) -> int:
+        """Columns of a row of one colour, unused ones at its end."""
+        return self.planes.shape[-1]
+
+    @property
+    def ways(self) -> int:
+        """How many systems there are."""
+        return self.planes.shape[0]
+
+    @property
+    def options(self) -> str:
+        """Build options of kernels that go over the board."""
+        return f"-DWRAPS={self.grid[2]}"
+
+    def relax(self, device: Device, sweeps: int, relaxation: float) -> None:
+        """Red-black sweeps."""
+        calls = [(self.grid, self.pitch, colour, relaxation, self.planes) for colour in (0, 1)]
+        size = (self.pitch, self.grid[1], self.ways)
+        device.repeat("flow", "flow_relax", size, calls, sweeps, self.options, _ROW_GROUP)
+
+    def solution(self, device: Device, flows: Buffer, first: int = 0) -> Buffer:
+        """`flows`, float32 (2, height, width, 2) or one of them, with the board's from way `first` on."""
+        size = (*self.grid[:2], self.ways)
+        device.run("flow", "flow_solution", size, self.planes, self.grid, self.pitch, first, flows)
+        return flows
+
+
+# Changes a level's linear system before it is solved: level, board, which of its ways.
+Pull = Callable[[int, Board, int], None]
 
 
 @dataclass(frozen=True)
@@ -53,60 +106,58 @@ class Start:
     pulls: tuple[Pull | None, Pull | None] = (None, None)
 
 
-@dataclass(frozen=True)
-class _Features:
-    feature: Buffer
-    grid: tuple[int, int, int, int]
-
-
-def _features(device: Device, level: Level, coarser: Level, parameters: FlowParameters) -> _Features:
-    """Features of a level; the local mean is smooth enough to be taken from the next coarser one."""
-    mean = pyramid.smooth(device, coarser, parameters.mean_sigma / 2)
-    feature = device.empty((*level.image.shape, 4))
-    device.run(
-        "flow", "flow_feature", level.grid[:2], level.image, level.mask, level.grid,
-        mean.image, mean.mask, mean.grid, feature,
-    )  # fmt: skip
-    return _Features(feature, level.grid)
+def _features(device: Device, pairs: Sequence[tuple[Level, Level]], parameters: FlowParameters) -> Buffer:
+    """Features of images, float32 (images, height, width, 4). Each is given by its level and the next coarser
+    one: the local mean is smooth enough to be taken from there.
+    """
+    features = device.empty((len(pairs), *pairs[0][0].image.shape, 4))
+    for way, (level, coarser) in enumerate(pairs):
+        mean = pyramid.smooth(device, coarser, parameters.mean_sigma / 2)
+        device.run(
+            "flow", "flow_feature", level.grid[:2], level.image, level.mask, level.grid,
+            mean.image, mean.mask, mean.grid, way, features,
+        )  # fmt: skip
+    return features
 
 
 def _refine(
     device: Device,
-    a: _Features,
-    b: _Features,
-    flow: Buffer,
+    features: Buffer,
+    flows: Buffer,
+    grid: Grid,
     level: int,
     parameters: FlowParameters,
-    pull: Pull | None = None,
+    pulls: tuple[Pull | None, Pull | None],
 ) -> Buffer:
-    """Improve `flow` from a to b on one level."""
-    grid, size = a.grid, a.grid[:2]
-    shape = size[::-1]
-    warped, tensor, left = (device.empty((*shape, 4)) for _ in range(3))
-    right, median = (device.empty((*shape, 2)) for _ in range(2))
-    system_left, system_right = (device.empty((*shape, 4)) for _ in range(2))
-    window_right = device.empty((*shape, 2))
+    """Improve the flows between the images on one level, both ways; `flows` is used up."""
+    median = device.empty(flows.shape)
+    together = 2 * grid[0] * grid[1] * _PLANES * 4 <= _TOGETHER
+    board = Board.of(device, 2 if together else 1, grid)
+    rows, halves = (2 * board.pitch, grid[1], board.ways), (board.pitch, 2 * grid[1], board.ways)
     warps, sweeps = (
         per_level[min(level, len(per_level) - 1)] for per_level in (parameters.warps, parameters.sweeps)
     )
-    for _ in range(warps):
-        device.run("flow", "flow_warp", size, b.feature, flow, grid, warped)
-        device.run(
-            "flow", "flow_tensor", size, a.feature, warped, grid,
-            parameters.brightness, parameters.gradient, parameters.noise, tensor, right,
-        )  # fmt: skip
-        device.run("flow", "flow_window", size, tensor, right, grid, left, window_right)
-        device.run(
-            "flow", "flow_system", size, left, window_right, flow, a.feature, grid,
-            parameters.smoothness, parameters.contrast, system_left, system_right,
-        )  # fmt: skip
-        if pull:
-            pull(level, system_left, system_right)
-        half = ((size[0] + 1) // 2, size[1])
-        calls = [(system_left, system_right, grid, colour, parameters.relaxation, flow) for colour in (0, 1)]
-        device.repeat("flow", "flow_relax", half, calls, sweeps)
-        flow, median = search.filtered(device, flow, grid, median), flow
-    return flow
+    for first in range(0, 2, board.ways):
+        old, new = flows, median
+        device.run("flow", "flow_board", rows, features, grid, board.pitch, first, board.planes)
+        for _ in range(warps):
+            device.run("flow", "flow_warp", rows, features, old, grid, board.pitch, first, board.planes)
+            device.run(
+                "flow", "flow_tensor", halves, grid, board.pitch,
+                parameters.brightness, parameters.gradient, parameters.noise, board.planes,
+                options=board.options, group=_ROW_GROUP,
+            )  # fmt: skip
+            device.run(
+                "flow", "flow_system", halves, grid, board.pitch, parameters.smoothness, parameters.contrast,
+                board.planes, options=board.options, group=_ROW_GROUP,
+            )  # fmt: skip
+            for way, pull in enumerate(pulls[first : first + board.ways]):
+                if pull:
+                    pull(level, board, way)
+            board.relax(device, sweeps, parameters.relaxation)
+            search.filtered(device, board.solution(device, old, first), grid, new, first, board.ways)
+            old, new = new, old
+    return median if warps % 2 else flows
 
 
 def levels(image: Level, parameters: FlowParameters) -> int:
@@ -118,24 +169,45 @@ def levels(image: Level, parameters: FlowParameters) -> int:
 
 
 def finest_features(device: Device, image: Level, parameters: FlowParameters) -> Buffer:
-    """What the solver sees of an image on its finest level: float32 (height, width, 4), see flow.cl."""
-    return _features(device, image, pyramid.reduce(device, image), parameters).feature
+    """What the solver sees of an image on its finest level: float32 (1, height, width, 4), see flow.cl."""
+    return _features(device, [(image, pyramid.reduce(device, image))], parameters)
 
 
 def _choose(
-    device: Device, features: list[_Features], flows: list[Buffer], level: int, searched: bool,
-    reach: float, parameters: FlowParameters,
-) -> list[Buffer]:  # fmt: skip
+    device: Device, features: Buffer, stacked: Buffer, grid: Grid, level: int,
+    searched: bool, reach: float, parameters: FlowParameters,
+) -> Buffer:  # fmt: skip
     """The flows with which a level starts: each pixel's own, found by search, or from beside it."""
-    grid, how = features[0].grid, parameters.search
-    descriptors = a, b = [search.descriptor(device, f.feature, grid, how) for f in features]
-    others = flows
+    how = parameters.search
+    descriptors = a, b = [search.descriptor(device, one, grid, how) for one in _apart(device, features)]
+    flows = others = _apart(device, stacked)
     if searched:
         others = search.exhaustive(device, a, b, flows, grid, reach / 2**level, how)
-    return [
-        search.choose(device, descriptors[i], descriptors[1 - i], flow, others[i], grid, how)
-        for i, flow in enumerate(flows)
-    ]
+    return _together(
+        device,
+        [
+            search.choose(device, descriptors[i], descriptors[1 - i], flow, others[i], grid, how)
+            for i, flow in enumerate(flows)
+        ],
+    )
+
+
+def _apart(device: Device, stacked: Buffer) -> list[Buffer]:
+    """Copies of the arrays that lie one behind the other in a buffer."""
+    shape = stacked.shape[1:]
+    parts, count = [device.empty(shape) for _ in range(stacked.shape[0])], math.prod(shape[:-1])
+    for index, part in enumerate(parts):
+        part.copy(0, stacked, index * count, count)
+    return parts
+
+
+def _together(device: Device, parts: Sequence[Buffer]) -> Buffer:
+    """The opposite of `_apart`."""
+    shape = parts[0].shape
+    stacked, count = device.empty((len(parts), *shape)), math.prod(shape[:-1])
+    for index, part in enumerate(parts):
+        stacked.copy(index * count, part, 0, count)
+    return stacked
 
 
 def pair_flow(
@@ -148,10 +220,10 @@ def pair_flow(
 ) -> tuple[Buffer, Buffer]:
     """Flow from a to b and from b to a: two float32 (height, width, 2) in px of the grid.
 
-    a, b: log brightness with masks, 0 outside them. start: its flows are worked on, not copied, and nothing
-    else is searched. reach: the largest motion that is searched, px, 0: none; if it is None,
-    `parameters.reach` of the longer side. It is less where the masks overlap little: in a small corner of a
-    floor of tiles every tile fits. Raises `DeviceError` if the device fails.
+    a, b: log brightness with masks, 0 outside them. start: nothing else is searched. reach: the largest
+    motion that is searched, px, 0: none; if it is None, `parameters.reach` of the longer side. It is less
+    where the masks overlap little: in a small corner of a floor of tiles every tile fits. Raises
+    `DeviceError` if the device fails.
     """
     parameters = parameters or FlowParameters()
     count = start.level + 1 if start else levels(a, parameters)
@@ -161,37 +233,31 @@ def pair_flow(
         reach = min(reach, parameters.overlap * math.sqrt(common))
         searched = search.level(reach, count, parameters.search) if reach > 0 else -1
     pyramids = [pyramid.build(device, image, count + 1) for image in (a, b)]
-    flows: list[Buffer] | None = None
+    flows: Buffer | None = None
     for level in reversed(range(count)):
-        features = [_features(device, p[level], p[level + 1], parameters) for p in pyramids]
-        grid = features[0].grid
+        features = _features(device, [(p[level], p[level + 1]) for p in pyramids], parameters)
+        grid = pyramids[0][level].grid
         if flows is None and start:
-            flows = list(start.flows)
+            flows = _together(device, start.flows)
         elif flows is None:
-            flows = [device.zeros((grid[1], grid[0], 2)) for _ in range(2)]
+            flows = device.zeros((2, grid[1], grid[0], 2))
         else:
-            flows = [_expand(device, flow, grid) for flow in flows]
+            flows = _expand(device, flows, grid)
         # a search on a level finer than choose_from (of a small image) is followed by no other choice
         if min(searched, parameters.choose_from) <= level <= searched:
-            flows = _choose(device, features, flows, level, level == searched, reach, parameters)
-        flows = [
-            _refine(
-                device,
-                features[i],
-                features[1 - i],
-                flow,
-                level,
-                parameters,
-                start.pulls[i] if start else None,
-            )
-            for i, flow in enumerate(flows)
-        ]
+            flows = _choose(device, features, flows, grid, level, level == searched, reach, parameters)
+        flows = _refine(
+            device, features, flows, grid, level, parameters, start.pulls if start else (None, None)
+        )
     assert flows is not None
-    return flows[0], flows[1]
+    forward, backward = _apart(device, flows)
+    return forward, backward
 
 
-def _expand(device: Device, flow: Buffer, grid: tuple[int, int, int, int]) -> Buffer:
-    coarse = (flow.shape[1], flow.shape[0], grid[2], 0)
-    fine = device.empty((grid[1], grid[0], 2))
-    device.run("flow", "flow_expand", grid[:2], flow, coarse, fine, grid[:2])
+def _expand(device: Device, flows: Buffer, grid: Grid) -> Buffer:
+    """Flows of both ways on the next finer level's grid."""
+    ways, height, width, _ = flows.shape
+    fine = device.empty((ways, grid[1], grid[0], 2))
+    size = (*grid[:2], ways)
+    device.run("flow", "flow_expand", size, flows, (width, height, grid[2], 0), fine, grid[:2])
     return fine

@@ -18,7 +18,7 @@ import numpy.typing as npt
 
 from hugin_abflow import flow
 from hugin_abflow.chart import Chart
-from hugin_abflow.flow import FlowParameters, Start
+from hugin_abflow.flow import Board, FlowParameters, Start
 from hugin_abflow.guides import Guide, Points, doubts
 from hugin_abflow.opencl import Buffer, Device
 from hugin_abflow.pyramid import Level
@@ -109,7 +109,7 @@ def lead(
     guides, ways = guides.only(leading), [way.only(leading) for way in ways]
     solved = FlowParameters()
     level = min(len(parameters.pulls), flow.levels(images[0], solved)) - 1
-    found = [device.upload(one.get()) for one in flows]  # a start is worked on
+    found = [device.copy(one) for one in flows]  # what wins is put into them
     springs = [_Springs(device, images[0], *pair, parameters) for pair in zip(found, ways, strict=True)]
     start = Start(
         level, (springs[0].start(level), springs[1].start(level)), (springs[0].pull, springs[1].pull)
@@ -199,15 +199,15 @@ class _Springs:
     def start(self, level: int) -> Buffer:
         return self.at(level)[0]
 
-    def pull(self, level: int, left_side: Buffer, right_side: Buffer) -> None:
+    def pull(self, level: int, board: Board, way: int) -> None:
         strength = self._parameters.pulls[level]
         if not strength:
             return
         start, near = self.at(level)
-        grid = (start.shape[1], start.shape[0], self._image.grid[2], 0)
         self._device.run(
-            "guidance", "guidance_pull", grid[:2], start, near, grid, strength, left_side, right_side
-        )
+            "guidance", "guidance_pull", board.grid[:2], start, near, board.grid, board.pitch, strength, way,
+            board.planes,
+        )  # fmt: skip
 
 
 def _sigmas(way: _Way, parameters: GuidanceParameters) -> Values:
@@ -228,7 +228,7 @@ def _sigmas(way: _Way, parameters: GuidanceParameters) -> Values:
 class _Rivals:
     """Two flows of one direction, and what of the other image each brings to the pixels of this one.
 
-    feature, brought    float32 (height, width, 4), see kernels/flow.cl.
+    feature, brought    float32 (1, height, width, 4), see kernels/flow.cl.
     """
 
     grid: tuple[int, int, int, int]
@@ -244,7 +244,7 @@ class _Rivals:
     ) -> _Rivals:  # fmt: skip
         brought = device.empty(feature.shape), device.empty(feature.shape)
         for field, target in zip((old, new), brought, strict=True):
-            device.run("flow", "flow_warp", grid[:2], other, field, grid, target)
+            device.run("guidance", "guidance_bring", grid[:2], other, field, grid, target)
         return cls(grid, feature, old, new, brought)
 
 
@@ -257,7 +257,7 @@ def _refusals(rivals: Sequence[_Rivals], ways: Sequence[_Way], parameters: Guida
     count = len(ways[0].places)
     costs, contrast, moved = np.zeros((count, 2)), np.zeros(count), np.zeros(count)
     for rival, way in zip(rivals, ways, strict=True):
-        feature, *brought = (buffer.get() for buffer in (rival.feature, *rival.brought))
+        feature, *brought = (buffer.get()[0] for buffer in (rival.feature, *rival.brought))
         shift = np.linalg.norm(rival.new.get() - rival.old.get(), axis=-1)
         width, height, wraps, _ = rival.grid
         for i in np.flatnonzero(way.residuals.any(1)):
@@ -291,13 +291,11 @@ def _cost(a: npt.NDArray[np.float32], b: npt.NDArray[np.float32]) -> npt.NDArray
 def _choose(device: Device, rivals: _Rivals, near: Buffer, parameters: GuidanceParameters) -> None:
     """Put the new flow into the old one where it explains the images better."""
     grid, size = rivals.grid, rivals.grid[:2]
-    left_side, right_side = (device.empty(rivals.feature.shape) for _ in range(2))
+    board = Board.of(device, 1, grid)
     device.run(
-        "guidance", "guidance_vote", size, rivals.feature, *rivals.brought, near, grid,
-        parameters.evidence, parameters.trust, parameters.contrast, left_side, right_side,
+        "guidance", "guidance_vote", size, rivals.feature, *rivals.brought, near, grid, board.pitch,
+        parameters.evidence, parameters.trust, parameters.contrast, board.planes,
     )  # fmt: skip
-    vote = device.zeros(rivals.old.shape)
-    half = ((size[0] + 1) // 2, size[1])
-    calls = [(left_side, right_side, grid, colour, 1.9, vote) for colour in (0, 1)]
-    device.repeat("flow", "flow_relax", half, calls, parameters.sweeps)
+    board.relax(device, parameters.sweeps, 1.9)
+    vote = board.solution(device, device.empty(rivals.old.shape))
     device.run("guidance", "guidance_choose", size, vote, rivals.new, grid, rivals.old)

@@ -26,7 +26,7 @@ from hugin_abflow.errors import DeviceError
 _log = logging.getLogger(__name__)
 
 # Work-group: rows suit both a GPU's wavefronts and the vector units of a CPU.
-_GROUP = (256, 1)
+_GROUP = 256
 
 _INSTALL = {
     "linux": "install a CPU runtime with `pip install 'pyopencl[pocl]'` (or Debian's pocl-opencl-icd), "
@@ -245,6 +245,7 @@ class Device:
         self.queue = cl.CommandQueue(self.context, properties=timing)
         self._times = _Times(self.queue) if timing else None
         self._kernels: dict[tuple[str, str, str], cl.Kernel] = {}
+        self._repeated: dict[tuple[str, str, str], list[cl.Kernel]] = {}
         self._arguments = threading.Lock()  # a kernel keeps its arguments from when they are set to its start
         _log.info("device: %s", self.name)
 
@@ -290,8 +291,16 @@ class Device:
                 self._kernels[(module, found.function_name, options)] = found
         return self._kernels[key]
 
-    def run(self, module: str, name: str, size: Sequence[int], *args: object, options: str = "") -> None:
-        """Run a kernel over `size` (columns, rows) work items.
+    def run(
+        self,
+        module: str,
+        name: str,
+        size: Sequence[int],
+        *args: object,
+        options: str = "",
+        group: int = _GROUP,
+    ) -> None:
+        """Run a kernel over `size` (columns, rows, or columns, rows, layers) work items.
 
         Arguments: `Buffer`, int (int32), float (float32), or a tuple / array of 2, 4 or 16 numbers,
         which becomes an int or float vector. The run size is rounded up to whole work-groups; every
@@ -302,26 +311,39 @@ class Device:
         with self._arguments, _device_errors(f"running {name}"):
             kernel = self.kernel(module, name, options)
             kernel.set_args(*(_argument(a) for a in args))
-            event = cl.enqueue_nd_range_kernel(self.queue, kernel, _rounded(size), _GROUP)
+            event = cl.enqueue_nd_range_kernel(self.queue, kernel, *_launch(size, group))
         self.timed(name, trace.KERNEL, event)
 
     def repeat(
-        self, module: str, name: str, size: Sequence[int], calls: Sequence[Sequence[object]], times: int
+        self,
+        module: str,
+        name: str,
+        size: Sequence[int],
+        calls: Sequence[Sequence[object]],
+        times: int,
+        options: str = "",
+        group: int = _GROUP,
     ) -> None:
         """Run a kernel with each of the argument lists `calls` in turn, `times` over.
 
         Arguments are set once: on small grids that is most of what a launch costs.
         """
-        program = self.kernel(module, name).program
-        kernels = [cl.Kernel(program, name) for _ in calls]
-        for kernel, args in zip(kernels, calls, strict=True):
-            kernel.set_args(*(_argument(a) for a in args))
-        rounded = _rounded(size)
-        with _device_errors(f"running {name}"):
+        launch = _launch(size, group)
+        with self._arguments, _device_errors(f"running {name}"):
+            kernels = self._instances(module, name, options, len(calls))
+            for kernel, args in zip(kernels, calls, strict=True):
+                kernel.set_args(*(_argument(a) for a in args))
             for _ in range(times):
                 for kernel in kernels:
-                    event = cl.enqueue_nd_range_kernel(self.queue, kernel, rounded, _GROUP)
+                    event = cl.enqueue_nd_range_kernel(self.queue, kernel, *launch)
                     self.timed(name, trace.KERNEL, event)
+
+    def _instances(self, module: str, name: str, options: str, count: int) -> list[cl.Kernel]:
+        """Objects of one kernel, each with arguments of its own; they are slow to make."""
+        first = self.kernel(module, name, options)
+        made = self._repeated.setdefault((module, name, options), [first])
+        made += [cl.Kernel(first.program, name) for _ in range(count - len(made))]
+        return made[:count]
 
     def finish(self) -> None:
         """Wait for all that was started; raises `DeviceError` if the device failed."""
@@ -340,9 +362,10 @@ class Device:
             self._times.tell()
 
 
-def _rounded(size: Sequence[int]) -> tuple[int, ...]:
-    """A run size in whole work-groups."""
-    return tuple(-(-int(n) // g) * g for n, g in zip(size, _GROUP, strict=True))
+def _launch(size: Sequence[int], group: int) -> tuple[tuple[int, ...], tuple[int, ...]]:
+    """A run size in whole work-groups, and the size of these."""
+    columns, *others = map(int, size)
+    return (-(-columns // group) * group, *others), (group, *(1 for _ in others))
 
 
 def _argument(value: Any) -> Any:

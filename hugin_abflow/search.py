@@ -14,7 +14,7 @@ from dataclasses import dataclass
 
 from hugin_abflow.opencl import Buffer, Device
 
-Grid = tuple[int, int, int, int]
+Grid = tuple[int, int, int, int]  # (width, height, wraps, 0), as the kernels take it
 
 
 @dataclass(frozen=True)
@@ -43,10 +43,14 @@ def descriptor(device: Device, feature: Buffer, grid: Grid, parameters: SearchPa
     return result
 
 
-def filtered(device: Device, flow: Buffer, grid: Grid, result: Buffer) -> Buffer:
-    """`result`, filled with the median of `flow`: both float32 (height, width, 2)."""
-    four_at_a_time = (-(-grid[0] // 4), grid[1])
-    device.run("flow", "flow_median", four_at_a_time, flow, grid, result)
+def filtered(
+    device: Device, flow: Buffer, grid: Grid, result: Buffer, first: int = 0, ways: int = 1
+) -> Buffer:
+    """`result`, filled with the median of `flow`: both float32 (height, width, 2), or several of these, of
+    which `ways` are filtered from `first` on.
+    """
+    four_at_a_time = (-(-grid[0] // 4), grid[1], ways)
+    device.run("flow", "flow_median", four_at_a_time, flow, grid, first, result)
     return result
 
 

@@ -41,6 +41,14 @@ static inline float square3(float3 a) {
 }
 
 /* exp(a) to 1e-7, exactly 1 for 0, of -87 to 88: a power of two times a polynomial fitted to 2^t over 0..1. */
+static inline float exponential1(float a) {
+    const float y = a * 1.44269504f;
+    int whole = (int)y;
+    whole -= y < (float)whole ? 1 : 0;
+    const float t = y - (float)whole, upper = 0.0557999383f + t * (0.00901699517f + t * 0.00186714665f);
+    return (1.0f + t * (0.693151312f + t * (0.240164443f + t * upper))) * as_float((whole + 127) << 23);
+}
+
 static inline float4 exponential(float4 a) {
     const float4 y = a * 1.44269504f;
     int4 whole = convert_int4(y);
@@ -74,6 +82,45 @@ static inline bool grid_border(int2 *p, int4 grid) {
 /* Index of pixel p in an array of the whole grid; -1 outside. */
 static inline int grid_index(int2 p, int4 grid) {
     return grid_border(&p, grid) ? p.y * grid.x + p.x : -1;
+}
+
+/* What a board holds. With the flows u of the four neighbours, the data term's matrix J and right-hand side b, and
+   weights s of smoothness, the linear system is
+       (J11 + sum s) u1 + J12 u2 = b1 + sum s u1',    J12 u1 + (J22 + sum s) u2 = b2 + sum s u2'.
+   Of the first and the last value no neighbour's is read, which might lie beside the array. */
+enum board_value {
+    BOARD_R1, BOARD_R2,                                             /* 1 / (J11 + sum s), 1 / (J22 + sum s) */
+    BOARD_CROSS,                                                    /* J12 */
+    BOARD_EAST, BOARD_SOUTH,                                        /* weights towards two neighbours, or 0 */
+    BOARD_U, BOARD_V,                                               /* flow */
+    BOARD_H, BOARD_HX, BOARD_HY, BOARD_VALID,                       /* feature */
+    BOARD_WARPED_H, BOARD_WARPED_HX, BOARD_WARPED_HY, BOARD_WARPED, /* the other image's, by the flow */
+    BOARD_J11, BOARD_J12, BOARD_J22, BOARD_J13, BOARD_J23,          /* constraints of a pixel alone */
+    BOARD_B1, BOARD_B2,                                             /* b */
+    BOARD_PLANES
+};
+
+/* A board holds values of a grid's pixels, parted by colour like the squares of a chequerboard: floats
+   (2, grid.y, BOARD_PLANES, pitch), first the rows of pixels whose x + y is even, then the others, each with its
+   pixels side by side, value for value. A pixel's neighbours lie side by side as well, in the other colour's rows,
+   its diagonal ones in its own, so that compilers for CPUs can take many pixels of a row at a time; for that kernels
+   over boards do not check columns. A row ends with at least one column of zeros, which is also what lies before
+   the first column of the next. */
+static inline int board_index(int x, int y, int4 grid, int pitch) {
+    return (((x + y) & 1) * grid.y + y) * BOARD_PLANES * pitch + x / 2;
+}
+
+/* Put the sides of a pixel's system on a board (p: its first value). links: weights to the east, west, south and
+   north. What nothing holds stays as it is. */
+static inline void board_solve(__global float *p, int pitch, float3 data, float2 b, float4 links) {
+    const float sum = links.x + links.y + links.z + links.w, first = data.x + sum, second = data.z + sum;
+    p[BOARD_R1 * pitch] = 1.0f / (first > 0.0f ? first : 1.0f);
+    p[BOARD_R2 * pitch] = 1.0f / (second > 0.0f ? second : 1.0f);
+    p[BOARD_CROSS * pitch] = data.y;
+    p[BOARD_EAST * pitch] = links.x;
+    p[BOARD_SOUTH * pitch] = links.z;
+    p[BOARD_B1 * pitch] = first > 0.0f ? b.x : p[BOARD_U * pitch];
+    p[BOARD_B2 * pitch] = second > 0.0f ? b.y : p[BOARD_V * pitch];
 }
 
 /* Index of canvas pixel p in an array that covers box (left, top, width, height); -1 outside. */
@@ -189,6 +236,15 @@ static inline float2 bilinear_flow(__global const float2 *values, float2 q, int4
     int4 at;
     const float4 w = bilinear_taps(q, grid, &at);
     return w.x * values[at.x] + w.y * values[at.y] + w.z * values[at.z] + w.w * values[at.w];
+}
+
+/* A feature of flow.cl at pixel (x, y) displaced by f, bilinear; all 0 where a tap that counts is not valid. */
+static inline float4 feature_sample(__global const float4 *feature, int x, int y, float2 f, int4 grid) {
+    const int2 whole = floor_int2(f);
+    int4 at;
+    const float4 w = grid_taps((int2)(x, y) + whole, f - convert_float2(whole), grid, &at);
+    const float4 sum = w.x * feature[at.x] + w.y * feature[at.y] + w.z * feature[at.z] + w.w * feature[at.w];
+    return sum.w > 0.999f ? sum / sum.w : (float4)(0.0f);
 }
 
 /* A layer of the working grid at position q, bilinear; all 0 where a tap is missing. */

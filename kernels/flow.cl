@@ -3,7 +3,8 @@
    the mask; coarse to fine, with warping (Bruhn, Weickert, Schnoerr 2005; normalised as Zimmer et al. 2011).
 
    A feature is (h, dh/dx, dh/dy, valid): h is log brightness less its local mean, blind to gain. Flow is in
-   pixels of the level's grid; grid = (width, height, wraps, 0). */
+   pixels of the level's grid; grid = (width, height, wraps, 0). The two ways of a pair, from a to b and from b to a,
+   are calculated at a time where they are small, on boards (common.cl). */
 
 /* Bilinear reading of the local mean, which is kept on the next coarser level. */
 static inline float flow_local_mean(__global const float *mean, __global const float *weight, int4 coarse, int x,
@@ -31,12 +32,14 @@ __kernel void flow_feature(__global const float *image,  /* (grid.y, grid.x) log
                            __global const float *mean,   /* (coarse.y, coarse.x) local mean */
                            __global const float *weight, /* (coarse.y, coarse.x) of the mean */
                            int4 coarse,                  /* the next coarser level */
-                           __global float4 *feature)    /* (grid.y, grid.x) */
+                           int way,                      /* place among `features` */
+                           __global float4 *features)    /* (ways, grid.y, grid.x) */
 {
     const int x = get_global_id(0), y = get_global_id(1);
     if (x >= grid.x || y >= grid.y)
         return;
     const int at = y * grid.x + x;
+    __global float4 *feature = features + way * grid.y * grid.x;
     if (mask[at] == 0.0f) {
         feature[at] = (float4)(0.0f);
         return;
@@ -46,167 +49,214 @@ __kernel void flow_feature(__global const float *image,  /* (grid.y, grid.x) log
     feature[at] = (float4)(image[at] - flow_local_mean(mean, weight, coarse, x, y), dx, dy, 1.0f);
 }
 
-/* Sample feature at q + flow(q), bilinear; w is the share of valid taps. */
-__kernel void flow_warp(__global const float4 *feature, /* (grid.y, grid.x) of the other image */
-                        __global const float2 *flow,    /* (grid.y, grid.x) px */
-                        int4 grid,                      /* run size */
-                        __global float4 *warped)        /* (grid.y, grid.x) */
+/* Begin a level: the features of one or both ways on boards. */
+__kernel void flow_board(__global const float4 *features, /* (2, grid.y, grid.x) */
+                         int4 grid, int pitch,            /* run size: 2 pitch, grid.y, ways */
+                         int first,                       /* the first of these ways */
+                         __global float *board)           /* (ways, 2, grid.y, BOARD_PLANES, pitch) */
 {
     const int x = get_global_id(0), y = get_global_id(1);
-    if (x >= grid.x || y >= grid.y)
+    if (x >= 2 * pitch || y >= grid.y)
         return;
-    const float2 f = flow[y * grid.x + x];
-    const int2 whole = floor_int2(f);
-    int4 at;
-    const float4 w = grid_taps((int2)(x, y) + whole, f - convert_float2(whole), grid, &at);
-    const float4 sum = w.x * feature[at.x] + w.y * feature[at.y] + w.z * feature[at.z] + w.w * feature[at.w];
-    warped[y * grid.x + x] = sum.w > 0.999f ? sum / sum.w : (float4)(0.0f);
+    __global float *p = board + get_global_id(2) * 2 * grid.y * BOARD_PLANES * pitch + board_index(x, y, grid, pitch);
+    float4 f = (float4)(0.0f);
+    if (x < grid.x)
+        f = features[((first + get_global_id(2)) * grid.y + y) * grid.x + x];
+    p[BOARD_H * pitch] = f.x;
+    p[BOARD_HX * pitch] = f.y;
+    p[BOARD_HY * pitch] = f.z;
+    p[BOARD_VALID * pitch] = f.w;
 }
 
-static inline float4 flow_mean_feature(__global const float4 *a, __global const float4 *b, int2 p, int4 grid) {
-    if (!grid_border(&p, grid))
-        return (float4)(0.0f);
-    const float4 fa = a[p.y * grid.x + p.x], fb = b[p.y * grid.x + p.x];
-    return fa.w * fb.w > 0.0f ? 0.5f * (fa + fb) : (float4)(0.0f);
+/* Begin a linearisation: the flow, and what it brings of the other image's feature. */
+__kernel void flow_warp(__global const float4 *features, /* (2, grid.y, grid.x) */
+                        __global const float2 *flows,    /* (2, grid.y, grid.x) px */
+                        int4 grid, int pitch,            /* run size: 2 pitch, grid.y, ways */
+                        int first,                       /* the first of these ways */
+                        __global float *board)           /* (ways, 2, grid.y, BOARD_PLANES, pitch) */
+{
+    const int x = get_global_id(0), y = get_global_id(1), way = first + get_global_id(2);
+    if (x >= 2 * pitch || y >= grid.y)
+        return;
+    __global float *p = board + get_global_id(2) * 2 * grid.y * BOARD_PLANES * pitch + board_index(x, y, grid, pitch);
+    float2 flow = (float2)(0.0f);
+    float4 f = (float4)(0.0f);
+    if (x < grid.x) {
+        flow = flows[(way * grid.y + y) * grid.x + x];
+        f = feature_sample(features + (1 - way) * grid.y * grid.x, x, y, flow, grid);
+    }
+    p[BOARD_U * pitch] = flow.x;
+    p[BOARD_V * pitch] = flow.y;
+    p[BOARD_WARPED_H * pitch] = f.x;
+    p[BOARD_WARPED_HX * pitch] = f.y;
+    p[BOARD_WARPED_HY * pitch] = f.z;
+    p[BOARD_WARPED * pitch] = f.w;
+}
+
+/* Most charts do not wrap, and compilers for CPUs take many pixels at a time only if they know. */
+#ifndef WRAPS
+#define WRAPS grid.z
+#endif
+
+/* Places on a board: of pixel k of a row and colour, its neighbours (a row beyond the border: any place), and the
+   first of its colour's rows above and below, which hold its diagonal neighbours. */
+typedef struct {
+    int x, at, west, east, north, south;
+    int above_west, above_east, below_west, below_east;
+} flow_places;
+
+static inline flow_places flow_around(int k, int y, int colour, int4 grid, int pitch) {
+    flow_places p;
+    const int odd = (y + colour) & 1, own = (colour * grid.y + y) * BOARD_PLANES * pitch + k;
+    const int other = ((1 - colour) * grid.y + y) * BOARD_PLANES * pitch + k;
+    const int row = BOARD_PLANES * pitch, up = y > 0 ? -row : 0, down = y + 1 < grid.y ? row : 0;
+    p.x = 2 * k + odd;
+    p.at = own;
+    p.east = other + odd;
+    p.west = p.east - 1;
+    p.north = other + up;
+    p.south = other + down;
+    p.above_east = own + up + odd;
+    p.above_west = p.above_east - 1;
+    p.below_east = own + down + odd;
+    p.below_west = p.below_east - 1;
+    if (WRAPS) {
+        const int above = y > 0 ? y - 1 : y, below = y + 1 < grid.y ? y + 1 : y;
+        const bool start = p.x == 0, end = p.x == grid.x - 1;
+        p.west = start ? board_index(grid.x - 1, y, grid, pitch) : p.west;
+        p.east = end ? board_index(0, y, grid, pitch) : p.east;
+        p.above_west = start ? board_index(grid.x - 1, above, grid, pitch) : p.above_west;
+        p.above_east = end ? board_index(0, above, grid, pitch) : p.above_east;
+        p.below_west = start ? board_index(grid.x - 1, below, grid, pitch) : p.below_west;
+        p.below_east = end ? board_index(0, below, grid, pitch) : p.below_east;
+    }
+    return p;
 }
 
 /* The linearised constraints of one warp, J (du, dv) = -(J13, J23), weighted robustly. */
-__kernel void flow_tensor(__global const float4 *feature, /* (grid.y, grid.x) */
-                          __global const float4 *warped,  /* (grid.y, grid.x) the other, warped */
-                          int4 grid,                      /* run size */
-                          float brightness,               /* weight of brightness constancy */
-                          float gradient,                 /* weight of gradient constancy */
-                          float noise,                    /* amplitude of h below which texture is noise */
-                          __global float4 *tensor,        /* (grid.y, grid.x) J11, J12, J22, valid */
-                          __global float2 *right)         /* (grid.y, grid.x) J13, J23 */
+__kernel void flow_tensor(int4 grid, int pitch, /* run size: pitch, 2 grid.y, ways */
+                          float brightness,     /* weight of brightness constancy */
+                          float gradient,       /* weight of gradient constancy */
+                          float noise,          /* amplitude of h below which texture is noise */
+                          __global float *board) /* (ways, 2, grid.y, BOARD_PLANES, pitch) */
 {
-    const int x = get_global_id(0), y = get_global_id(1);
-    if (x >= grid.x || y >= grid.y)
+    const int row = get_global_id(1), colour = row >= grid.y, y = row - colour * grid.y;
+    if (row >= 2 * grid.y)
         return;
-    const int at = y * grid.x + x;
-    const float4 a = feature[at], b = warped[at];
-    float4 j = (float4)(0.0f);
-    float2 r = (float2)(0.0f);
-    if (a.w * b.w > 0.0f) {
-        const float robust = 1e-3f, zeta = noise * noise;
-        const float2 d = 0.5f * (a.yz + b.yz);
-        const float4 t = b - a;
-        const float n = 1.0f / (square2(d) + zeta);
-        const float w = brightness * n / ROOT(t.x * t.x * n + robust * robust);
-        j = (float4)(w * d.x * d.x, w * d.x * d.y, w * d.y * d.y, 1.0f);
-        r = w * t.x * d;
-        const float4 west = flow_mean_feature(feature, warped, (int2)(x - 1, y), grid);
-        const float4 east = flow_mean_feature(feature, warped, (int2)(x + 1, y), grid);
-        const float4 north = flow_mean_feature(feature, warped, (int2)(x, y - 1), grid);
-        const float4 south = flow_mean_feature(feature, warped, (int2)(x, y + 1), grid);
-        if (west.w * east.w * north.w * south.w > 0.0f) {
-            const float2 dx = 0.5f * (east.yz - west.yz);   /* d(hx)/dx, d(hy)/dx */
-            const float2 dy = 0.5f * (south.yz - north.yz); /* d(hx)/dy, d(hy)/dy */
-            const float nx = 1.0f / (dx.x * dx.x + dy.x * dy.x + zeta);
-            const float ny = 1.0f / (dx.y * dx.y + dy.y * dy.y + zeta);
-            const float g = gradient / ROOT(t.y * t.y * nx + t.z * t.z * ny + robust * robust);
-            j.x += g * (nx * dx.x * dx.x + ny * dx.y * dx.y);
-            j.y += g * (nx * dx.x * dy.x + ny * dx.y * dy.y);
-            j.z += g * (nx * dy.x * dy.x + ny * dy.y * dy.y);
-            r.x += g * (nx * dx.x * t.y + ny * dx.y * t.z);
-            r.y += g * (nx * dy.x * t.y + ny * dy.y * t.z);
-        }
-    }
-    tensor[at] = j;
-    right[at] = r;
+    board += get_global_id(2) * 2 * grid.y * BOARD_PLANES * pitch;
+    const flow_places p = flow_around(get_global_id(0), y, colour, grid, pitch);
+    __global const float *h = board + BOARD_H * pitch, *hx = board + BOARD_HX * pitch;
+    __global const float *hy = board + BOARD_HY * pitch, *valid = board + BOARD_VALID * pitch;
+    __global const float *warped_h = board + BOARD_WARPED_H * pitch, *warped_hx = board + BOARD_WARPED_HX * pitch;
+    __global const float *warped_hy = board + BOARD_WARPED_HY * pitch, *warped = board + BOARD_WARPED * pitch;
+
+    const float robust = 1e-3f, zeta = noise * noise;
+    const float mx = 0.5f * (hx[p.at] + warped_hx[p.at]), my = 0.5f * (hy[p.at] + warped_hy[p.at]);
+    const float t = warped_h[p.at] - h[p.at], tx = warped_hx[p.at] - hx[p.at], ty = warped_hy[p.at] - hy[p.at];
+    const float n = 1.0f / (mx * mx + my * my + zeta);
+    const float both = valid[p.at] * warped[p.at] > 0.0f ? 1.0f : 0.0f;
+    const float w = both * brightness * n / ROOT(t * t * n + robust * robust);
+
+    const float seen = both * valid[p.west] * warped[p.west] * valid[p.east] * warped[p.east] * valid[p.north] *
+                       warped[p.north] * valid[p.south] * warped[p.south];
+    const float whole = seen > 0.0f && y > 0 && y + 1 < grid.y ? 1.0f : 0.0f;
+    /* derivatives in x and y of the mean slopes */
+    const float xx = 0.25f * (hx[p.east] + warped_hx[p.east] - hx[p.west] - warped_hx[p.west]);
+    const float yx = 0.25f * (hy[p.east] + warped_hy[p.east] - hy[p.west] - warped_hy[p.west]);
+    const float xy = 0.25f * (hx[p.south] + warped_hx[p.south] - hx[p.north] - warped_hx[p.north]);
+    const float yy = 0.25f * (hy[p.south] + warped_hy[p.south] - hy[p.north] - warped_hy[p.north]);
+    const float nx = 1.0f / (xx * xx + xy * xy + zeta), ny = 1.0f / (yx * yx + yy * yy + zeta);
+    const float g = whole * gradient / ROOT(tx * tx * nx + ty * ty * ny + robust * robust);
+    const float gx = g * nx, gy = g * ny;
+
+    board[BOARD_J11 * pitch + p.at] = w * mx * mx + gx * xx * xx + gy * yx * yx;
+    board[BOARD_J12 * pitch + p.at] = w * mx * my + gx * xx * xy + gy * yx * yy;
+    board[BOARD_J22 * pitch + p.at] = w * my * my + gx * xy * xy + gy * yy * yy;
+    board[BOARD_J13 * pitch + p.at] = w * t * mx + gx * xx * tx + gy * yx * ty;
+    board[BOARD_J23 * pitch + p.at] = w * t * my + gx * xy * tx + gy * yy * ty;
 }
 
-/* Add to the sums j, r what a pixel p of the window has, if it lies on the grid; inner: it does. */
-static inline void flow_add(__global const float4 *tensor, __global const float2 *right, int2 p, float weight,
-                            int4 grid, bool inner, float4 *j, float2 *r) {
-    const int at = inner ? p.y * grid.x + p.x : grid_index(p, grid);
-    if (at < 0)
-        return;
-    *j += weight * tensor[at];
-    *r += weight * right[at];
+/* Sum over the Lucas-Kanade window (binomial, 3 x 3). share: a sixteenth, or 0 for a row that is not. */
+static inline float flow_window(__global const float *j, flow_places p, float share, float above, float below) {
+    return share * (4.0f * j[p.at] + 2.0f * (j[p.west] + j[p.east])) +
+           above * (2.0f * j[p.north] + j[p.above_west] + j[p.above_east]) +
+           below * (2.0f * j[p.south] + j[p.below_west] + j[p.below_east]);
 }
 
-/* Sum the constraints over the Lucas-Kanade window (binomial, 3 x 3). */
-__kernel void flow_window(__global const float4 *tensor, /* (grid.y, grid.x) */
-                          __global const float2 *right,  /* (grid.y, grid.x) */
-                          int4 grid,                     /* run size */
-                          __global float4 *tensor_out,   /* (grid.y, grid.x) */
-                          __global float2 *right_out)    /* (grid.y, grid.x) */
-{
-    const int x = get_global_id(0), y = get_global_id(1);
-    if (x >= grid.x || y >= grid.y)
-        return;
-    const bool inner = x > 0 && x + 1 < grid.x && y > 0 && y + 1 < grid.y;
-    float4 j = (float4)(0.0f);
-    float2 r = (float2)(0.0f);
-    for (int row = y - 1; row <= y + 1; ++row) {
-        const float weight = row == y ? 0.5f : 0.25f;
-        flow_add(tensor, right, (int2)(x - 1, row), 0.25f * weight, grid, inner, &j, &r);
-        flow_add(tensor, right, (int2)(x, row), 0.5f * weight, grid, inner, &j, &r);
-        flow_add(tensor, right, (int2)(x + 1, row), 0.25f * weight, grid, inner, &j, &r);
-    }
-    tensor_out[y * grid.x + x] = j;
-    right_out[y * grid.x + x] = r;
+/* Weight of smoothness towards neighbour `to`: less across an edge of the image, where the flow may jump, and by
+   the total variation of the flow. */
+static inline float flow_link(__global const float *board, int pitch, int at, int to, float contrast) {
+    __global const float *h = board + BOARD_H * pitch, *valid = board + BOARD_VALID * pitch;
+    __global const float *u = board + BOARD_U * pitch, *v = board + BOARD_V * pitch;
+    const float step = (h[at] - h[to]) / contrast, du = u[to] - u[at], dv = v[to] - v[at];
+    const float edge = valid[at] * valid[to] > 0.0f ? LEAST(MAGNITUDE(step), 80.0f) : 0.0f;
+    return exponential1(-edge) / ROOT(du * du + dv * dv + 1e-4f);
 }
 
-/* How far two pixels are apart: step of the image over `contrast`, squared difference of their flows. */
-static inline float2 flow_gap(__global const float2 *flow, __global const float4 *feature, int at, int to,
-                              float contrast) {
-    const float4 a = feature[at], b = feature[to];
-    const float step = (a.x - b.x) / contrast;
-    /* an edge of the image is where the flow may jump */
-    return (float2)(a.w * b.w > 0.0f ? LEAST(MAGNITUDE(step), 80.0f) : 0.0f, square2(flow[to] - flow[at]));
-}
-
-/* The linear system of one warp: diag/off-diagonals of the data term, right-hand side for the whole flow (not
-   the increment), and the smoothness weights towards the east and south neighbours. */
-__kernel void flow_system(__global const float4 *tensor,  /* (grid.y, grid.x) */
-                          __global const float2 *right,   /* (grid.y, grid.x) */
-                          __global const float2 *flow,    /* (grid.y, grid.x) of this linearisation */
-                          __global const float4 *feature, /* (grid.y, grid.x) */
-                          int4 grid,                      /* run size */
+/* The linear system of one warp, for the whole flow (not the increment). */
+__kernel void flow_system(int4 grid, int pitch, /* run size: pitch, 2 grid.y, ways */
                           float smoothness, float contrast,
-                          __global float4 *left_side, /* (grid.y, grid.x) J11, J12, J22, weight to the east */
-                          __global float4 *right_side) /* (grid.y, grid.x) b1, b2, weight to the south, 0 */
+                          __global float *board) /* (ways, 2, grid.y, BOARD_PLANES, pitch) */
+{
+    const int row = get_global_id(1), colour = row >= grid.y, y = row - colour * grid.y;
+    if (row >= 2 * grid.y)
+        return;
+    board += get_global_id(2) * 2 * grid.y * BOARD_PLANES * pitch;
+    const flow_places p = flow_around(get_global_id(0), y, colour, grid, pitch);
+    const bool inside = p.x < grid.x; /* beyond, all has to stay 0 */
+    const float share = inside ? 0.0625f : 0.0f, above = y > 0 ? share : 0.0f, below = y + 1 < grid.y ? share : 0.0f;
+    const float u = board[BOARD_U * pitch + p.at], v = board[BOARD_V * pitch + p.at];
+    const float j11 = flow_window(board + BOARD_J11 * pitch, p, share, above, below);
+    const float j12 = flow_window(board + BOARD_J12 * pitch, p, share, above, below);
+    const float j22 = flow_window(board + BOARD_J22 * pitch, p, share, above, below);
+    const float j13 = flow_window(board + BOARD_J13 * pitch, p, share, above, below);
+    const float j23 = flow_window(board + BOARD_J23 * pitch, p, share, above, below);
+    const float east = inside && (WRAPS || p.x + 1 < grid.x) ? smoothness : 0.0f;
+    const float west = inside && (WRAPS || p.x > 0) ? smoothness : 0.0f;
+    const float south = inside && y + 1 < grid.y ? smoothness : 0.0f, north = inside && y > 0 ? smoothness : 0.0f;
+    board_solve(board + p.at, pitch, (float3)(j11, j12, j22), (float2)(j11 * u + j12 * v - j13, j12 * u + j22 * v - j23),
+                (float4)(east * flow_link(board, pitch, p.at, p.east, contrast),
+                         west * flow_link(board, pitch, p.at, p.west, contrast),
+                         south * flow_link(board, pitch, p.at, p.south, contrast),
+                         north * flow_link(board, pitch, p.at, p.north, contrast)));
+}
+
+/* One half-sweep of red-black successive over-relaxation. */
+__kernel void flow_relax(int4 grid, int pitch, /* run size: pitch, grid.y, ways */
+                         int colour, float relaxation,
+                         __global float *board) /* (ways, 2, grid.y, BOARD_PLANES, pitch); its flow is changed */
+{
+    const int y = get_global_id(1);
+    if (y >= grid.y)
+        return;
+    board += get_global_id(2) * 2 * grid.y * BOARD_PLANES * pitch;
+    /* across a border that does not wrap the weights are 0 */
+    const flow_places p = flow_around(get_global_id(0), y, colour, grid, pitch);
+    __global float *u = board + BOARD_U * pitch, *v = board + BOARD_V * pitch;
+    __global const float *to_east = board + BOARD_EAST * pitch, *to_south = board + BOARD_SOUTH * pitch;
+    const float e = to_east[p.at], w = to_east[p.west], s = to_south[p.at], n = y > 0 ? to_south[p.north] : 0.0f;
+    const float b1 = board[BOARD_B1 * pitch + p.at] + e * u[p.east] + w * u[p.west] + s * u[p.south] + n * u[p.north];
+    const float b2 = board[BOARD_B2 * pitch + p.at] + e * v[p.east] + w * v[p.west] + s * v[p.south] + n * v[p.north];
+    const float cross = board[BOARD_CROSS * pitch + p.at];
+    float fu = u[p.at], fv = v[p.at];
+    fu += relaxation * ((b1 - cross * fv) * board[BOARD_R1 * pitch + p.at] - fu);
+    fv += relaxation * ((b2 - cross * fu) * board[BOARD_R2 * pitch + p.at] - fv);
+    u[p.at] = fu;
+    v[p.at] = fv;
+}
+
+/* The flow of boards. */
+__kernel void flow_solution(__global const float *board, /* (ways, 2, grid.y, BOARD_PLANES, pitch) */
+                            int4 grid, int pitch,        /* run size: grid.x, grid.y, ways */
+                            int first,                   /* the first of these ways */
+                            __global float2 *flows)      /* (2, grid.y, grid.x) px */
 {
     const int x = get_global_id(0), y = get_global_id(1);
     if (x >= grid.x || y >= grid.y)
         return;
-    const int at = y * grid.x + x;
-    const float4 j = tensor[at];
-    const float2 f = flow[at], r = right[at];
-    const int east = grid_index((int2)(x + 1, y), grid), south = grid_index((int2)(x, y + 1), grid);
-    const float2 to_east = flow_gap(flow, feature, at, east < 0 ? at : east, contrast);
-    const float2 to_south = flow_gap(flow, feature, at, south < 0 ? at : south, contrast);
-    const float4 alike = smoothness * exponential((float4)(-to_east.x, -to_south.x, 0.0f, 0.0f));
-    left_side[at] = (float4)(j.xyz, east < 0 ? 0.0f : alike.x / ROOT(to_east.y + 1e-4f));
-    right_side[at] = (float4)(j.x * f.x + j.y * f.y - r.x, j.y * f.x + j.z * f.y - r.y,
-                              south < 0 ? 0.0f : alike.y / ROOT(to_south.y + 1e-4f), 0.0f);
-}
-
-/* One half-sweep of red-black successive over-relaxation, in place. */
-__kernel void flow_relax(__global const float4 *left_side,  /* (grid.y, grid.x) */
-                         __global const float4 *right_side, /* (grid.y, grid.x) */
-                         int4 grid, int colour,             /* run size: ((grid.x + 1) / 2, grid.y) */
-                         float relaxation,
-                         __global float2 *flow) /* (grid.y, grid.x) */
-{
-    const int y = get_global_id(1), x = 2 * get_global_id(0) + ((y + colour) & 1);
-    if (x >= grid.x || y >= grid.y)
-        return;
-    /* across a border that does not wrap the weights are 0, so that any place will do */
-    const int row = y * grid.x, at = row + x;
-    const int east = row + (x + 1 < grid.x ? x + 1 : 0), west = row + (x > 0 ? x : grid.x) - 1;
-    const int south = (y + 1 < grid.y ? row + grid.x : 0) + x, north = (y > 0 ? row : grid.y * grid.x) - grid.x + x;
-    const float4 j = left_side[at], b = right_side[at];
-    const float from_west = left_side[west].w, from_north = right_side[north].z;
-    const float2 sum = b.xy + j.w * flow[east] + b.z * flow[south] + from_west * flow[west] + from_north * flow[north];
-    const float2 diagonal = j.xz + (j.w + b.z + from_west + from_north);
-    const float2 step = diagonal > 0.0f ? relaxation / diagonal : (float2)(0.0f);
-    float2 f = flow[at];
-    f.x += step.x * (sum.x - j.y * f.y - diagonal.x * f.x);
-    f.y += step.y * (sum.y - j.y * f.x - diagonal.y * f.y);
-    flow[at] = f;
+    board += get_global_id(2) * 2 * grid.y * BOARD_PLANES * pitch + board_index(x, y, grid, pitch);
+    flows[((first + get_global_id(2)) * grid.y + y) * grid.x + x] =
+        (float2)(board[BOARD_U * pitch], board[BOARD_V * pitch]);
 }
 
 /* The median takes this many pixels of a row at a time: compilers for CPUs do not find such work on their own. */
@@ -233,13 +283,16 @@ static inline float8 flow_chunk(__global const float2 *flow, int x, int y, int d
 }
 
 /* 3 x 3 median of each component: removes outliers, keeps edges of motion. */
-__kernel void flow_median(__global const float2 *flow, /* (grid.y, grid.x) */
-                          int4 grid,                   /* run size: grid.x / FLOW_CHUNK, rounded up, grid.y */
-                          __global float2 *median)     /* (grid.y, grid.x) */
+__kernel void flow_median(__global const float2 *flow, /* (ways, grid.y, grid.x) */
+                          int4 grid,                   /* run size: grid.x / FLOW_CHUNK, rounded up, grid.y, ways */
+                          int first,                   /* the first of these ways */
+                          __global float2 *median)     /* (ways, grid.y, grid.x) */
 {
     const int y = get_global_id(1), x = get_global_id(0) * FLOW_CHUNK;
     if (x >= grid.x || y >= grid.y)
         return;
+    flow += (first + get_global_id(2)) * grid.y * grid.x;
+    median += (first + get_global_id(2)) * grid.y * grid.x;
     const bool inner = x > 0 && x + FLOW_CHUNK < grid.x && y > 0 && y + 1 < grid.y;
     /* written out: indices that a loop counts would keep the array in memory */
     float8 v[9] = {
@@ -262,14 +315,14 @@ __kernel void flow_median(__global const float2 *flow, /* (grid.y, grid.x) */
 }
 
 /* Carry the flow of the coarser level to the next finer one: bilinear, doubled. */
-__kernel void flow_expand(__global const float2 *coarse, /* (grid.y, grid.x) px of the coarse level */
+__kernel void flow_expand(__global const float2 *coarse, /* (ways, grid.y, grid.x) px of the coarse level */
                           int4 grid,                     /* of the coarse level */
-                          __global float2 *fine,         /* (size.y, size.x) px of the fine level */
-                          int2 size)                     /* run size */
+                          __global float2 *fine,         /* (ways, size.y, size.x) px of the fine level */
+                          int2 size)                     /* run size: size.x, size.y, ways */
 {
-    const int x = get_global_id(0), y = get_global_id(1);
+    const int x = get_global_id(0), y = get_global_id(1), way = get_global_id(2);
     if (x >= size.x || y >= size.y)
         return;
     const float2 q = 0.5f * (float2)(x + 0.5f, y + 0.5f);
-    fine[y * size.x + x] = 2.0f * bilinear_flow(coarse, q, grid);
+    fine[(way * size.y + y) * size.x + x] = 2.0f * bilinear_flow(coarse + way * grid.y * grid.x, q, grid);
 }

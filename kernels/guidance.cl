@@ -44,18 +44,32 @@ __kernel void guidance_start(__global const float2 *flow,   /* (grid.y, grid.x) 
 /* Add to the system of one linearisation (flow_system) a spring that holds the flow near its start. */
 __kernel void guidance_pull(__global const float2 *start,  /* (grid.y, grid.x) */
                             __global const float *near,    /* (grid.y, grid.x) */
-                            int4 grid,                     /* run size */
+                            int4 grid, int pitch,          /* run size: grid.xy */
                             float strength,                /* in units of the data term */
-                            __global float4 *left_side,    /* (grid.y, grid.x) */
-                            __global float4 *right_side)   /* (grid.y, grid.x) */
+                            int way,                       /* place of the system among `board`'s */
+                            __global float *board)         /* (ways, 2, grid.y, BOARD_PLANES, pitch) */
 {
     const int x = get_global_id(0), y = get_global_id(1);
     if (x >= grid.x || y >= grid.y)
         return;
+    __global float *p = board + way * 2 * grid.y * BOARD_PLANES * pitch + board_index(x, y, grid, pitch);
     const int at = y * grid.x + x;
     const float k = strength * guidance_share(near[at]);
-    left_side[at] += (float4)(k, 0.0f, k, 0.0f);
-    right_side[at] += (float4)(k * start[at], 0.0f, 0.0f);
+    p[BOARD_R1 * pitch] /= 1.0f + k * p[BOARD_R1 * pitch];
+    p[BOARD_R2 * pitch] /= 1.0f + k * p[BOARD_R2 * pitch];
+    p[BOARD_B1 * pitch] += k * start[at].x;
+    p[BOARD_B2 * pitch] += k * start[at].y;
+}
+
+/* What a flow brings of the other image's feature. */
+__kernel void guidance_bring(__global const float4 *feature, /* (grid.y, grid.x) of the other image */
+                             __global const float2 *flow,    /* (grid.y, grid.x) px */
+                             int4 grid,                      /* run size */
+                             __global float4 *brought)       /* (grid.y, grid.x) */
+{
+    const int x = get_global_id(0), y = get_global_id(1);
+    if (x < grid.x && y < grid.y)
+        brought[y * grid.x + x] = feature_sample(feature, x, y, flow[y * grid.x + x], grid);
 }
 
 /* How badly what a flow brings here fits; the slopes tell more than the brightness. */
@@ -77,12 +91,11 @@ __kernel void guidance_vote(__global const float4 *feature, /* (grid.y, grid.x) 
                             __global const float4 *old,     /* (grid.y, grid.x) the other image by the old flow */
                             __global const float4 *new,     /* (grid.y, grid.x) the same by the new flow */
                             __global const float *near,     /* (grid.y, grid.x) */
-                            int4 grid,                      /* run size */
+                            int4 grid, int pitch,           /* run size: grid.xy */
                             float evidence,                 /* weight of a difference in cost */
                             float trust,                    /* weight of the seeds */
                             float contrast,                 /* step of h across which neighbours part */
-                            __global float4 *left_side,     /* (grid.y, grid.x) as of flow_system */
-                            __global float4 *right_side)    /* (grid.y, grid.x) */
+                            __global float *board)          /* (2, grid.y, BOARD_PLANES, pitch), all 0 */
 {
     const int x = get_global_id(0), y = get_global_id(1);
     if (x >= grid.x || y >= grid.y)
@@ -93,10 +106,12 @@ __kernel void guidance_vote(__global const float4 *feature, /* (grid.y, grid.x) 
     const float n2 = near[at] * near[at], n8 = n2 * n2 * n2 * n2;
     const float seed = trust * n8 * n8; /* a quarter of the sigma */
     const float far = 1.0f - guidance_share(near[at]);
-    left_side[at] = (float4)(fabs(gain) + seed + far, 0.0f, 0.0f,
-                             guidance_link(feature, a, (int2)(x + 1, y), grid, contrast));
-    right_side[at] = (float4)(gain + seed - far, 0.0f,
-                              guidance_link(feature, a, (int2)(x, y + 1), grid, contrast), 0.0f);
+    const float4 links = (float4)(guidance_link(feature, a, (int2)(x + 1, y), grid, contrast),
+                                  guidance_link(feature, a, (int2)(x - 1, y), grid, contrast),
+                                  guidance_link(feature, a, (int2)(x, y + 1), grid, contrast),
+                                  guidance_link(feature, a, (int2)(x, y - 1), grid, contrast));
+    board_solve(board + board_index(x, y, grid, pitch), pitch,
+                (float3)(fabs(gain) + seed + far, 0.0f, 0.0f), (float2)(gain + seed - far, 0.0f), links);
 }
 
 /* The new flow where the vote is for it. */

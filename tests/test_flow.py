@@ -10,8 +10,9 @@ from reference import flow as twin
 from scipy import ndimage
 from tolerances import DECISIONS, SUM, TRIGONOMETRY, assert_close
 
-from hugin_abflow import pyramid
-from hugin_abflow.opencl import Buffer, Device
+from hugin_abflow import pyramid, search
+from hugin_abflow.flow import Board
+from hugin_abflow.opencl import Device
 from hugin_abflow.pyramid import Level
 
 GRIDS = {"plane": (77, 53, 0, 0), "cylinder": (78, 53, 1, 0), "odd cylinder": (77, 53, 1, 0)}
@@ -19,10 +20,12 @@ GRIDS = {"plane": (77, 53, 0, 0), "cylinder": (78, 53, 1, 0), "odd cylinder": (7
 
 def run_expand(device: Device, coarse: np.ndarray, wraps: int, size: tuple[int, int]) -> np.ndarray:
     height, width = coarse.shape[:2]
-    fine = device.empty((size[1], size[0], 2))
+    fine = device.empty((2, size[1], size[0], 2))
     grid = (width, height, wraps, 0)
-    device.run("flow", "flow_expand", size, device.upload(coarse.astype(np.float32)), grid, fine, size)
-    return fine.get()
+    ways = device.upload(np.stack([0 * coarse, coarse]).astype(np.float32))
+    device.run("flow", "flow_expand", (*size, 2), ways, grid, fine, size)
+    assert not fine.get()[0].any()
+    return fine.get()[1]
 
 
 @pytest.mark.parametrize("wraps", [0, 1])
@@ -60,12 +63,39 @@ def make_feature(seed: int, grid: tuple[int, int, int, int], share: float = 0.85
     return feature * patches(seed + 1, grid[0], grid[1], share, 7)[..., None]
 
 
-def run(device: Device, name: str, grid: tuple[int, int, int, int], *arguments: object, shapes: list[int]):
-    """Outputs of a kernel over the grid; arrays among the arguments are uploaded."""
-    outputs = [device.empty((grid[1], grid[0], n)) for n in shapes]
-    sent = [device.upload(a.astype(np.float32)) if isinstance(a, np.ndarray) else a for a in arguments]
-    device.run("flow", name, grid[:2], *sent, *outputs)
-    return [one.get() for one in outputs]
+# What a board holds, in the order of kernels/common.cl.
+SOLVED, FLOW, FEATURE, WARPED = [0, 1, 2, 3, 4, 20, 21], [5, 6], [7, 8, 9, 10], [11, 12, 13, 14]
+TENSOR, RIGHT = [15, 16, 17], [18, 19]
+
+
+def board_of(
+    device: Device, grid: tuple[int, int, int, int], values: dict[tuple[int, ...], np.ndarray]
+) -> Board:
+    """A board that holds some values, each (height, width, n), and 0 else."""
+    board = Board.of(device, 1, grid)
+    planes = board.planes.get()
+    for places, value in values.items():
+        planes[0][:, :, list(places)] = twin.flow_board(value, grid, board.pitch)
+    board.planes.set(planes)
+    return board
+
+
+def on_board(board: Board, places: list[int]) -> np.ndarray:
+    """What a board of one way holds, (height, width, n)."""
+    return twin.flow_solution(board.planes.get()[0][:, :, places], board.grid)
+
+
+def run(device: Device, name: str, board: Board, options: str, *arguments: float) -> None:
+    """Run a kernel over both colours of a board."""
+    size = (board.pitch, 2 * board.grid[1], board.ways)
+    device.run(
+        "flow", name, size, board.grid, board.pitch, *arguments, board.planes, options=options, group=64
+    )
+
+
+def specialised(grid: tuple[int, int, int, int]) -> list[str]:
+    """Build options that leave the result as it is: none, and those that say whether the grid wraps."""
+    return ["", f"-DWRAPS={grid[2]}"]
 
 
 @pytest.mark.parametrize("name", list(GRIDS))
@@ -76,13 +106,14 @@ def test_feature_equals_its_twin(device: Device, name: str) -> None:
     finest = Level(device.upload(image), device.upload(mask), bool(grid[2]))
     small = pyramid.reduce(device, finest)
     mean = pyramid.smooth(device, small, 3.0)
-    feature = device.empty((grid[1], grid[0], 4))
+    features = device.zeros((2, grid[1], grid[0], 4))
     device.run(
         "flow", "flow_feature", grid[:2], device.upload(image), device.upload(mask), grid,
-        mean.image, mean.mask, mean.grid, feature,
+        mean.image, mean.mask, mean.grid, 1, features,
     )  # fmt: skip
     expected = twin.flow_feature(image, mask, grid, mean.image.get(), mean.mask.get(), mean.grid)
-    assert_close(feature.get(), expected, SUM)
+    assert_close(features.get()[1], expected, SUM)
+    assert not features.get()[0].any()
 
 
 def test_twin_of_feature_is_numpys_gradient() -> None:
@@ -102,14 +133,29 @@ def test_twin_of_feature_is_numpys_gradient() -> None:
 
 
 @pytest.mark.parametrize("name", list(GRIDS))
-def test_warp_equals_its_twin(device: Device, name: str) -> None:
+@pytest.mark.parametrize("ways", [1, 2])
+def test_board_and_warp_equal_their_twins(device: Device, name: str, ways: int) -> None:
+    """Both ways at a time, or one after the other; beyond the rows' ends there is nothing."""
     grid = GRIDS[name]
-    feature, moved = make_feature(18, grid), 9 * smooth_noise(19, grid, 2, 4)
-    moved[:9] = np.rint(moved[:9])
-    (kernel,) = run(device, "flow_warp", grid, feature, moved, grid, shapes=[4])
-    expected = twin.flow_warp(feature, moved, grid)
-    assert 0.2 < expected[..., 3].mean() < 0.9
-    assert_close(kernel, expected, 1e-5, DECISIONS)
+    features = [make_feature(seed, grid) for seed in (18, 58)]
+    flows = [9 * smooth_noise(seed, grid, 2, 4) for seed in (19, 59)]
+    flows[0][:9] = np.rint(flows[0][:9])
+    sent = [device.upload(np.stack(both)) for both in (features, flows)]
+    for first in range(0, 2, ways):
+        board = Board.of(device, ways, grid)
+        size = (2 * board.pitch, grid[1], ways)
+        device.run("flow", "flow_board", size, sent[0], grid, board.pitch, first, board.planes)
+        device.run("flow", "flow_warp", size, *sent, grid, board.pitch, first, board.planes)
+        for way, planes in enumerate(board.planes.get(), first):
+            warped = twin.flow_warp(features[1 - way], flows[way], grid)
+            assert 0.2 < warped[..., 3].mean() < 0.9
+            copied = twin.flow_board(np.concatenate([flows[way], features[way]], -1), grid, board.pitch)
+            assert np.array_equal(planes[:, :, FLOW + FEATURE], copied)
+            expected = twin.flow_board(warped, grid, board.pitch)
+            assert_close(planes[:, :, WARPED], expected, 1e-5, DECISIONS)
+        back = device.zeros((2, grid[1], grid[0], 2))
+        board.solution(device, back, first)
+        assert np.array_equal(back.get()[first : first + ways], flows[first : first + ways])
 
 
 def test_twin_of_warp_is_scipys() -> None:
@@ -126,18 +172,19 @@ def test_twin_of_warp_is_scipys() -> None:
 
 
 @pytest.mark.parametrize("name", list(GRIDS))
-def test_tensor_and_window_equal_their_twins(device: Device, name: str) -> None:
+def test_tensor_equals_its_twin(device: Device, name: str) -> None:
     grid = GRIDS[name]
     a, b = make_feature(22, grid), make_feature(24, grid)
-    kernel = run(device, "flow_tensor", grid, a, b, grid, 5.0, 10.0, 0.01, shapes=[4, 2])
-    expected = twin.flow_tensor(a, b, grid, 5.0, 10.0, 0.01)
-    assert 0.3 < expected[0][..., 3].mean() < 0.9
-    for one, other in zip(kernel, expected, strict=True):
-        # sums of squares of slopes with both signs: rounding is relative to the largest
-        assert_close(one, other, TRIGONOMETRY, scale=float(np.abs(other).max()) / 10)
-    window = run(device, "flow_window", grid, *expected, grid, shapes=[4, 2])
-    for one, other in zip(window, twin.flow_window(*expected, grid), strict=True):
-        assert_close(one, other, SUM, scale=float(np.abs(other).max()))
+    tensor, right = twin.flow_tensor(a, b, grid, 5.0, 10.0, 0.01)
+    assert 0.3 < tensor[..., 3].mean() < 0.9
+    for options in specialised(grid):
+        board = board_of(device, grid, {tuple(FEATURE): a, tuple(WARPED): b})
+        run(device, "flow_tensor", board, options, 5.0, 10.0, 0.01)
+        for places, expected in ((TENSOR, tensor[..., :3]), (RIGHT, right)):
+            # sums of squares of slopes with both signs: rounding is relative to the largest
+            scale = float(np.abs(expected).max()) / 10
+            assert_close(on_board(board, places), expected, TRIGONOMETRY, scale=scale)
+        assert not board.planes.get()[..., TENSOR + RIGHT, (grid[0] + 1) // 2 :].any()
 
 
 def test_twin_of_tensor_is_the_energys_curvature() -> None:
@@ -194,10 +241,30 @@ def system_of(grid: tuple[int, int, int, int], seed: int) -> tuple[np.ndarray, .
 @pytest.mark.parametrize("name", list(GRIDS))
 def test_system_equals_its_twin(device: Device, name: str) -> None:
     grid = GRIDS[name]
-    parts = [part.astype(np.float32) for part in system_of(grid, 31)]
-    kernel = run(device, "flow_system", grid, *parts, grid, 12.0, 0.3, shapes=[4, 4])
-    for one, other in zip(kernel, twin.flow_system(*parts, grid, 12.0, 0.3), strict=True):
-        assert_close(one, other, TRIGONOMETRY, scale=10)
+    tensor, right, moved, feature = (part.astype(np.float32) for part in system_of(grid, 31))
+    window = twin.flow_window(tensor, right, grid)
+    expected = twin.solving(*twin.flow_system(*window, moved, feature, grid, 12.0, 0.3), grid, moved)
+    for options in specialised(grid):
+        board = board_of(
+            device, grid,
+            {
+                tuple(TENSOR): tensor[..., :3],
+                tuple(RIGHT): right,
+                tuple(FLOW): moved,
+                tuple(FEATURE): feature,
+            },
+        )  # fmt: skip
+        run(device, "flow_system", board, options, 12.0, 0.3)
+        assert_close(on_board(board, SOLVED), expected, TRIGONOMETRY, scale=10)
+        assert not board.planes.get()[..., SOLVED[2:], (grid[0] + 1) // 2 :].any()
+
+
+def test_pixels_that_nothing_holds_stay(device: Device) -> None:
+    """A single pixel without data."""
+    board = board_of(device, (1, 1, 0, 0), {tuple(FLOW): np.array([[[3.0, -4.0]]])})
+    run(device, "flow_system", board, board.options, 12.0, 0.3)
+    board.relax(device, 3, 1.85)
+    assert np.array_equal(on_board(board, FLOW), [[[3, -4]]])
 
 
 def test_twin_of_system_by_hand() -> None:
@@ -245,15 +312,15 @@ def test_relaxation_solves_the_system(device: Device, wraps: int) -> None:
     tensor, right, moved, feature = system_of(grid, 43)
     sides = twin.flow_system(tensor, right, moved, feature, grid, 0.02, 0.3)
     expected = dense_solution(*sides, bool(wraps))
-    iterated, kernel = moved.astype(np.float64), device.upload(moved)
-    buffers = [device.upload(side.astype(np.float32)) for side in sides]
+    iterated = moved.astype(np.float64)
+    board = board_of(device, grid, {tuple(SOLVED): twin.solving(*sides, grid, moved), tuple(FLOW): moved})
     for _ in range(300):
         for colour in (0, 1):
             iterated = twin.flow_relax(*sides, grid, colour, 1.8, iterated)
-            device.run("flow", "flow_relax", (9, 13), *buffers, grid, colour, 1.8, kernel)
+    board.relax(device, 300, 1.8)
     assert np.abs(expected).max() > 0.05
     assert np.allclose(iterated, expected, atol=1e-9)
-    assert np.allclose(kernel.get(), expected, atol=1e-4)
+    assert np.allclose(on_board(board, FLOW), expected, atol=1e-4)
 
 
 @pytest.mark.parametrize("name", ["plane", "cylinder"])
@@ -261,14 +328,18 @@ def test_relaxation_solves_the_system(device: Device, wraps: int) -> None:
 def test_relax_equals_its_twin(device: Device, name: str, colour: int) -> None:
     grid = GRIDS[name]
     tensor, right, moved, feature = system_of(grid, 49)
-    sides = [s.astype(np.float32) for s in twin.flow_system(tensor, right, moved, feature, grid, 1.0, 0.3)]
-    result: Buffer = device.upload(moved)
-    size = ((grid[0] + 1) // 2, grid[1])
-    device.run("flow", "flow_relax", size, *map(device.upload, sides), grid, colour, 1.85, result)
+    sides = twin.flow_system(tensor, right, moved, feature, grid, 1.0, 0.3)
     expected = twin.flow_relax(*sides, grid, colour, 1.85, moved)
     x, y = common.pixels(grid[0], grid[1])
-    assert np.array_equal(result.get()[(x + y) % 2 != colour], moved[(x + y) % 2 != colour])
-    assert_close(result.get(), expected, TRIGONOMETRY)
+    for options in specialised(grid):
+        board = board_of(device, grid, {tuple(SOLVED): twin.solving(*sides, grid, moved), tuple(FLOW): moved})
+        device.run(
+            "flow", "flow_relax", (board.pitch, grid[1], 1), grid, board.pitch, colour, 1.85, board.planes,
+            options=options, group=64,
+        )  # fmt: skip
+        result = on_board(board, FLOW)
+        assert np.array_equal(result[(x + y) % 2 != colour], moved[(x + y) % 2 != colour])
+        assert_close(result, expected, TRIGONOMETRY)
 
 
 @pytest.mark.parametrize("name", list(GRIDS))
@@ -276,7 +347,8 @@ def test_median_is_scipys(device: Device, name: str) -> None:
     """Kernel and twin; rows beyond the border are the pixel itself, which SciPy cannot do."""
     grid = GRIDS[name]
     moved = np.random.default_rng(55).normal(size=(53, grid[0], 2)).astype(np.float32)
-    (kernel,) = run(device, "flow_median", grid, moved, grid, shapes=[2])
+    stacked = device.upload(np.stack([0 * moved, moved]))
+    kernel = search.filtered(device, stacked, grid, device.zeros(stacked.shape), 1).get()[1]
     expected = twin.flow_median(moved, grid)
     for i in (0, 1):
         median = ndimage.median_filter(moved[..., i], 3, mode="wrap")

@@ -10,11 +10,13 @@ import pytest
 from grids import patches
 from reference import common
 from reference import guidance as twin
-from test_flow import make_feature, smooth_noise
+from reference.flow import flow_solution, solving
+from test_flow import SOLVED, board_of, make_feature, on_board, smooth_noise
 from test_flow_truth import level, log, scene
-from tolerances import SUM, TRIGONOMETRY, assert_close
+from tolerances import DECISIONS, SUM, TRIGONOMETRY, assert_close
 
 from hugin_abflow import flow, guidance
+from hugin_abflow.flow import Board
 from hugin_abflow.guidance import ChartGuides, GuidanceParameters
 from hugin_abflow.opencl import Device
 
@@ -63,15 +65,35 @@ def test_twin_of_start_by_hand() -> None:
 
 
 def test_pull_equals_its_twin(device: Device) -> None:
+    """A spring on the second of two systems: they are solved with it, the first one without."""
     grid = GRIDS["plane"]
     start, near = 5 * smooth_noise(62, grid, 2, 3), np.abs(smooth_noise(63, grid, 1, 3))[..., 0]
     left, right = np.abs(smooth_noise(64, grid, 4, 1)), smooth_noise(65, grid, 4, 1)
-    sides = [device.upload(left), device.upload(right)]
+    right[..., 2] = np.abs(right[..., 2])
+    left[:, -1, 3] = right[-1, :, 2] = 0  # there is no neighbour
+    moved = smooth_noise(66, grid, 2, 2)
+    alone = board_of(device, grid, {tuple(SOLVED): solving(left, right, grid, moved)})
+    board = Board.of(device, 2, grid)
+    board.planes.set(np.repeat(alone.planes.get(), 2, 0))
     device.run(
-        "guidance", "guidance_pull", grid[:2], device.upload(start), device.upload(near), grid, 8.0, *sides
+        "guidance", "guidance_pull", grid[:2], device.upload(start), device.upload(near), grid, board.pitch,
+        8.0, 1, board.planes,
+    )  # fmt: skip
+    first, second = board.planes.get()
+    assert np.array_equal(first, alone.planes.get()[0])
+    expected = solving(*twin.guidance_pull(start, near, 8.0, left, right), grid, moved)
+    assert_close(flow_solution(second[:, :, SOLVED], grid), expected, TRIGONOMETRY, scale=10)
+
+
+@pytest.mark.parametrize("name", list(GRIDS))
+def test_bring_equals_its_twin(device: Device, name: str) -> None:
+    grid = GRIDS[name]
+    feature, moved = make_feature(18, grid), 9 * smooth_noise(19, grid, 2, 4)
+    brought = device.empty(feature.shape)
+    device.run(
+        "guidance", "guidance_bring", grid[:2], device.upload(feature), device.upload(moved), grid, brought
     )
-    for side, expected in zip(sides, twin.guidance_pull(start, near, 8.0, left, right), strict=True):
-        assert_close(side.get(), expected, SUM, scale=10)
+    assert_close(brought.get(), twin.guidance_bring(feature, moved, grid), 1e-5, DECISIONS)
 
 
 @pytest.mark.parametrize("name", list(GRIDS))
@@ -80,15 +102,15 @@ def test_vote_equals_its_twin(device: Device, name: str) -> None:
     small = np.array([0.2, 0.2, 0.2, 1], np.float32)  # else every cost is the largest
     seen = [small * make_feature(66 + i, grid) for i in range(3)]
     near = np.abs(smooth_noise(70, grid, 1, 4))[..., 0]
-    sides = [device.empty((grid[1], grid[0], 4)) for _ in range(2)]
+    board = Board.of(device, 1, grid)
     device.run(
         "guidance", "guidance_vote", grid[:2], *map(device.upload, seen), device.upload(near), grid,
-        20.0, 15.0, 0.05, *sides,
+        board.pitch, 20.0, 15.0, 0.05, board.planes,
     )  # fmt: skip
     expected = twin.guidance_vote(*seen, near, grid, 20.0, 15.0, 0.05)
     assert (expected[1][..., 0] > 0.1).mean() > 0.1 and (expected[1][..., 0] < -0.1).mean() > 0.1
-    for side, wanted in zip(sides, expected, strict=True):
-        assert_close(side.get(), wanted, TRIGONOMETRY, scale=10)
+    wanted = solving(*expected, grid, np.zeros((grid[1], grid[0], 2)))
+    assert_close(on_board(board, SOLVED), wanted, TRIGONOMETRY, scale=10)
 
 
 def test_twin_of_vote_is_a_weighted_mean() -> None:

@@ -114,12 +114,39 @@ def flow_system(
     smoothness: float,
     contrast: float,
 ) -> tuple[Array, Array]:
-    """J11, J12, J22, weight to the east; b1, b2, weight to the south, 0."""
+    """J11, J12, J22, weight to the east; b1, b2, weight to the south, 0. Constraints: of flow_window."""
     matrix = tensor[..., [0, 1, 1, 2]].reshape(*tensor.shape[:2], 2, 2).astype(np.float64)
     flow = flow.astype(np.float64)
     target = np.einsum("yxij,yxj->yxi", matrix, flow) - right
     east, south = (edge(flow, feature, grid, *d, smoothness, contrast)[..., None] for d in ((1, 0), (0, 1)))
     return np.concatenate([tensor[..., :3], east], -1), np.concatenate([target, south, 0 * south], -1)
+
+
+def flow_board(values: Array, grid: Sequence[int], pitch: int) -> Array:
+    """Values (height, width, n) on a board, (2, height, n, pitch): by colour, those of a row side by side."""
+    board = np.zeros((2, grid[1], values.shape[-1], pitch))
+    for y, x in np.ndindex(grid[1], grid[0]):
+        board[(x + y) % 2, y, :, x // 2] = values[y, x]
+    return board
+
+
+def flow_solution(board: Array, grid: Sequence[int]) -> Array:
+    """The opposite of flow_board: (height, width, n)."""
+    x, y = pixels(grid[0], grid[1])
+    return board[(x + y) % 2, y, :, x // 2]
+
+
+def solving(left_side: Array, right_side: Array, grid: Sequence[int], flow: Array) -> Array:
+    """(height, width, 7): a system as a board holds it to be solved: inverse diagonals, J12, weights to the
+    east and south, b. What nothing holds stays as it is.
+    """
+    east, south = left_side[..., 3], right_side[..., 2]
+    links = east + south + beside(east, grid, -1, 0)[0] + beside(south, grid, 0, -1)[0]
+    diagonals = left_side[..., [0, 2]] + links[..., None]
+    free = diagonals <= 0
+    inverse = 1 / np.where(free, 1, diagonals)
+    b = np.where(free, flow, right_side[..., :2])
+    return np.concatenate([inverse, left_side[..., 1:2], east[..., None], south[..., None], b], -1)
 
 
 def flow_relax(

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from reference.common import Array, bilinear, pixels
-from reference.flow import beside
+from reference.flow import beside, flow_warp
 
 MOST_COST = 0.5
 
@@ -44,6 +44,11 @@ def guidance_pull(
     left[..., 2] += k
     right[..., :2] += k[..., None] * start
     return left, right
+
+
+def guidance_bring(feature: Array, flow: Array, grid: Sequence[int]) -> Array:
+    """The feature at q + flow(q), as for the flow itself."""
+    return flow_warp(feature, flow, grid)
 
 
 def cost(a: Array, b: Array) -> Array:
