@@ -2,22 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any, get_args
 
 import click
 
+from hugin_abflow.batch.config import NAME, find_config, read_config, write_config
 from hugin_abflow.batch.queue import find_projects
 from hugin_abflow.batch.run import Run, default_jobs, run
 from hugin_abflow.batch.task import Task
-from hugin_abflow.errors import AbflowError, ExitCode
+from hugin_abflow.errors import AbflowError, ConfigError, ExitCode
 from hugin_abflow.images import COMPRESSIONS
 from hugin_abflow.metadata import PROGRAM, version
 from hugin_abflow.nona import Remap
 from hugin_abflow.opencl import list_devices
-from hugin_abflow.options import ARGUMENTS, Command, Option
+from hugin_abflow.options import ARGUMENTS, Command, Option, kind_of, long_names
 from hugin_abflow.settings import FlowQuality, MergeMode, Settings
 from hugin_abflow.terminal import complain, interruptible, say
 
@@ -46,6 +47,12 @@ EXAMPLES = (
 )
 
 _DEFAULTS = Settings()
+# Options that a file of settings cannot give.
+_UNSETTLED = frozenset({"config", "print-config"})
+# Parameters that say something about the run as a whole, not about a project.
+_OF_THE_RUN = frozenset(
+    {"recursive", "resume", "force", "jobs", "report", "log", "quiet", "verbose", "profile", "print_config"}
+)
 
 
 def _print_devices(context: click.Context, parameter: click.Parameter, wanted: bool) -> None:
@@ -73,7 +80,7 @@ _information = partial(click.option, cls=Option, group="Information")
 
 
 @click.command(cls=Command, examples=EXAMPLES, exit_codes=EXIT_CODES, add_help_option=False)
-@click.argument("projects", metavar="PROJECT...", nargs=-1, required=True, type=_file)
+@click.argument("projects", metavar="PROJECT...", nargs=-1, type=_file)
 @_result(
     "-o",
     "--output",
@@ -212,6 +219,13 @@ _information = partial(click.option, cls=Option, group="Information")
     type=_file,
     help="Write what became of each project, with times and figures, into FILE, as JSON.",
 )
+@_batch(
+    "--config",
+    metavar="FILE",
+    type=_file,
+    help=f"Take options from FILE. [default: {NAME} beside each project, or above it up to a named folder]",
+)
+@_batch("--print-config", is_flag=True, help=f"Print all options as they would be in {NAME}, and exit.")
 @_batch("--log", metavar="FILE", type=_file, help="Add all messages, with the time, to the end of FILE.")
 @_information(
     "--list-devices",
@@ -233,19 +247,7 @@ _information = partial(click.option, cls=Option, group="Information")
     version(), prog_name=PROGRAM, message="%(prog)s %(version)s", help="Print the version and exit."
 )
 @click.help_option("-h", "--help", help="Show this help and exit.")
-def command(
-    projects: tuple[Path, ...],
-    recursive: bool,
-    resume: bool,
-    force: bool,
-    jobs: int | None,
-    report: Path | None,
-    log: Path | None,
-    quiet: bool,
-    verbose: bool,
-    profile: Path | None,
-    **chosen: Any,
-) -> ExitCode:
+def command(projects: tuple[Path, ...], **given: Any) -> ExitCode:
     """Blend the photos of Hugin projects into panoramas, by optical flow.
 
     PROJECT is a .pto file as Hugin saves it, or a folder of such files. Its photos must already be aligned;
@@ -255,18 +257,89 @@ def command(
 
     The names of the panoramas are printed, a line each.
     """
+    config: Path | None = given["config"]
+    if not projects and not given["print_config"]:
+        raise click.UsageError("Missing argument 'PROJECT...'.")
+    # what concerns the run as a whole is said beside what is named first
+    place = projects[0] if projects else Path()
+    first = config or find_config(place / "any" if place.is_dir() else place, projects)
+    recursive, resume, force, how = _run_options(**_chosen(first))
+    found = find_projects(projects, recursive)
+    files = {project: config or find_config(project, projects) for project in found}
+    chosen = {
+        file: _chosen(file, alone=file == first) for file in {first: None, **dict.fromkeys(files.values())}
+    }
+    if given["print_config"]:
+        return _print_configs(chosen, files)
+    options = {file: _options(**values) for file, values in chosen.items()}
+    lone = {name for name in ("output", "layers") for file in files.values() if options[file][name]}
+    if len(found) > 1 and lone:
+        option = "-o" if "output" in lone else "--layers"
+        raise click.UsageError(f"{option} is for one project, but there are {len(found)}")
+    remember = resume or force or len(found) > 1 or any(place.is_dir() for place in projects)
+    return run([Task(p, options[files[p]], remember and not force, remember) for p in found], how)
+
+
+def _chosen(file: Path | None, alone: bool = True) -> dict[str, Any]:
+    """All options, by their parameters: of the command line, else of a file of settings, else the default.
+
+    alone       the file may say something about the run as a whole.
+    """
+    if file is None:
+        return dict(click.get_current_context().params)
+    names = long_names(command)
+    kinds = {name: kind_of(option) for name, option in names.items() if name not in _UNSETTLED}
+    values = read_config(
+        file, kinds, [n for n, option in names.items() if isinstance(option.type, click.Path)]
+    )
+    whole = sorted(name for name in values if names[name].name in _OF_THE_RUN)
+    if whole and not alone:
+        raise ConfigError(
+            f"{file}: {whole[0]} is for the whole run; give it on the command line, or in {NAME} beside "
+            "what is named first"
+        )
+    defaults = {str(names[name].name): value for name, value in values.items()}
+    try:
+        with command.make_context(PROGRAM, _arguments(), default_map=defaults) as context:
+            return dict(context.params)
+    except click.UsageError as error:
+        raise ConfigError(f"{file}: {error.format_message()}") from None
+
+
+def _print_configs(
+    chosen: Mapping[Path | None, dict[str, Any]], files: Mapping[Path, Path | None]
+) -> ExitCode:
+    """Answer --print-config: all options as a file of settings, for each such file that was found."""
+    names = {name: option for name, option in long_names(command).items() if name not in _UNSETTLED}
+    for file, values in chosen.items():
+        projects = [str(project) for project, its_file in files.items() if its_file == file]
+        if files and not projects:
+            continue
+        click.echo(f"# {file or 'no ' + NAME}" + "".join(f"\n# for {project}" for project in projects))
+        plain = {name: values[str(option.name)] for name, option in names.items()}
+        click.echo(write_config(plain))
+    return ExitCode.OK
+
+
+def _run_options(
+    *,
+    recursive: bool,
+    resume: bool,
+    force: bool,
+    jobs: int | None,
+    report: Path | None,
+    log: Path | None,
+    quiet: bool,
+    verbose: bool,
+    profile: Path | None,
+    **others: Any,
+) -> tuple[bool, bool, bool, Run]:
+    """What the options say about the run as a whole: --recursive, --resume, --force, and how it is done."""
     if quiet and verbose:
         raise click.UsageError("-q and -v contradict each other")
     if resume and force:
         raise click.UsageError("--resume and --force contradict each other")
-    options = _options(**chosen)
-    found = find_projects(projects, recursive)
-    if len(found) > 1 and (options["output"] or options["layers"]):
-        option = "-o" if options["output"] else "--layers"
-        raise click.UsageError(f"{option} is for one project, but there are {len(found)}")
-    how = Run(jobs, report, log, quiet, verbose, _arguments(), profile)
-    remember = resume or force or len(found) > 1 or any(place.is_dir() for place in projects)
-    return run([Task(project, options, remember and not force, remember) for project in found], how)
+    return recursive, resume, force, Run(jobs, report, log, quiet, verbose, _arguments(), profile)
 
 
 def _options(
@@ -306,7 +379,7 @@ def _options(
         "prefix": prefix,
         "layers": list(layers) or None,
         "metadata": not no_metadata,
-        **others,
+        **{name: value for name, value in others.items() if name not in _OF_THE_RUN | {"projects", "config"}},
     }
 
 

@@ -106,6 +106,12 @@ class SettingsError(AbflowError):
     exit_code = ExitCode.USAGE
 
 
+class ConfigError(AbflowError):
+    """A file of settings is wrong."""
+
+    exit_code = ExitCode.USAGE
+
+
 class CommandLineError(AbflowError):
     """A command line in enblend's manner is wrong."""
 

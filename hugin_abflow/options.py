@@ -79,3 +79,23 @@ def spread_layers(arguments: Sequence[str]) -> list[str]:
             spread.append("--layers")
         spread.append(argument)
     return spread
+
+
+def long_names(command: click.Command) -> dict[str, click.Option]:
+    """The options of a command that take part in settings, by their long names without dashes in front."""
+    return {
+        max(option.opts, key=len).lstrip("-"): option
+        for option in command.params
+        if isinstance(option, click.Option) and option.expose_value and not option.is_eager
+    }
+
+
+def kind_of(option: click.Option) -> str:
+    """What kind of value an option takes: "bool", "int", "float", "str" or "list" (of texts)."""
+    if option.is_flag:
+        return "bool"
+    if option.multiple:
+        return "list"
+    if isinstance(option.type, click.types.IntParamType):  # click.IntRange is one
+        return "int"
+    return "float" if isinstance(option.type, click.types.FloatParamType) else "str"

@@ -1,0 +1,96 @@
+"""Options for a shoot: ``abflow.toml`` beside the projects, with the names of the command's options."""
+
+from __future__ import annotations
+
+import difflib
+import tomllib
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any
+
+import tomli_w
+
+from hugin_abflow.errors import ConfigError
+
+NAME = "abflow.toml"
+
+
+def find_config(project: Path, places: Iterable[Path]) -> Path | None:
+    """The settings of a project: in its folder, else in the next one above, up to a folder of `places`."""
+    folder = project.absolute().parent
+    tops = {place.absolute() for place in places if place.is_dir()}
+    above = [folder, *folder.parents]
+    top = next((number for number, one in enumerate(above) if one in tops), 0)
+    return next((one / NAME for one in above[: top + 1] if (one / NAME).is_file()), None)
+
+
+def read_config(file: Path, kinds: Mapping[str, str], paths: Iterable[str]) -> dict[str, Any]:
+    """The options that a file gives, by their names without dashes in front.
+
+    kinds       of each option: "bool", "int", "float", "str" or "list" (of texts).
+    paths       options that are files; relative ones are meant from the file's folder.
+
+    Raises `ConfigError` for a file that cannot be read, an unknown option (with a suggestion), or a value of
+    another kind.
+    """
+    try:
+        values = tomllib.loads(file.read_text("utf-8"))
+    except OSError as error:
+        raise ConfigError(f"{file} cannot be read: {error.strerror}; check --config") from None
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise ConfigError(f"{file} is no TOML: {error}") from None
+    for name, value in values.items():
+        if name not in kinds:
+            raise ConfigError(f"{file}: there is no option {name!r}; {_suggestion(name, kinds)}")
+        _check(file, name, value, kinds[name])
+    for name in set(paths) & set(values):
+        value = values[name]
+        values[name] = (
+            [str(file.parent / one) for one in value] if isinstance(value, list) else str(file.parent / value)
+        )
+    return values
+
+
+def write_config(values: Mapping[str, Any]) -> str:
+    """The text of a file that gives these options; those that say nothing are left out."""
+    plain = {
+        name: [str(one) for one in value]
+        if isinstance(value, list | tuple)
+        else str(value)
+        if isinstance(value, Path)
+        else value
+        for name, value in values.items()
+        if value is not None and value != ()
+    }
+    return tomli_w.dumps(plain)
+
+
+def _suggestion(name: str, known: Iterable[str]) -> str:
+    """What may have been meant."""
+    close = difflib.get_close_matches(
+        name.replace("_", "-").lstrip("-").lower(), list(known), n=1, cutoff=0.5
+    )
+    return f"did you mean {close[0]!r}?" if close else "--help lists them, without their dashes"
+
+
+_WORDS = {
+    "bool": "true or false",
+    "int": "a whole number",
+    "float": "a number",
+    "str": 'text in quotes ("...")',
+    "list": 'a list of texts (["...", "..."])',
+}
+
+
+def _check(file: Path, name: str, value: object, kind: str) -> None:
+    """Raise `ConfigError` unless a value is of its kind."""
+    number = isinstance(value, int) and not isinstance(value, bool)
+    fits = {
+        "bool": isinstance(value, bool),
+        "int": number,
+        "float": number or isinstance(value, float),
+        "str": isinstance(value, str),
+        "list": isinstance(value, list) and all(isinstance(one, str) for one in value),
+    }[kind]
+    if not fits:
+        raise ConfigError(f"{file}: {name} is {value!r}; give {_WORDS[kind]}")

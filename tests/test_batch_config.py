@@ -1,0 +1,152 @@
+"""Options from a file: which file, what it may say, and that the command line has the last word."""
+
+from __future__ import annotations
+
+import tomllib
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from hugin_abflow import cli
+from hugin_abflow.errors import ExitCode
+from hugin_abflow.settings import Settings
+
+Calls = dict[str, dict[str, Any]]
+
+
+@pytest.fixture
+def shoot(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    for name in ("a.pto", "day/b.pto", "day/late/c.pto"):
+        (tmp_path / "shoot" / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / "shoot" / name).touch()
+    monkeypatch.chdir(tmp_path)
+    return tmp_path / "shoot"
+
+
+@pytest.fixture
+def calls(replace: Callable[..., None]) -> Calls:
+    """What each project is stitched with."""
+    seen: Calls = {}
+
+    def merge(path: Path, **keywords: Any) -> Path:
+        seen[path.stem] = keywords
+        return path.with_suffix(".tif")
+
+    replace(merge)
+    return seen
+
+
+def test_options_of_a_file_are_those_of_the_command_line(calls: Calls, shoot: Path) -> None:
+    (shoot / "abflow.toml").write_text(
+        'flow-quality = "best"\nseam = "off"\nno-flow = true\nsoftmax-sharpness = 3\njpeg-quality = 80\n'
+        'prefix = "room"\nkeep-layers = true\n'
+    )
+    assert cli.main(["shoot/a.pto"]) == 0
+    assert calls["a"]["settings"] == Settings(
+        flow_quality="best", seam=False, flow=False, softmax_sharpness=3.0
+    )
+    assert [calls["a"][name] for name in ("jpeg_quality", "prefix", "keep_layers")] == [80, "room", True]
+
+
+def test_command_line_has_the_last_word(calls: Calls, shoot: Path) -> None:
+    (shoot / "abflow.toml").write_text('flow-quality = "best"\njpeg-quality = 80')
+    assert cli.main(["shoot/a.pto", "--flow-quality", "normal"]) == 0
+    assert calls["a"]["settings"].flow_quality == "normal" and calls["a"]["jpeg_quality"] == 80
+
+
+def test_each_project_takes_the_nearest_file_up_to_the_named_folder(calls: Calls, shoot: Path) -> None:
+    (shoot.parent / "abflow.toml").write_text("jpeg-quality = 1")
+    (shoot / "abflow.toml").write_text("jpeg-quality = 10")
+    (shoot / "day" / "abflow.toml").write_text("jpeg-quality = 20")
+    assert cli.main(["--recursive", "shoot"]) == 0
+    assert {name: call["jpeg_quality"] for name, call in calls.items()} == {"a": 10, "b": 20, "c": 20}
+    (shoot / "day" / "abflow.toml").unlink()
+    assert cli.main(["shoot/a.pto", "shoot/day/late"]) == 0
+    assert {name: calls[name]["jpeg_quality"] for name in "ac"} == {"a": 10, "c": None}
+    assert cli.main(["--recursive", "shoot", "--config", "abflow.toml"]) == 0
+    assert {call["jpeg_quality"] for call in calls.values()} == {1}
+
+
+def test_files_are_meant_from_the_folder_of_the_settings(calls: Calls, shoot: Path) -> None:
+    (shoot / "abflow.toml").write_text('output = "../out.png"\nlayers = ["l.tif", "/m.tif"]\nlog = "log.txt"')
+    assert cli.main(["shoot/a.pto"]) == 0
+    assert calls["a"]["output"] == shoot / "../out.png"
+    assert calls["a"]["layers"] == [shoot / "l.tif", Path("/m.tif")]
+    assert "a.pto" in (shoot / "log.txt").read_text()
+
+
+@pytest.mark.parametrize(
+    ("text", "parts"),
+    [
+        ('flow-qualty = "best"', ["'flow-qualty'", "did you mean 'flow-quality'?"]),
+        ('flow_quality = "best"', ["did you mean 'flow-quality'?"]),
+        ('"--seam" = "off"', ["did you mean 'seam'?"]),
+        ("zzz = 1", ["'zzz'", "--help"]),
+        ("[blending]\nseam = 1", ["'blending'"]),
+        ("help = true", ["'help'"]),
+        ('config = "other.toml"', ["'config'"]),
+        ("seam = false", ["seam is False", "text"]),
+        ('keep-layers = "yes"', ["keep-layers is 'yes'", "true or false"]),
+        ("jobs = 2.5", ["jobs is 2.5", "a whole number"]),
+        ("jobs = true", ["jobs is True", "a whole number"]),
+        ('softmax-sharpness = "3"', ["a number"]),
+        ('layers = "a.tif"', ["a list of texts"]),
+        ('seam = "maybe"', ["--seam", "maybe"]),
+        ("jpeg-quality = 101", ["--jpeg-quality", "101"]),
+        ("seam = off", ["no TOML", "line 1"]),
+        ("resume = true\nforce = true", ["contradict"]),
+    ],
+)
+def test_mistake_is_told_with_the_file(
+    calls: Calls, shoot: Path, capsys: pytest.CaptureFixture[str], text: str, parts: list[str]
+) -> None:
+    (shoot / "abflow.toml").write_text(text)
+    assert cli.main(["shoot/a.pto"]) == ExitCode.USAGE
+    said = capsys.readouterr().err
+    assert said.startswith("hugin-abflow: error: ") and all(part in said for part in parts), said
+    assert "contradict" in said or "abflow.toml" in said
+    assert calls == {}
+
+
+def test_file_that_is_not_there(calls: Calls, shoot: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main(["shoot/a.pto", "--config", "gone.toml"]) == ExitCode.USAGE
+    assert "gone.toml cannot be read" in capsys.readouterr().err and calls == {}
+
+
+def test_what_concerns_the_whole_run_is_said_in_one_place(
+    calls: Calls, shoot: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (shoot / "abflow.toml").write_text("quiet = true\nrecursive = true")
+    assert cli.main(["shoot"]) == 0
+    assert sorted(calls) == ["a", "b", "c"] and capsys.readouterr() == ("", "")
+    (shoot / "day" / "abflow.toml").write_text("jobs = 2")
+    assert cli.main(["shoot"]) == ExitCode.USAGE
+    assert "day/abflow.toml: jobs is for the whole run" in capsys.readouterr().err
+
+
+def test_printed_options_can_be_read_again(
+    calls: Calls, shoot: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (shoot / "abflow.toml").write_text('seam = "off"')
+    assert cli.main(["shoot", "--print-config", "--flow-quality", "best", "--jobs", "2"]) == 0
+    text = capsys.readouterr().out
+    assert text.startswith(f"# {shoot}/abflow.toml\n# for shoot/a.pto\n") and calls == {}
+    options = tomllib.loads(text)
+    assert (options["seam"], options["flow-quality"], options["jobs"]) == ("off", "best", 2)
+    assert "output" not in options and "config" not in options and options["softmax-sharpness"] == 10.0
+    (shoot / "abflow.toml").write_text(text)
+    assert cli.main(["shoot", "--print-config"]) == 0
+    assert tomllib.loads(capsys.readouterr().out) == options
+
+
+def test_printed_options_without_a_project(
+    shoot: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert cli.main(["--print-config"]) == 0
+    assert tomllib.loads(capsys.readouterr().out)["merge"] == "joint"
+    monkeypatch.chdir(shoot)
+    (shoot / "abflow.toml").write_text('merge = "sequential"')
+    assert cli.main(["--print-config"]) == 0
+    assert tomllib.loads(capsys.readouterr().out)["merge"] == "sequential"
