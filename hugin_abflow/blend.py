@@ -5,8 +5,8 @@ Rows of the next band are decoded, several layers at a time, while the device ca
 
 from __future__ import annotations
 
+import logging
 import math
-import os
 from collections.abc import Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
@@ -16,15 +16,21 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from hugin_abflow import memory
 from hugin_abflow.layer import Box, Layer
 from hugin_abflow.opencl import Buffer, Device, DeviceMemoryError
 from hugin_abflow.progress import Advance
 from hugin_abflow.settings import Settings
 from hugin_abflow.working import Grid, device_dtype, device_rows, pixel_options
 
-# Bands of about this many output pixels, where the settings leave the choice.
+_log = logging.getLogger(__name__)
+
+# Bands of about this many output pixels, where the settings leave the choice and memory allows it.
 _BAND_PIXELS = 1 << 20
 _LEAST_ROWS = 16
+# What files keep of each layer between two reads, and what is allocated beside that which is reckoned.
+_STRIP_ROWS = 64
+_SLACK = 48 << 20
 # A layer with less than this share of a pixel's weight changes it by less than a quarter of a level, and need
 # not be sampled; of a level of 16 bits for floats.
 _QUARTER_LEVEL = {np.dtype(np.uint8): 0.25 / 255}
@@ -73,7 +79,7 @@ def bands(
     layers' dtype, alpha last. `crop` is in canvas pixels; `advance` counts rows. `shoulder` is that of the
     exposure scale (colour.py).
     """
-    height = settings.band_rows or max(_LEAST_ROWS, _BAND_PIXELS // crop.width)
+    height = settings.band_rows or _band_height(device, layers, full, grid, crop, settings)
     top = crop.top
     while top < crop.bottom:
         rest = Box(crop.left, top, crop.right, crop.bottom)
@@ -86,6 +92,48 @@ def bands(
             if height <= _LEAST_ROWS:
                 raise
             height = max(_LEAST_ROWS, height // 2)  # the device is smaller than it says
+
+
+def _band_height(
+    device: Device, layers: Sequence[BlendLayer], full: Grid, grid: Grid, crop: Box, settings: Settings
+) -> int:
+    """Rows of a band: as many as are quick and memory holds."""
+    height = max(_LEAST_ROWS, _BAND_PIXELS // crop.width)
+    device.give_back()
+    limit = memory.limit(settings.max_memory)
+    used = memory.resident() + device.own_memory + _SLACK
+    while True:
+        plan = _plan(layers, full, grid, crop, height)
+        needed = used + _pass_memory(layers, plan)
+        if needed <= limit or height <= _LEAST_ROWS:
+            break
+        height = max(_LEAST_ROWS, height // 2)
+    _log.info("memory: %s of %s for bands of %d rows", memory.size(needed), memory.size(limit), height)
+    if needed > limit:
+        _log.warning(
+            "%s of memory are too little for this panorama, which takes about %s; going on with that",
+            memory.size(limit), memory.size(needed),
+        )  # fmt: skip
+    return height
+
+
+def _pass_memory(layers: Sequence[BlendLayer], plan: Sequence[_Band]) -> int:
+    """Bytes that the bands take on host and device beside what is there before."""
+    first, part = layers[0].layer, plan[0].part
+    pixel = (first.channels + 1) * device_dtype(first).itemsize
+    shelves = _shelves([one.layer for one in layers], [band.rows for band in plan])
+    out = part.width * part.height * pixel
+    # rows of the next band are held on the host until their turn comes; files hold rows as they decode them
+    fresh = max(
+        sum(
+            one.layer.box.width * (part.height + 2 * _STRIP_ROWS)
+            for one, (start, end) in zip(layers, band.rows, strict=True)
+            if start < end
+        )
+        for band in plan
+    )
+    lines = sum(16 * one.box[2] * part.height for one in layers)
+    return shelves.total * pixel + fresh * pixel + 4 * out + 2 * lines
 
 
 def _bands(
@@ -109,25 +157,28 @@ def _bands(
     gains = [(whole, layer.gain) for layer in layers if layer.gain is not None]
     columns = _turn(device, full.lens[0], full.lens[1], crop.left - region.left, crop.width)
     plan = _plan(layers, full, grid, crop, height)
-    with _Store(device, [layer.layer for layer in layers], [band.rows for band in plan]) as store:
+    with _Store(
+        device, [layer.layer for layer in layers], [band.rows for band in plan], settings.cores
+    ) as store:
         for band in plan:
             part = band.part
             size = part.width, part.height
-            rows, row_starts = store.next()
+            store.next()
             ways, way_starts = _lines(device, fields, part, full, grid, share)
             gained, gain_starts = _lines(device, gains, part, full, gain_grid, 0.0)
             table = np.zeros((len(layers), 16), np.int32)
             for k, (layer, (start, end)) in enumerate(zip(layers, band.rows, strict=True)):
-                box = layer.layer.box
+                box, ring = layer.layer.box, store.shelves.rings[k]
                 table[k, :4] = box.left - region.left, box.top - region.top + start, box.width, end - start
                 table[k, 4:8] = layer.box[0], layer.box[2], whole[0], whole[2]
-                table[k, 8:10] = row_starts[k], way_starts[k]
+                table[k, 8:10] = ring.start, way_starts[k]
                 table[k, 10] = -1 if layer.gain is None else gain_starts.pop(0)
+                table[k, 11:13] = ring.rows, start % ring.rows
             used = [k for k, (start, end) in enumerate(band.rows) if start < end]
             lines = _turn(device, full.lens[2], -full.lens[3], part.top, part.height)
             out = device.empty((part.height, part.width, first.channels + 1), device_dtype(first))
             device.run(
-                "blend", "blend_band", size, rows, device.upload(table[used]), len(used), ways, gained,
+                "blend", "blend_band", size, store.rows, device.upload(table[used]), len(used), ways, gained,
                 columns, lines, full.border, full.lens, grid.border, gain_grid.border,
                 (part.left, part.top, *size), (region.left, region.top),
                 shoulder, int(settings.interpolation == "nearest"), share, out, options=options,
@@ -204,25 +255,63 @@ def _plan(layers: Sequence[BlendLayer], full: Grid, grid: Grid, crop: Box, heigh
     return [_Band(part, tuple(rows)) for part, rows in zip(parts, spans, strict=True)]
 
 
+@dataclass(frozen=True)
+class _Ring:
+    """Where a layer's rows lie in the store: row r at r modulo `rows`. start: pixels before it."""
+
+    start: int
+    rows: int
+
+
+@dataclass(frozen=True)
+class _Shelves:
+    """The store's layout. total: its pixels."""
+
+    rings: tuple[_Ring, ...]
+    total: int
+
+
+def _shelves(layers: Sequence[Layer], spans: Sequence[Sequence[Span]]) -> _Shelves:
+    """Room for all rows that a band needs of each layer; layers that no band needs together may share it."""
+    rings, total = [_Ring(0, 1)] * len(layers), 0
+    placed: list[tuple[int, int, int]] = []  # from, to, last band
+    lives = []
+    for k in range(len(layers)):
+        needed = [i for i, band in enumerate(spans) if band[k][0] < band[k][1]]
+        if needed:
+            lives.append((needed[0], needed[-1], k))
+    for first, last, k in sorted(lives):
+        rows = max(end - start for start, end in (band[k] for band in spans))
+        need, at = rows * layers[k].box.width, 0
+        for start, end, their_last in sorted(placed):
+            if their_last < first:
+                continue  # it comes before: layers are placed in the order of their first bands
+            if at + need <= start:
+                break
+            at = max(at, end)
+        placed.append((at, at + need, last))
+        rings[k] = _Ring(at, rows)
+        total = max(total, at + need)
+    return _Shelves(tuple(rings), total)
+
+
 class _Store:
     """Rows of all layers on the device, those that a band needs. Each row is decoded and uploaded once.
 
     spans   for each band, the rows of each layer; from band to band neither end goes back, but for a layer
             that is not needed: its are equal.
+    rows    stored samples (n, channels + 1); shelves: where each layer's are.
     """
 
-    def __init__(self, device: Device, layers: Sequence[Layer], spans: Sequence[Sequence[Span]]) -> None:
+    def __init__(
+        self, device: Device, layers: Sequence[Layer], spans: Sequence[Sequence[Span]], threads: int
+    ) -> None:
+        self.shelves = _shelves(layers, spans)
+        self.rows = device.empty((self.shelves.total, layers[0].channels + 1), device_dtype(layers[0]))
         self._layers = layers
         self._spans = iter(spans)
-        most = max(
-            sum((end - start) * layer.box.width for layer, (start, end) in zip(layers, band, strict=True))
-            for band in spans
-        )
-        dtype, samples = device_dtype(layers[0]), layers[0].channels + 1
-        self._buffers = [device.empty((most, samples), dtype) for _ in range(2)]
-        self._held: list[Span] = [(0, 0)] * len(layers)
-        self._starts = [0] * len(layers)
-        self._decoders = ThreadPoolExecutor(os.cpu_count())
+        self._held: Sequence[Span] = [(0, 0)] * len(layers)
+        self._decoders = ThreadPoolExecutor(threads, "decoder")
         self._coming = self._decode()
 
     def __enter__(self) -> _Store:
@@ -231,29 +320,29 @@ class _Store:
     def __exit__(self, *reason: object) -> None:
         self._decoders.shutdown(cancel_futures=True)
 
-    def _decode(self) -> tuple[Sequence[Span], list[Future[npt.NDArray[Any]]]]:
-        """Begin to decode what the next band needs beyond what is held."""
+    def _decode(self) -> tuple[Sequence[Span], list[tuple[int, int, Future[npt.NDArray[Any]]]]]:
+        """Begin to decode what the next band needs beyond what is held: layer, first row, rows."""
         spans = next(self._spans, self._held)
-        return spans, [
-            self._decoders.submit(device_rows, layer, min(max(start, held), end), end)
-            for layer, (start, end), (_, held) in zip(self._layers, spans, self._held, strict=True)
-        ]
+        coming = []
+        for k, ((start, end), (_, held)) in enumerate(zip(spans, self._held, strict=True)):
+            first = max(start, held)
+            if first < end:
+                coming.append((k, first, self._decoders.submit(device_rows, self._layers[k], first, end)))
+        return spans, coming
 
-    def next(self) -> tuple[Buffer, list[int]]:
-        """Rows of the next band: stored samples (n, channels + 1), and where each layer's begin."""
+    def next(self) -> None:
+        """Have `rows` hold what the next band needs."""
         spans, coming = self._coming
-        before, now = self._buffers
-        starts, total = [], 0
-        for k, ((start, end), fresh) in enumerate(zip(spans, coming, strict=True)):
-            first, last = self._held[k]
-            width = self._layers[k].box.width
-            kept = max(0, min(last, end) - start)
-            now.copy(total, before, self._starts[k] + (start - first) * width, kept * width)
-            rows = fresh.result()
-            now.put(total + kept * width, rows.reshape(-1, rows.shape[2]))
-            starts.append(total)
-            total += (end - start) * width
-        self._buffers.reverse()
-        self._held, self._starts = list(spans), starts
+        for k, first, rows in coming:
+            self._put(self.shelves.rings[k], first, rows.result())
+        self._held = spans
         self._coming = self._decode()
-        return now, starts
+
+    def _put(self, ring: _Ring, first: int, rows: npt.NDArray[Any]) -> None:
+        """Upload rows of a layer from its row `first` on, over those that are needed no more."""
+        width = rows.shape[1]
+        while len(rows):
+            at = first % ring.rows
+            fitting = rows[: ring.rows - at]
+            self.rows.put(ring.start + at * width, fitting.reshape(-1, rows.shape[2]))
+            first, rows = first + len(fitting), rows[len(fitting) :]

@@ -9,6 +9,7 @@ from typing import Any, get_args
 
 import click
 
+from hugin_abflow import memory
 from hugin_abflow.batch.config import NAME, find_config, read_config, write_config
 from hugin_abflow.batch.queue import find_projects
 from hugin_abflow.batch.run import Run, default_jobs, run
@@ -18,7 +19,7 @@ from hugin_abflow.images import COMPRESSIONS
 from hugin_abflow.metadata import PROGRAM, version
 from hugin_abflow.nona import Remap
 from hugin_abflow.opencl import list_devices
-from hugin_abflow.options import ARGUMENTS, Command, Option, kind_of, long_names
+from hugin_abflow.options import ARGUMENTS, Command, Option, Size, kind_of, long_names
 from hugin_abflow.settings import FlowQuality, MergeMode, Settings
 from hugin_abflow.terminal import complain, interruptible, say
 
@@ -76,6 +77,7 @@ _layers = partial(click.option, cls=Option, group="Layers")
 _blending = partial(click.option, cls=Option, group="Blending", show_default=True)
 _result = partial(click.option, cls=Option, group="Result")
 _batch = partial(click.option, cls=Option, group="Many projects")
+_resources = partial(click.option, cls=Option, group="Resources")
 _information = partial(click.option, cls=Option, group="Information")
 
 
@@ -227,6 +229,19 @@ _information = partial(click.option, cls=Option, group="Information")
 )
 @_batch("--print-config", is_flag=True, help=f"Print all options as they would be in {NAME}, and exit.")
 @_batch("--log", metavar="FILE", type=_file, help="Add all messages, with the time, to the end of FILE.")
+@_resources(
+    "--max-memory",
+    metavar="SIZE",
+    type=Size(),
+    help="Memory that may be taken, the device's included, such as 800M or 1.5G; it changes no pixel. "
+    "[default: half of the machine's]",
+)
+@_resources(
+    "--threads",
+    metavar="NUMBER",
+    type=click.IntRange(1, 1024),
+    help="Processor cores to use, 1 to 1024; it changes no pixel. [default: all]",
+)
 @_information(
     "--list-devices",
     is_flag=True,
@@ -357,6 +372,8 @@ def _options(
     no_flow: bool,
     flow_quality: FlowQuality,
     device: str | None,
+    max_memory: int | None,
+    threads: int | None,
     **others: Any,
 ) -> dict[str, Any]:
     """The keywords of `merge_project` that the command's options mean; `others` are such by themselves."""
@@ -373,6 +390,8 @@ def _options(
         seam=seam == "auto",
         large_motion=large_motion == "on",
         device=device,
+        max_memory=max_memory or 0,
+        threads=threads or 0,
     )
     return {
         "settings": settings,
@@ -405,5 +424,6 @@ def _run(arguments: Sequence[str] | None) -> int:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run ``hugin-abflow`` with `arguments` (default: the process's own) and return its exit code."""
+    memory.manage()
     with interruptible():
         return _run(arguments)

@@ -256,8 +256,10 @@ def solve(measured: Measured, rounds: Sequence[tuple[float, float]] = _ROUNDS) -
         trusted = data * weight * _biweight(off, limit)
         held, pull = bounds.active(solution, limit)
         matrix = diags_array(hold + held) + smooth + link.T @ diags_array(trusted) @ link
-        factors = splu(matrix.tocsc(), "MMD_AT_PLUS_A", diag_pivot_thresh=0, options={"SymmetricMode": True})
-        solution = factors.solve(pull - link.T @ (trusted[:, None] * difference))
+        wanted = pull - link.T @ (trusted[:, None] * difference)
+        options = {"SymmetricMode": True}
+        # not kept until the next round's are there: factors are large
+        solution = splu(matrix.tocsc(), "MMD_AT_PLUS_A", diag_pivot_thresh=0, options=options).solve(wanted)
     result = np.zeros((*inside.shape, 3))
     result[inside] = solution
     return result

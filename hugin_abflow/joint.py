@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import os
 import threading
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
@@ -25,6 +24,7 @@ from hugin_abflow import (
     flow,
     geometry,
     guidance,
+    memory,
     quality,
     seam,
     transition,
@@ -33,6 +33,7 @@ from hugin_abflow import (
 from hugin_abflow.blend import BlendLayer
 from hugin_abflow.coefficient import Masks
 from hugin_abflow.colour import Correction
+from hugin_abflow.errors import SettingsError
 from hugin_abflow.flow import FlowParameters
 from hugin_abflow.geometry import Pair, PairFlow
 from hugin_abflow.guides import Guide, by_pair
@@ -50,6 +51,9 @@ _LEAST_OVERLAP = 64
 _SEAM_ROUNDS = 2
 # Motion that is looked for, as a share of the canvas's width.
 _REACH = 0.1
+# Bytes that are to come for each working pixel of a layer: a field, three arrays of coefficients; for each
+# that two layers share: flow both ways, on a chart that is half as large again.
+_STEP_BYTES, _FLOW_BYTES = 16 + 3 * 4, 1.5 * 16
 # Below this a working canvas is too small to be worth another attempt.
 _LEAST_WORKING_PIXELS = 20_000
 
@@ -124,7 +128,7 @@ def prepare(
     """Everything that sees far, at working resolution: flow, coefficients, geometry, colour."""
     full = working.full_grid(canvas, layers)
     grid = working.working_grid(full, settings)
-    everything = _read(device, layers, grid, progress)
+    everything = _read(device, layers, grid, progress, settings.cores)
     masks = coefficient.masks(device, everything, grid)
     used = [i for i in range(len(everything)) if not _redundant(i, everything, masks)]
     reduced = [everything[i] for i in used]
@@ -136,13 +140,15 @@ def prepare(
     largest = _REACH * (grid.canvas_width or grid.region.width) * grid.width / grid.region.width
     reach = largest if settings.large_motion else 0.0
     overlaps = _overlaps(device, reduced, masks)
+    _check_memory(device, reduced, overlaps, masks, grid, settings)
     flows = (
         _flows(device, reduced, masks, grid, overlaps, progress, parameters, reach, its_guides, numbers)
         if settings.flow
         else []
     )
     with progress("align", 1) as advance:
-        flows = [consistency.mend(device, pair) for pair in flows]
+        for index, pair_flow in enumerate(flows):  # one by one: they are large
+            flows[index] = consistency.mend(device, pair_flow)
         pairs = [pair for pair, _ in overlaps]
         fields, correction = _align(device, reduced, pairs, flows, masks, grid, settings)
         final = [
@@ -158,27 +164,31 @@ def _align(
     device: Device,
     layers: Sequence[WorkingLayer],
     pairs: Sequence[Pair],
-    flows: Sequence[PairFlow],
+    flows: list[PairFlow],
     masks: Masks,
     grid: Grid,
     settings: Settings,
 ) -> tuple[list[Buffer], Correction]:
     """Geometry and colour that make the layers agree, without flow colour alone; where nothing does, one
-    layer whole.
+    layer whole. `flows` is emptied.
 
     What flow cannot explain spoils the exposure around it, which is found again without it.
     """
     regions: npt.NDArray[np.bool_] | None = None
-    whole = coefficient.coefficients(device, layers, masks, grid, settings)
-    coefficients = transition.narrow(device, layers, whole, flows, grid, settings)
+    coefficients = transition.narrow(
+        device, layers, coefficient.coefficients(device, layers, masks, grid, settings), flows, grid, settings
+    )
     fields = geometry.fields(device, layers, coefficients, flows, grid, settings)
-    del whole, coefficients  # as large as the layers, and not needed again
+    flows.clear()  # these are as large as the layers, and not needed again
+    del coefficients
+    device.give_back()
     measured = colour.measure(device, layers, fields, pairs, grid, masks.host)
     correct = partial(colour.correction, device, measured)
     # exposure explains a difference whether it is corrected or not
     exposure = replace(settings, exposure=True)
     for _ in range(_SEAM_ROUNDS if settings.seam else 0):
         strict = correct(exposure, regions, strict=True)
+        device.give_back()
         found = seam.regions(device, layers, fields, pairs, strict, grid)
         grown = found if regions is None else found | regions
         if not grown.any() or (regions is not None and np.array_equal(grown, regions)):
@@ -192,7 +202,9 @@ def _align(
     return fields, correct(settings, regions)
 
 
-def _read(device: Device, layers: Sequence[Layer], grid: Grid, progress: Progress) -> list[WorkingLayer]:
+def _read(
+    device: Device, layers: Sequence[Layer], grid: Grid, progress: Progress, cores: int
+) -> list[WorkingLayer]:
     """The layers on the working grid, several decoded at a time, in an order that does not depend on the
     caller's: by place and size, and by what they show where these are the same.
     """
@@ -203,7 +215,7 @@ def _read(device: Device, layers: Sequence[Layer], grid: Grid, progress: Progres
             advance(rows)
 
     places = Counter(layer.box for layer in layers)
-    decoders = ThreadPoolExecutor(os.cpu_count())
+    decoders = ThreadPoolExecutor(cores, "decoder")
     with progress("read", sum(layer.box.height for layer in layers)) as advance:
         try:
             jobs = [
@@ -216,6 +228,7 @@ def _read(device: Device, layers: Sequence[Layer], grid: Grid, progress: Progres
         finally:
             decoders.shutdown(cancel_futures=True)
         device.finish()  # else the last rows' time would be told as that of what follows
+    device.give_back()
     return sorted(reduced, key=_place)
 
 
@@ -259,6 +272,34 @@ def _overlaps(
     return result
 
 
+def _check_memory(
+    device: Device,
+    layers: Sequence[WorkingLayer],
+    overlaps: Sequence[tuple[Pair, npt.NDArray[np.bool_]]],
+    masks: Masks,
+    grid: Grid,
+    settings: Settings,
+) -> None:
+    """Refuse a limit that is too low for the working canvas, which must not depend on it."""
+    pixels = sum(layer.box[2] * layer.box[3] for layer in layers)
+    ratio = grid.width * grid.height / (masks.grid.width * masks.grid.height)
+    shared = ratio * sum(int(np.count_nonzero(overlap)) for _, overlap in overlaps) if settings.flow else 0
+    needed = memory.resident() + device.own_memory + _STEP_BYTES * pixels + int(_FLOW_BYTES * shared)
+    limit = memory.limit(settings.max_memory)
+    _log.info("memory: about %s of %s at working resolution", memory.size(needed), memory.size(limit))
+    if needed <= limit:
+        return
+    if settings.max_memory:
+        raise SettingsError(
+            f"--max-memory {memory.size(limit)} is too little for these layers, whose flow takes about "
+            f"{memory.size(needed)}; give that much, or choose --flow-quality fast"
+        )
+    _log.warning(
+        "these layers take about %s of memory, more than half of the machine's (%s)",
+        memory.size(needed), memory.size(limit),
+    )  # fmt: skip
+
+
 def _flows(
     device: Device,
     layers: Sequence[WorkingLayer],
@@ -291,4 +332,5 @@ def _flows(
             result.append(PairFlow(pair.a, pair.b, its_chart, *found))
             advance(1)
         device.finish()  # kernels are only queued: the last pair's time would be told as that of what follows
+    device.give_back()
     return result

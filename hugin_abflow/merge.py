@@ -33,7 +33,7 @@ Method = Callable[
     [Device, Sequence[Layer], Canvas, Settings, Progress, Sequence[Guide]], Iterator[npt.NDArray[Any]]
 ]
 
-OpenDevice = Callable[[str | None], Device]
+OpenDevice = Callable[[str | None, int], Device]
 
 
 def merge_project(
@@ -58,7 +58,7 @@ def merge_project(
     compression, jpeg_quality    of the file, see `images.ImageWriter`; default: the project's, if the output
                     has the project's format.
     metadata        write EXIF and, for viewers of 360-degree panoramas, GPano; see `metadata.describe`.
-    open_device     gives the device that `settings.device` means; default: `Device`, a new one.
+    open_device     gives the device that `settings.device` and `.threads` mean; default: `Device`, a new one.
 
     The file appears when it is complete; inputs are never touched. Raises the `AbflowError` family:
     what the project, its layers, the device or the output can get wrong.
@@ -148,7 +148,7 @@ def _bands(
     open_device: OpenDevice | None = None,
 ) -> Iterator[npt.NDArray[Any]]:
     """The panorama's rows from top to bottom."""
-    device = (open_device or Device)(settings.device)
+    device = (open_device or Device)(settings.device, settings.threads)
     method = method or {"joint": joint.merge, "sequential": sequential.merge}[settings.merge]
     visible = False
     for rows in method(device, layers, canvas, settings, progress, guides):

@@ -15,13 +15,15 @@ from dataclasses import dataclass
 from functools import cache, lru_cache
 from pathlib import Path
 from typing import Any
+from weakref import WeakSet
 
 import numpy as np
 import numpy.typing as npt
 import pyopencl as cl
 
-from hugin_abflow import trace
+from hugin_abflow import memory, trace
 from hugin_abflow.errors import DeviceError
+from hugin_abflow.spare import Spare
 
 _log = logging.getLogger(__name__)
 
@@ -129,6 +131,20 @@ def _choose(wanted: str | None) -> cl.Device:
     raise DeviceError(f"no OpenCL device fits --device {wanted}; there are {names}")
 
 
+def _part(device: cl.Device, threads: int) -> cl.Device:
+    """As many of a processor's cores as are allowed, where its driver can be told."""
+    by_counts = cl.device_partition_property.BY_COUNTS
+    if (
+        not threads
+        or _kind(device) != "CPU"
+        or threads >= device.max_compute_units
+        or by_counts not in device.partition_properties
+    ):
+        return device
+    (part,) = device.create_sub_devices([by_counts, threads, 0])
+    return part
+
+
 class DeviceMemoryError(DeviceError):
     """The device's memory is too small for what was asked; smaller pieces may fit."""
 
@@ -160,9 +176,16 @@ class Buffer:
     def __init__(self, device: Device, shape: tuple[int, ...], dtype: npt.DTypeLike) -> None:
         self.shape, self.dtype = shape, np.dtype(dtype)
         self.nbytes = int(np.prod(shape, dtype=np.int64)) * self.dtype.itemsize
-        with _device_errors(f"allocating {self.nbytes} bytes"):
-            self.data = cl.Buffer(device.context, cl.mem_flags.READ_WRITE, max(self.nbytes, 16))
         self._device = device
+        self.data = device.spare.take(self.nbytes)
+        if self.data is None:
+            with _device_errors(f"allocating {self.nbytes} bytes"):
+                self.data = cl.Buffer(device.context, cl.mem_flags.READ_WRITE, max(self.nbytes, 16))
+        device.buffers.add(self)
+
+    def __del__(self) -> None:
+        if getattr(self, "data", None) is not None:  # else there was no room for it
+            self._device.spare.keep(self.nbytes, self.data)
 
     def _transfer(self, name: str, *places: Any, **offsets: int) -> None:
         """Copy between arrays, the target first."""
@@ -219,9 +242,15 @@ class _Times:
 
     def __init__(self, queue: cl.CommandQueue) -> None:
         self.events: deque[tuple[str, str, cl.Event]] = deque()
+        # its clock to ours: the least of several, for we may be told late
+        self._offset = min(self._lag(queue) for _ in range(8))
+
+    @staticmethod
+    def _lag(queue: cl.CommandQueue) -> float:
+        """Seconds from the end of an event on the device's clock to now on ours."""
         event = cl.enqueue_fill_buffer(queue, cl.Buffer(queue.context, 0, 16), np.int32(0), 0, 16)
         event.wait()
-        self._offset = time.perf_counter() - event.profile.end * 1e-9  # its clock to ours
+        return time.perf_counter() - float(event.profile.end) * 1e-9
 
     def tell(self) -> None:
         """Tell the trace what is done."""
@@ -235,15 +264,20 @@ class _Times:
 class Device:
     """A device with its queue and built kernels.
 
+    wanted      as `Settings.device`.
+    threads     cores that a processor may use; 0: all. Other devices use what they have.
+
     Raises `DeviceError` if there is none, none fits `wanted`, or a kernel does not build.
     """
 
-    def __init__(self, wanted: str | None = None) -> None:
-        self.device = _choose(wanted)
+    def __init__(self, wanted: str | None = None, threads: int = 0) -> None:
+        self.device = _part(_choose(wanted), threads)
         self.context = cl.Context([self.device])
         timing = cl.command_queue_properties.PROFILING_ENABLE if trace.is_recording() else 0
         self.queue = cl.CommandQueue(self.context, properties=timing)
         self._times = _Times(self.queue) if timing else None
+        self.buffers: WeakSet[Buffer] = WeakSet()
+        self.spare = Spare()
         self._kernels: dict[tuple[str, str, str], cl.Kernel] = {}
         self._repeated: dict[tuple[str, str, str], list[cl.Kernel]] = {}
         self._arguments = threading.Lock()  # a kernel keeps its arguments from when they are set to its start
@@ -253,6 +287,12 @@ class Device:
     def name(self) -> str:
         """What device it is, and whose driver runs it."""
         return f"{self.device.name.strip()} ({self.device.platform.name.strip()})"
+
+    @property
+    def own_memory(self) -> int:
+        """Bytes that buffers take and the host's count does not hold: those of a graphics card."""
+        shared = self.device.host_unified_memory
+        return 0 if shared else sum(buffer.nbytes for buffer in self.buffers)
 
     def empty(self, shape: Sequence[int], dtype: npt.DTypeLike = np.float32) -> Buffer:
         """An uninitialised array."""
@@ -344,6 +384,11 @@ class Device:
         made = self._repeated.setdefault((module, name, options), [first])
         made += [cl.Kernel(first.program, name) for _ in range(count - len(made))]
         return made[:count]
+
+    def give_back(self) -> None:
+        """Return freed memory to the system, on the device and the host, at the end of a step."""
+        self.spare.release()
+        memory.give_back()
 
     def finish(self) -> None:
         """Wait for all that was started; raises `DeviceError` if the device failed."""

@@ -7,6 +7,9 @@ from typing import Any
 
 import click
 
+from hugin_abflow import memory
+from hugin_abflow.errors import SettingsError
+
 # Where a context keeps the arguments as they were given.
 ARGUMENTS = "hugin_abflow.arguments"
 
@@ -17,6 +20,19 @@ class Option(click.Option):
     def __init__(self, *arguments: Any, group: str, **keywords: Any) -> None:
         super().__init__(*arguments, **keywords)
         self.group = group
+
+
+class Size(click.ParamType):  # type: ignore[type-arg]
+    """Bytes, as `memory.parse_size` reads them."""
+
+    name = "size"
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> int:
+        """The number of bytes; ends with click's message for what is none."""
+        try:
+            return memory.parse_size(value)
+        except SettingsError as error:
+            self.fail(str(error), param, ctx)
 
 
 class Command(click.Command):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from dataclasses import dataclass
 from numbers import Integral, Real
 from typing import Literal, get_args
@@ -40,7 +41,10 @@ class Settings:
                         pixels; 0: none, as published.
     fixed_point_steps   times that x_k <- p - sum_j w_j F_kj(x_k) is iterated; 0: flow is read at p,
                         as published.
-    band_rows           rows of a full-resolution band; 0: chosen from the canvas width.
+    band_rows           rows of a full-resolution band; 0: chosen from the canvas width and `max_memory`.
+    max_memory          bytes that host and device may take together; 0: half of the machine's memory. It
+                        changes no pixel.
+    threads             processor cores that are used at a time; 0: all. It changes no pixel.
     device              index in ``--list-devices`` or part of a device's name; None: the fastest GPU,
                         else CPU.
     """
@@ -60,6 +64,8 @@ class Settings:
     border_feather: float = 6.0
     fixed_point_steps: int = 0
     band_rows: int = 0
+    max_memory: int = 0
+    threads: int = 0
     device: str | None = None
 
     def __post_init__(self) -> None:
@@ -71,6 +77,8 @@ class Settings:
             ("border_feather", 0, 1000),
             ("fixed_point_steps", 0, 20),
             ("band_rows", 0, 1 << 20),
+            ("max_memory", 0, 1 << 50),
+            ("threads", 0, 1024),
         ):
             value = getattr(self, name)
             whole = type(getattr(type(self), name)) is int
@@ -96,6 +104,11 @@ class Settings:
             raise SettingsError(
                 f"device is {self.device!r}; choose an index or a part of a name, as text, or None"
             )
+
+    @property
+    def cores(self) -> int:
+        """`threads`, or all of the machine's cores."""
+        return self.threads or os.cpu_count() or 1
 
     @property
     def working_limit(self) -> int:

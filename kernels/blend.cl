@@ -10,7 +10,8 @@ typedef struct {
     int4 place;     /* of its stored rows: left, top, width, height */
     int2 way, gain; /* left, width of its field, on the working grid, and of its gain, on the colour grid */
     int rows, ways, gains; /* where it begins in `stored`, `ways` and `gains`; gains -1: no correction */
-    int unused[5];
+    int ring, turn; /* rows lie in a ring of so many, the first one there */
+    int unused[3];
 } blend_layer;
 
 /* r, g, b, alpha in stored units. */
@@ -22,12 +23,21 @@ static inline float4 blend_samples(blend_pixel p) {
 #endif
 }
 
+/* Where a layer's stored row lies; its rows go round. */
+static inline __global const blend_pixel *blend_line(__global const blend_pixel *stored,
+                                                     __global const blend_layer *layer, int row) {
+    row += layer->turn;
+    row -= row >= layer->ring ? layer->ring : 0;
+    return stored + layer->rows + row * layer->place.z;
+}
+
 /* r, g, b in stored units and 1 for a valid pixel, else zeros. */
-static inline float4 blend_tap(__global const blend_pixel *rows, int4 place, int2 p) {
-    const int at = box_index(p, place);
-    if (at < 0)
+static inline float4 blend_tap(__global const blend_pixel *stored, __global const blend_layer *layer, int2 p) {
+    const int4 place = layer->place;
+    const int x = p.x - place.x, y = p.y - place.y;
+    if (x < 0 || y < 0 || x >= place.z || y >= place.w)
         return (float4)(0.0f);
-    const float4 c = blend_samples(rows[at]);
+    const float4 c = blend_samples(blend_line(stored, layer, y)[x]);
     return c.w >= 0.5f * WHITE ? (float4)(c.xyz, 1.0f) : (float4)(0.0f);
 }
 
@@ -39,20 +49,22 @@ static inline float4 blend_row(__global const blend_pixel *p, float4 weights, fl
 }
 
 /* Bicubic sample at position q; next to the mask's rim bilinear over the valid taps, whose share is w. */
-static float4 blend_sample(__global const blend_pixel *rows, int4 place, float2 q, int4 border, int nearest) {
+static float4 blend_sample(__global const blend_pixel *stored, __global const blend_layer *layer, float2 q,
+                           int4 border, int nearest) {
     int2 corner = floor_int2(nearest ? q : q - 0.5f);
     if (nearest)
-        return grid_border(&corner, border) ? blend_tap(rows, place, corner) : (float4)(0.0f);
+        return grid_border(&corner, border) ? blend_tap(stored, layer, corner) : (float4)(0.0f);
     const float2 t = q - 0.5f - convert_float2(corner);
     const float4 wx = catmull_rom(t.x), wy = catmull_rom(t.y);
+    const int4 place = layer->place;
     const int2 first = corner - 1 - place.xy;
     if (first.x >= 0 && first.y >= 0 && first.x + 3 < place.z && first.y + 3 < place.w) {
         /* nearly all samples: every tap is stored, no border rule is needed */
-        __global const blend_pixel *p = rows + first.y * place.z + first.x;
-        float4 least = (float4)(WHITE), sum = wy.x * blend_row(p, wx, &least);
-        sum += wy.y * blend_row(p + place.z, wx, &least);
-        sum += wy.z * blend_row(p + 2 * place.z, wx, &least);
-        sum += wy.w * blend_row(p + 3 * place.z, wx, &least);
+        float4 least = (float4)(WHITE);
+        float4 sum = wy.x * blend_row(blend_line(stored, layer, first.y) + first.x, wx, &least);
+        sum += wy.y * blend_row(blend_line(stored, layer, first.y + 1) + first.x, wx, &least);
+        sum += wy.z * blend_row(blend_line(stored, layer, first.y + 2) + first.x, wx, &least);
+        sum += wy.w * blend_row(blend_line(stored, layer, first.y + 3) + first.x, wx, &least);
         if (least.w >= 0.5f * WHITE)
             return (float4)(sum.xyz, 1.0f);
     }
@@ -62,7 +74,7 @@ static float4 blend_sample(__global const blend_pixel *rows, int4 place, float2 
     for (int j = 0; j < 4; ++j)
         for (int i = 0; i < 4; ++i) {
             int2 p = corner + (int2)(i - 1, j - 1);
-            const float4 c = grid_border(&p, border) ? blend_tap(rows, place, p) : (float4)(0.0f);
+            const float4 c = grid_border(&p, border) ? blend_tap(stored, layer, p) : (float4)(0.0f);
             missing += c.w == 0.0f;
             cubic += ax[i] * ay[j] * c;
             if (i > 0 && i < 3 && j > 0 && j < 3)
@@ -194,7 +206,7 @@ static inline float4 blend_round(float4 v, float4 thresholds, int dithered) {
    say and weighted as they say. The sum is of differences from a reference, the first layer's own pixel, so
    that equal colours stay equal to the bit; where nothing else is known, that is the result. */
 __kernel void blend_band(
-    __global const blend_pixel *stored, /* rows of the layers one after the other: (height, width) each */
+    __global const blend_pixel *stored, /* a ring of rows for each layer: (ring, width) */
     __global const blend_layer *layers, int count, /* those that the band may touch */
     __global const float4 *ways,         /* per layer, (band.w, way.y): displacement, weight, from blend_rows */
     __global const float4 *gains,        /* per corrected layer, (band.w, gain.y) */
@@ -220,7 +232,7 @@ __kernel void blend_band(
     int first = 0, several = 0;
     float4 reference = (float4)(0.0f);
     for (int k = 0; k < count && !several; ++k) {
-        const float4 own = blend_tap(stored + layers[k].rows, layers[k].place, place);
+        const float4 own = blend_tap(stored, layers + k, place);
         if (own.w == 0.0f)
             continue;
         several = reference.w != 0.0f;
@@ -244,7 +256,7 @@ __kernel void blend_band(
             float total = 0.0f;
             sum = (float4)(0.0f);
             for (int k = first; k < count; ++k) {
-                float4 c = blend_tap(stored + layers[k].rows, layers[k].place, place);
+                float4 c = blend_tap(stored, layers + k, place);
                 if (c.w == 0.0f)
                     continue;
                 __global const float4 *line = ways + layers[k].ways + y * layers[k].way.y;
@@ -254,8 +266,8 @@ __kernel void blend_band(
                     continue;
                 total += w;
                 if (blend_any(way.xyz))
-                    c = blend_sample(stored + layers[k].rows, layers[k].place,
-                                     blend_position(p, way.xyz, scale, lens, turn), border, nearest);
+                    c = blend_sample(stored, layers + k, blend_position(p, way.xyz, scale, lens, turn), border,
+                                     nearest);
                 /* a sample that falls outside its layer counts smoothly less */
                 w *= c.w * c.w;
                 if (w <= 0.0f)

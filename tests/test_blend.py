@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -14,9 +15,10 @@ from reference import common
 from scipy import ndimage
 from tolerances import DECISIONS, POSITION, SUM, assert_close
 
-from hugin_abflow import working
+from hugin_abflow import blend, working
 from hugin_abflow.layer import Box, Layer
 from hugin_abflow.opencl import Device
+from hugin_abflow.settings import Settings
 from hugin_abflow.working import Grid
 
 STORED = [(dtype, channels) for dtype in (np.uint8, np.uint16, np.float32) for channels in (1, 3)]
@@ -150,19 +152,26 @@ def test_a_band_of_three_layers_equals_its_twin(
     table[:, :4] = places
     table[:, 4:6] = [(box[0], box[2]) for box in boxes]
     table[:, 6:8] = 0, 7
-    table[:, 8] = np.cumsum([0, *(p[2] * p[3] for p in places)])[:3]
     table[:, 9] = np.cumsum([0, *(box[2] * band[3] for box in boxes)])[:3]
     table[:, 10] = -1, 0, 7 * band[3]
+    # rings of as many rows as there are, or more; they begin anywhere
+    rings, turns = [p[3] + spare for p, spare in zip(places, (0, 3, 1), strict=True)], (0, 30, 17)
+    table[:, 8] = np.cumsum([0, *(p[2] * ring for p, ring in zip(places, rings, strict=True))])[:3]
+    table[:, 11:13] = list(zip(rings, turns, strict=True))
+    turned = [
+        np.roll(np.pad(rows, ((0, ring - len(rows)), (0, 0), (0, 0))), turn, 0)
+        for rows, ring, turn in zip(stored, rings, turns, strict=True)
+    ]
     x, y = (a + 0.5 for a in (np.arange(2, 73), np.arange(1, 37)))
     angles = full.lens[0] + x * full.lens[1], full.lens[2] - y * full.lens[3]
-    turns = [device.upload(np.stack([np.sin(a), np.cos(a)], -1).astype(np.float32)) for a in angles]
+    axes = [device.upload(np.stack([np.sin(a), np.cos(a)], -1).astype(np.float32)) for a in angles]
     out = device.empty((36, 71, channels + 1), dtype)
     packed = [
-        np.concatenate([a.reshape(-1, a.shape[-1]) for a in arrays]) for arrays in (stored, ways, gained)
+        np.concatenate([a.reshape(-1, a.shape[-1]) for a in arrays]) for arrays in (turned, ways, gained)
     ]
     rows, lines, factors = (device.upload(a) for a in packed)
     device.run(
-        "blend", "blend_band", band[2:], rows, device.upload(table), 3, lines, factors, *turns,
+        "blend", "blend_band", band[2:], rows, device.upload(table), 3, lines, factors, *axes,
         full.border, full.lens, grid.border, cells.border, band, origin, shoulder, nearest, share,
         out, options=options,
     )  # fmt: skip
@@ -243,6 +252,46 @@ def test_a_band_sees_the_next_rows_displacements(device: Device) -> None:
     assert not np.array_equal(whole, pixels)
     for rows in (1, 2, 3):
         assert np.array_equal(merged(device, [layer, layer], full, grid, rows=rows), whole)
+
+
+def test_bands_are_as_high_as_memory_allows(device: Device, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The result is the same; what cannot be kept is told."""
+    full = plane(500, 400)
+    grid = full.resized(50, 40)
+    pixels = stored_pixels(30, 500, 400, np.uint8, 3, 0.9)
+    layers = [blend_layer(device, pixels, 0, 0, full, grid)] * 2
+    heights, results, warnings = [], [], []
+    monkeypatch.setattr(blend, "_SLACK", 0)
+    monkeypatch.setattr(blend.memory, "resident", lambda: 0)
+    monkeypatch.setattr(blend._log, "warning", lambda *said: warnings.append(said))
+    for limit in (0, 6 << 20, 3 << 20, 1 << 19):
+        settings = Settings(max_memory=limit)
+        cells = grid.resized(7, 5)
+        found = blend.bands(device, layers, full, grid, cells, 1.0, full.region, settings, lambda units: None)
+        parts = list(found)
+        heights.append(len(parts[0]))
+        results.append(np.concatenate(parts))
+    assert heights[0] == 400 > heights[1] > heights[2] > heights[3] == 16
+    assert all(np.array_equal(result, results[0]) for result in results)
+    assert len(warnings) == 1
+
+
+def test_layers_that_no_band_needs_together_share_memory() -> None:
+    """A column of many small layers takes no more than those that meet; none lies over another in use."""
+    pixels = np.zeros((20, 30, 4), np.uint8)
+    layers = [Layer.from_array("l", pixels, 0, 15 * k) for k in range(40)]
+    spans = [
+        [(max(0, top - layer.box.top), max(0, min(20, top + 10 - layer.box.top))) for layer in layers]
+        for top in range(0, 605, 10)
+    ]
+    spans = [[(a, b) if a < b else (0, 0) for a, b in band] for band in spans]
+    shelves = blend._shelves(layers, spans)
+    assert shelves.total <= 3 * 20 * 30
+    for band in spans:
+        used = [k for k, (start, end) in enumerate(band) if start < end]
+        taken = sorted((shelves.rings[k].start, shelves.rings[k].rows * 30) for k in used)
+        assert all(a + size <= b for (a, size), (b, _) in pairwise(taken))
+        assert all(shelves.rings[k].rows >= band[k][1] - band[k][0] for k in used)
 
 
 @pytest.mark.parametrize("far", [0.0, 9.0])

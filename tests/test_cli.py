@@ -96,6 +96,8 @@ def test_option_reaches_merge_project(calls: Calls, arguments: list[str], name: 
         (["--no-flow"], "flow", False),
         (["--flow-quality", "best"], "flow_quality", "best"),
         (["--device", "0"], "device", "0"),
+        (["--max-memory", "1.5G"], "max_memory", 3 << 29),
+        (["--threads", "2"], "threads", 2),
     ],
 )
 def test_option_changes_one_setting(calls: Calls, arguments: list[str], name: str, value: object) -> None:
@@ -272,6 +274,7 @@ def test_help_is_grouped_and_complete(capsys: pytest.CaptureFixture[str]) -> Non
         "Layers",
         "Blending",
         "Many projects",
+        "Resources",
         "Information",
         "Examples",
         "Exit codes",

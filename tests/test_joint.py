@@ -21,6 +21,7 @@ from pictures import (
 )
 
 from hugin_abflow import joint, merge
+from hugin_abflow.errors import SettingsError
 from hugin_abflow.layer import Box, Canvas, Layer
 from hugin_abflow.opencl import Device
 
@@ -139,7 +140,7 @@ few_examples = settings(max_examples=8, deadline=None, derandomize=True)
 def one_device_for_all(device: Device):
     """As `one_device`, for hypothesis, which keeps a fixture for all its examples."""
     patch = pytest.MonkeyPatch()
-    patch.setattr(merge, "Device", lambda wanted: device)
+    patch.setattr(merge, "Device", lambda *wanted: device)
     yield
     patch.undo()
 
@@ -301,6 +302,20 @@ def test_order_does_not_matter_for_layers_below_a_working_pixel():
     ]
     first, second = (merged(order, canvas, working_pixels=10_000) for order in (layers, layers[::-1]))
     np.testing.assert_array_equal(first, second)
+
+
+def test_neither_threads_nor_memory_change_a_pixel(monkeypatch):
+    """A limit that is too low for the working canvas, which must not depend on it, is refused."""
+    canvas = CANVASES["sphere"]
+    layers = moving(canvas)
+    expected = merged(layers, canvas)
+    needed = {}
+    monkeypatch.setattr(joint._log, "info", lambda text, *values: needed.setdefault(text, values))
+    for other in ({"threads": 1}, {"threads": 2, "band_rows": 7}, {"max_memory": 4 << 30}):
+        np.testing.assert_array_equal(merged(layers, canvas, **other), expected)
+    ((reckoned, _),) = (values for text, values in needed.items() if text.startswith("memory"))
+    with pytest.raises(SettingsError, match=f"20.0 MiB is too little.*{reckoned}; give that much"):
+        merged(layers, canvas, max_memory=20 << 20)
 
 
 @pytest.mark.parametrize("upright", [False, True])

@@ -15,7 +15,7 @@ import numpy as np
 import pyopencl as cl
 import pytest
 
-from hugin_abflow import opencl, working
+from hugin_abflow import opencl, spare, working
 from hugin_abflow.errors import DeviceError, ExitCode
 from hugin_abflow.opencl import Device, kernel_source, list_devices
 
@@ -243,3 +243,36 @@ def test_running_over_nothing_does_nothing(device: Device) -> None:
     image = device.empty((0, 7))
     device.run("pyramid", "pyramid_reduce", (7, 0), image, image, (7, 0, 0, 0), image, image, (4, 0))
     device.finish()
+
+
+def test_memory_of_buffers_that_are_gone_is_used_again() -> None:
+    """By one of the same size, and of no other; up to a bound; until it is given back."""
+    device = Device()
+    first = device.upload(np.full((300, 1000), 7, np.float32))
+    memory = first.data
+    del first
+    assert device.empty((300, 999)).data != memory
+    second = device.zeros((1000, 300))
+    assert second.data == memory and not second.get().any()
+    del second
+    device.give_back()
+    for _ in range(1000):
+        device.empty((1 << 20,))
+    assert device.spare._total <= spare.MOST_BYTES
+    many = [device.empty((k,)) for k in range(1, 500)]
+    del many
+    assert len(device.spare._kept) <= spare.MOST_BLOCKS
+
+
+def test_a_processor_uses_as_many_cores_as_it_may() -> None:
+    whole = Device()
+    units = whole.device.max_compute_units
+    if whole.device.type & cl.device_type.CPU and units > 1:
+        assert Device(threads=1).device.max_compute_units == 1
+    assert Device(threads=units).device.max_compute_units == units
+
+
+def test_only_memory_of_its_own_counts_for_the_device() -> None:
+    device = Device()
+    kept = device.zeros((1 << 20,))
+    assert device.own_memory == (0 if device.device.host_unified_memory else kept.nbytes)

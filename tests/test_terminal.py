@@ -54,7 +54,8 @@ def test_verbose_shows_info_and_phases(replace: Replace, capsys: pytest.CaptureF
         "hugin-abflow: warning: layers are older than the project",
         *("Flow ...", "Flow: 0.0 s", "Blend ...", "Blend: 0.0 s"),
         "phase     seconds  share",
-        *lines[-4:],
+        *lines[-5:-1],
+        "peak memory: 0.0 MiB",
     ]
     assert output.out == "a.tif\n"
 
@@ -70,7 +71,7 @@ def test_verbose_ends_with_a_table_of_phases(replace: Replace, capsys: pytest.Ca
 
     replace(slow)
     assert cli.main(["-v", "a.pto"]) == 0
-    table = capsys.readouterr().err.split("phase     seconds  share\n")[1].splitlines()
+    table = capsys.readouterr().err.split("phase     seconds  share\n")[1].splitlines()[:-1]
     rows = [re.fullmatch(r"(\w+) +(\d+\.\d\d) +(\d+)%", line) for line in table]
     assert all(rows)
     names, seconds, shares = zip(*(row.groups() for row in rows if row), strict=True)

@@ -14,18 +14,9 @@ from typing import Any, TextIO
 from hugin_abflow.batch.record import Record
 from hugin_abflow.batch.task import Task
 from hugin_abflow.errors import OutputError
+from hugin_abflow.memory import size
 from hugin_abflow.progress import Advance
 from hugin_abflow.terminal import display_progress, label, on_terminal, say
-
-SIZES = ((1 << 30, "GiB"), (1 << 20, "MiB"), (1 << 10, "KiB"))
-
-
-def size(number: int) -> str:
-    """A number of bytes for people."""
-    for unit, name in SIZES:
-        if number >= unit:
-            return f"{number / unit:.1f} {name}"
-    return f"{number} bytes"
 
 
 def duration(seconds: float) -> str:
@@ -52,7 +43,8 @@ def phase_table(record: Record) -> list[str]:
     whole = max(record.seconds, 1e-9)
     rows = {**record.phases, "other": whole - sum(record.phases.values()), "total": whole}
     shares = [f"{phase:<9}{seconds:8.2f}{seconds / whole:6.0%}" for phase, seconds in rows.items()]
-    return ["phase     seconds  share", *shares]
+    peak = [] if record.memory is None else [f"peak memory: {size(record.memory)}"]
+    return ["phase     seconds  share", *shares, *peak]
 
 
 @contextmanager

@@ -42,11 +42,11 @@ class Watcher(Protocol):
 class _Worker:
     """A process with what it does at the moment."""
 
-    def __init__(self, level: int) -> None:
+    def __init__(self, level: int, sharers: int) -> None:
         context = multiprocessing.get_context("spawn")
         self.pipe, other = context.Pipe()
         self.process: SpawnProcess = context.Process(
-            target=work, args=(other, level, trace.is_recording()), daemon=True
+            target=work, args=(other, level, trace.is_recording(), sharers), daemon=True
         )
         with _deaf():
             self.process.start()
@@ -168,7 +168,7 @@ class Pool:
             if worker.task is None:
                 return worker
         if len(self._workers) < self._jobs:
-            self._workers.append(_Worker(self._level))
+            self._workers.append(_Worker(self._level, self._jobs))
             return self._workers[-1]
         return None
 

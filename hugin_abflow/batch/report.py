@@ -7,9 +7,10 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from hugin_abflow.batch.display import duration, size
+from hugin_abflow.batch.display import duration
 from hugin_abflow.batch.record import Record, write_json
 from hugin_abflow.errors import OutputError
+from hugin_abflow.memory import size
 from hugin_abflow.metadata import PROGRAM, version
 
 SCHEMA = 1

@@ -14,8 +14,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any, Protocol
 
-from hugin_abflow import nona, trace
-from hugin_abflow.batch import memory
+from hugin_abflow import memory, nona, trace
 from hugin_abflow.batch.record import Record
 from hugin_abflow.batch.state import State
 from hugin_abflow.errors import AbflowError, DeviceError
@@ -111,8 +110,8 @@ def _stitch(task: Task, record: Record, listener: Listener) -> None:
     """Fill in the record while the panorama is made."""
     record.versions = _versions()
 
-    def open_device(wanted: str | None) -> Device:
-        device = _device(wanted, trace.is_recording())
+    def open_device(wanted: str | None, threads: int) -> Device:
+        device = _device(wanted, threads, trace.is_recording())
         record.device = device.name
         return device
 
@@ -152,9 +151,9 @@ def _sizes(files: list[Path]) -> list[dict[str, Any]]:
 
 
 @cache
-def _device(wanted: str | None, timed: bool) -> Device:
+def _device(wanted: str | None, threads: int, timed: bool) -> Device:
     """The device, with its kernels, for all projects of this process; `timed`: one that tells its times."""
-    return Device(wanted)
+    return Device(wanted, threads)
 
 
 @cache

@@ -15,7 +15,7 @@ from contextlib import nullcontext
 from multiprocessing.connection import Connection
 from typing import Any
 
-from hugin_abflow import trace
+from hugin_abflow import memory, trace
 from hugin_abflow.batch.task import Task, perform
 from hugin_abflow.terminal import interruptible
 
@@ -46,11 +46,14 @@ class _Sender:
         self.send("message", level, text)
 
 
-def work(pipe: Connection, level: int, traced: bool) -> None:
+def work(pipe: Connection, level: int, traced: bool, sharers: int) -> None:
     """Perform the tasks that come through `pipe`, until None comes or the other end is closed.
 
     level       of the messages that are sent. traced: send what is done and when as well.
+    sharers     processes that share the memory that may be taken.
     """
+    memory.manage()
+    memory.share(sharers)
     orders: queue.SimpleQueue[Task | None] = queue.SimpleQueue()
     sender = _Sender(pipe)
     try:
