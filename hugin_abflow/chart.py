@@ -8,7 +8,7 @@ equator: there is no pole in it and hardly any stretch. On a plane it is the can
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -28,12 +28,15 @@ _FLOOR = 0.05
 
 @dataclass(frozen=True)
 class Chart:
-    """transform: the 16 numbers of common.cl; width, height px; wraps: columns are periodic."""
+    """transform: the 16 numbers of common.cl; width, height px; wraps: columns are periodic; coarse: pixels
+    of the working grid per pixel, 1 or 2.
+    """
 
     transform: npt.NDArray[np.float32]
     width: int
     height: int
     wraps: bool
+    coarse: int = 1
 
     def around(self, grid: Grid) -> float:
         """The width of the canvas of `grid` in px of the chart."""
@@ -62,22 +65,24 @@ def _gap(columns: npt.NDArray[np.bool_]) -> tuple[int, int]:
 
 
 def _plane(overlap: npt.NDArray[np.bool_], grid: Grid) -> Chart:
+    """overlap: as fine as the chart, over the region of `grid`."""
+    height, width = overlap.shape
     rows = np.flatnonzero(overlap.any(1))
-    top, bottom = max(0, rows[0] - _MARGIN), min(grid.height, rows[-1] + 1 + _MARGIN)
+    top, bottom = max(0, rows[0] - _MARGIN), min(height, rows[-1] + 1 + _MARGIN)
     transform = np.zeros(16, np.float32)
-    transform[9:11] = 1
+    transform[9:11] = width / grid.width, height / grid.height
     columns = np.logical_or.reduce(overlap, 0)
     if not grid.wraps:
         used = np.flatnonzero(columns)
-        left, right = max(0, used[0] - _MARGIN), min(grid.width, used[-1] + 1 + _MARGIN)
+        left, right = max(0, used[0] - _MARGIN), min(width, used[-1] + 1 + _MARGIN)
         transform[11:13] = -left, -top
         return Chart(transform, int(right - left), int(bottom - top), False)
     transform[14] = grid.width
     first, gap = _gap(columns)
     if gap > 2 * _MARGIN:
         transform[11:13] = _MARGIN - first, -top
-        return Chart(transform, grid.width - gap + 2 * _MARGIN, int(bottom - top), False)
-    width = max(1, round(grid.width / _WRAP_MULTIPLE)) * _WRAP_MULTIPLE
+        return Chart(transform, width - gap + 2 * _MARGIN, int(bottom - top), False)
+    width = max(1, round(width / _WRAP_MULTIPLE)) * _WRAP_MULTIPLE
     transform[9], transform[12] = width / grid.width, -top
     return Chart(transform, width, int(bottom - top), True)
 
@@ -136,16 +141,19 @@ def _sphere(overlap: npt.NDArray[np.bool_], mask_grid: Grid, scale: float) -> Ch
     return Chart(transform, width, math.ceil((north - south) * scale), wraps)
 
 
-def pair_chart(overlap: npt.NDArray[np.bool_], mask_grid: Grid, grid: Grid) -> Chart:
+def pair_chart(overlap: npt.NDArray[np.bool_], mask_grid: Grid, grid: Grid, coarse: int = 1) -> Chart:
     """The chart for an overlap given as a mask on `mask_grid` (a grid over the same region as `grid`).
 
-    It is as fine as the working grid; the mask is not empty.
+    It is as fine as the working grid, or half as fine if `coarse` is 2; the mask is not empty.
     """
     if grid.lens[1]:
-        return _sphere(overlap, mask_grid, 1 / grid.lens[1])
-    rows = np.arange(grid.height) * mask_grid.height // grid.height
-    columns = np.arange(grid.width) * mask_grid.width // grid.width
-    return _plane(overlap[rows][:, columns], grid)
+        found = _sphere(overlap, mask_grid, 1 / (coarse * grid.lens[1]))
+    else:
+        height, width = (max(1, round(n / coarse)) for n in grid.shape)
+        rows = np.arange(height) * mask_grid.height // height
+        columns = np.arange(width) * mask_grid.width // width
+        found = _plane(overlap[rows][:, columns], grid)
+    return replace(found, coarse=coarse)
 
 
 def sample(device: Device, layer: WorkingLayer, grid: Grid, chart: Chart) -> Level:
@@ -154,6 +162,6 @@ def sample(device: Device, layer: WorkingLayer, grid: Grid, chart: Chart) -> Lev
     level = Level(device.empty(size[::-1]), device.empty(size[::-1]), chart.wraps)
     device.run(
         "chart", "chart_sample", size, layer.pixels, layer.box, grid.border, grid.lens, chart.transform, size,
-        _FLOOR, level.image, level.mask,
+        chart.coarse, _FLOOR, level.image, level.mask,
     )  # fmt: skip
     return level

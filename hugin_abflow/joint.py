@@ -34,7 +34,6 @@ from hugin_abflow.blend import BlendLayer
 from hugin_abflow.coefficient import Masks
 from hugin_abflow.colour import Correction
 from hugin_abflow.errors import SettingsError
-from hugin_abflow.flow import FlowParameters
 from hugin_abflow.geometry import Pair, PairFlow
 from hugin_abflow.guides import Guide, by_pair
 from hugin_abflow.layer import Canvas, Layer
@@ -135,14 +134,11 @@ def prepare(
     masks = masks.only(used)
     order = {id(layer): index for index, layer in enumerate(layers)}
     numbers = [order[id(one.layer)] for one in reduced]
-    parameters = quality.flow_parameters(settings.flow_quality)
-    its_guides = by_pair(guides if settings.guides else ())
-    largest = _REACH * (grid.canvas_width or grid.region.width) * grid.width / grid.region.width
-    reach = largest if settings.large_motion else 0.0
     overlaps = _overlaps(device, reduced, masks)
     _check_memory(device, reduced, overlaps, masks, grid, settings)
+    its_guides = by_pair(guides if settings.guides else ())
     flows = (
-        _flows(device, reduced, masks, grid, overlaps, progress, parameters, reach, its_guides, numbers)
+        _flows(device, reduced, masks, grid, overlaps, progress, settings, its_guides, numbers)
         if settings.flow
         else []
     )
@@ -284,6 +280,7 @@ def _check_memory(
     pixels = sum(layer.box[2] * layer.box[3] for layer in layers)
     ratio = grid.width * grid.height / (masks.grid.width * masks.grid.height)
     shared = ratio * sum(int(np.count_nonzero(overlap)) for _, overlap in overlaps) if settings.flow else 0
+    shared /= quality.coarseness(settings.flow_quality, grid.width * grid.height) ** 2
     needed = memory.resident() + device.own_memory + _STEP_BYTES * pixels + int(_FLOW_BYTES * shared)
     limit = memory.limit(settings.max_memory)
     _log.info("memory: about %s of %s at working resolution", memory.size(needed), memory.size(limit))
@@ -307,8 +304,7 @@ def _flows(
     grid: Grid,
     overlaps: Sequence[tuple[Pair, npt.NDArray[np.bool_]]],
     progress: Progress,
-    parameters: FlowParameters,
-    reach: float,
+    settings: Settings,
     guides: Mapping[tuple[int, int], Sequence[Guide]],
     numbers: Sequence[int],
 ) -> list[PairFlow]:
@@ -317,11 +313,15 @@ def _flows(
     overlaps    the pairs, and where they overlap on the grid of `masks`.
     guides      of each two layers, by their numbers; numbers: what guides call each of `layers`.
     """
+    parameters = quality.flow_parameters(settings.flow_quality)
+    coarse = quality.coarseness(settings.flow_quality, grid.width * grid.height)
+    largest = _REACH * (grid.canvas_width or grid.region.width) * grid.width / grid.region.width
+    reach = largest / coarse if settings.large_motion else 0.0
     result = []
     with progress("flow", len(overlaps)) as advance:
         for pair, overlap in overlaps:
             its_layers = (layers[pair.a], layers[pair.b])
-            its_chart = chart.pair_chart(overlap, masks.grid, grid)
+            its_chart = chart.pair_chart(overlap, masks.grid, grid, coarse)
             image_a, image_b = (chart.sample(device, layer, grid, its_chart) for layer in its_layers)
             found = flow.pair_flow(device, image_a, image_b, parameters, reach=reach)
             first, second = numbers[pair.a], numbers[pair.b]

@@ -12,11 +12,19 @@ static inline float4 chart_row(__global const float4 *row, float4 weights, float
     return weights.x * row[0] + weights.y * row[1] + weights.z * row[2] + weights.w * row[3];
 }
 
-/* Log brightness of a layer on a chart: bicubic where all taps are valid, bilinear at the rim of the mask. */
+/* Weights of four taps around fraction t: to read between pixels, or for every second one. The latter are a tent
+   two pixels wide to each side, so that texture finer than the chart is averaged, not taken for something else. */
+static inline float4 chart_weights(float t, int coarse) {
+    return coarse == 1 ? catmull_rom(t) : 0.25f * (float4)(1.0f - t, 2.0f - t, 1.0f + t, t);
+}
+
+/* Log brightness of a layer on a chart, by these weights where all taps are valid, bilinear at the rim of the
+   mask. */
 __kernel void chart_sample(__global const float4 *layer, /* (box.w, box.z) r, g, b, valid */
                            int4 box,                     /* place of `layer` on the canvas grid */
                            int4 border, float4 lens,     /* canvas grid */
                            float16 chart, int2 size,     /* run size */
+                           int coarse,                   /* pixels of the canvas grid per pixel, 1 or 2 */
                            float floor_value,            /* added before the logarithm: dark noise */
                            __global float *image,        /* (size.y, size.x) */
                            __global float *mask)         /* (size.y, size.x), 0 or 1 */
@@ -31,7 +39,7 @@ __kernel void chart_sample(__global const float4 *layer, /* (box.w, box.z) r, g,
     if (t.x > 0.9995f) { corner.x += 1; t.x = 0.0f; }
     if (t.y > 0.9995f) { corner.y += 1; t.y = 0.0f; }
     t = t < 0.0005f ? (float2)(0.0f) : t;
-    const float4 wx = catmull_rom(t.x), wy = catmull_rom(t.y);
+    const float4 wx = chart_weights(t.x, coarse), wy = chart_weights(t.y, coarse);
     const int2 first = corner - 1 - box.xy;
     if (first.x >= 0 && first.y >= 0 && first.x + 3 < box.z && first.y + 3 < box.w) {
         /* nearly all samples: every tap is stored, no border rule is needed */

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from grids import GRIDS, on_device, patches, plane, random_layer, sphere, window
 from reference import common
-from reference.chart import chart_sample
+from reference.chart import chart_sample, tent
 from scipy import ndimage
 from scipy.spatial.transform import Rotation
 from tolerances import DECISIONS, POSITION, TRIGONOMETRY, assert_close
@@ -57,10 +57,11 @@ OVERLAPS = {
 }  # fmt: skip
 
 
-@pytest.fixture(params=list(OVERLAPS))
+@pytest.fixture(params=[(name, coarse) for name in OVERLAPS for coarse in (1, 2)], ids=str)
 def overlap(request: pytest.FixtureRequest) -> tuple[Grid, np.ndarray, Chart]:
-    grid, mask = OVERLAPS[request.param]
-    return grid, mask, pair_chart(mask, grid, grid)
+    name, coarse = request.param
+    grid, mask = OVERLAPS[name]
+    return grid, mask, pair_chart(mask, grid, grid, coarse)
 
 
 def test_twins_of_the_transforms_are_scipys_rotation() -> None:
@@ -108,17 +109,18 @@ def test_a_chart_holds_its_overlap_with_a_margin(overlap: tuple[Grid, np.ndarray
 
 
 @pytest.mark.parametrize("name", ["sphere", "sphere border", "sphere pole", "sphere south", "odd sphere"])
-def test_a_chart_has_hardly_any_stretch(name: str) -> None:
-    """On a round overlap anywhere, over a pole too, a chart pixel is about one working pixel."""
+@pytest.mark.parametrize("coarse", [1, 2])
+def test_a_chart_has_hardly_any_stretch(name: str, coarse: int) -> None:
+    """On a round overlap anywhere, over a pole too, a chart pixel is about one working pixel, or two."""
     grid, mask = OVERLAPS[name]
-    found = pair_chart(mask, grid, grid)
+    found = pair_chart(mask, grid, grid, coarse)
     columns, rows = common.pixels(grid.width, grid.height)
     point = common.canvas_point(columns[mask] + 0.5, rows[mask] + 0.5, grid.lens)
     _, v = common.chart_position(point, found.transform)
     stretch = 1 / np.cos((found.transform[12] - v) / found.transform[10])
     assert stretch.max() < 1.5
     # chart px per working px along the chart's meridians
-    assert found.transform[10] * grid.lens[1] == pytest.approx(1)
+    assert found.transform[10] * grid.lens[1] == pytest.approx(1 / coarse)
 
 
 @pytest.mark.parametrize("name", ["sphere ring", "everything", "cylinder ring"])
@@ -197,6 +199,16 @@ def test_catmull_rom_is_exact_on_parabolas_and_on_pixels() -> None:
     assert np.array_equal(common.catmull_rom(np.array([0.0]))[:, 0], [0, 1, 0, 0])
 
 
+def test_tent_averages_what_is_finer_than_every_second_pixel() -> None:
+    """It keeps what is even or sloping, and nothing of what changes from pixel to pixel."""
+    t = np.linspace(0, 1, 17)
+    taps = tent(t)
+    assert np.allclose(taps.sum(0), 1)
+    assert np.allclose(np.arange(-1, 3) @ taps, t)
+    assert np.allclose([1, -1, 1, -1] @ taps, 0)
+    assert np.array_equal(tent(np.array([0.0]))[:, 0], [0.25, 0.5, 0.25, 0])
+
+
 def test_sample_equals_its_twin(device: Device, overlap: tuple[Grid, np.ndarray, Chart]) -> None:
     """On ragged layers; the mask's decisions may fall either way where a tap's weight is all but 0."""
     grid, _, found = overlap
@@ -204,8 +216,9 @@ def test_sample_equals_its_twin(device: Device, overlap: tuple[Grid, np.ndarray,
     level = chart.sample(device, on_device(device, pixels), grid, found)
     size = (found.width, found.height)
     image, mask = chart_sample(
-        pixels, (0, 0, grid.width, grid.height), grid.border, grid.lens, found.transform, size, FLOOR
-    )
+        pixels, (0, 0, grid.width, grid.height), grid.border, grid.lens, found.transform, size, FLOOR,
+        found.coarse,
+    )  # fmt: skip
     assert level.grid == (*size, int(found.wraps), 0)
     assert 0.2 < mask.mean() < 1
     kernel = level.mask.get()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from contextlib import contextmanager
 from typing import get_args
 
@@ -42,6 +43,13 @@ def test_quality_chooses_the_working_canvas() -> None:
     assert fast < normal / 3 and 2 * normal < best <= 3.02 * normal
 
 
+def test_flow_is_solved_on_every_second_pixel_where_many_are_left() -> None:
+    """Never on few pixels, and for "best" on all."""
+    assert quality.coarseness("normal", 2_100_000) == quality.coarseness("fast", 500_000) == 2
+    assert quality.coarseness("normal", 1_500_000) == quality.coarseness("fast", 300_000) == 1
+    assert quality.coarseness("best", 6_300_000) == 1
+
+
 @pytest.mark.parametrize("name", QUALITIES)
 def test_working_pixels_outrank_the_quality(name: FlowQuality) -> None:
     assert Settings(flow_quality=name, working_pixels=5000).working_limit == 5000
@@ -67,12 +75,12 @@ def test_fast_is_less_than_half_the_work(device: Device, monkeypatch: pytest.Mon
     run, repeat = device.run, device.repeat
 
     def counting_run(module, name, size, *arguments, **options):
-        done[now] += size[0] * size[1] * (module == "flow")
+        done[now] += math.prod(size) * (module == "flow")
         run(module, name, size, *arguments, **options)
 
-    def counting_repeat(module, name, size, calls, times):
-        done[now] += size[0] * size[1] * len(calls) * times
-        repeat(module, name, size, calls, times)
+    def counting_repeat(module, name, size, calls, times, *rest):
+        done[now] += math.prod(size) * len(calls) * times
+        repeat(module, name, size, calls, times, *rest)
 
     monkeypatch.setattr(device, "run", counting_run)
     monkeypatch.setattr(device, "repeat", counting_repeat)
@@ -80,9 +88,12 @@ def test_fast_is_less_than_half_the_work(device: Device, monkeypatch: pytest.Mon
     for now in QUALITIES:
         joint.prepare(device, pair(canvas), canvas, Settings(flow_quality=now), silent)
     assert 0 < done["fast"] < done["normal"] <= done["best"]
-    limits = {name: Settings(flow_quality=name).working_limit for name in QUALITIES}
-    assert done["fast"] * limits["fast"] < 0.5 * done["normal"] * limits["normal"]
-    assert done["best"] * limits["best"] <= 3 * done["normal"] * limits["normal"]
+    work = {}
+    for name in QUALITIES:
+        pixels = Settings(flow_quality=name).working_limit
+        work[name] = done[name] * pixels / quality.coarseness(name, pixels) ** 2
+    assert work["fast"] < 0.5 * work["normal"]
+    assert work["best"] <= 12 * work["normal"]
 
 
 def test_time_of_the_flow_is_told_as_the_flows(device: Device, monkeypatch: pytest.MonkeyPatch) -> None:

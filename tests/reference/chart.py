@@ -21,6 +21,12 @@ from reference.common import (
 SNAP = 0.0005
 
 
+def tent(t: Array) -> Array:
+    """Weights (4, ...) of taps -1, 0, 1, 2 around fraction t, which fall to 0 two pixels away."""
+    distance = np.abs(np.asarray(t) - np.arange(-1, 3).reshape(4, *[1] * np.ndim(t)))
+    return np.maximum(2 - distance, 0) / 4
+
+
 def chart_sample(
     layer: Array,
     box: Sequence[int],
@@ -29,6 +35,7 @@ def chart_sample(
     chart: Numbers,
     size: Sequence[int],
     floor_value: float,
+    coarse: int = 1,
 ) -> tuple[Array, Array]:
     """Log brightness and mask (height, width) of a layer on a chart."""
     columns, rows = pixels(size[0], size[1])
@@ -39,7 +46,7 @@ def chart_sample(
         position = np.where(np.abs(position - nearest) < SNAP, nearest, position)
         whole.append(np.floor(position).astype(int))
         fraction.append(position - np.floor(position))
-    cubic = [catmull_rom(t) for t in fraction]
+    cubic = [catmull_rom(t) if coarse == 1 else tent(t) for t in fraction]
     linear = [np.stack([0 * t, 1 - t, t, 0 * t]) for t in fraction]
     sums = {"cubic": 0.0, "linear": 0.0}
     complete = {name: np.ones(x.shape, bool) for name in sums}
