@@ -11,12 +11,12 @@ import pytest
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
-from benchmarks import ablation, rigs
+from benchmarks import ablation, phases, rigs, scaling
 from benchmarks.quality import paste
 from benchmarks.rigs import read_canvas, write_layer
 from benchmarks.scoring import Chart, Score, View, score
 from benchmarks.speed import Run, measure, table
-from hugin_abflow import Settings
+from hugin_abflow import Layer, Settings, read_layer, write_image
 from sample_projects import lens
 
 HEIGHT, WIDTH, PARALLAX = 150, 331, 18
@@ -234,3 +234,57 @@ def test_table_has_medians_and_ratios() -> None:
 def test_each_part_differs_from_the_default_by_valid_settings(part: str) -> None:
     changed = Settings(**ablation.PARTS[part])
     assert (changed == Settings()) == (part == "default")
+
+
+# Growth, and where the time goes
+
+
+@pytest.mark.parametrize("factor", [0.5, 2, 4])
+def test_layers_of_other_sizes_show_the_same(tmp_path: Path, factor: float) -> None:
+    """In strips as at once; a halved layer begins at even rows and columns of the canvas."""
+    height, width = 150, 121
+    y, x = np.mgrid[:height, :width]
+    picture = np.stack([x, y, 100 + np.sin(x / 9) * 50, np.full((height, width), 255)], -1).astype(np.uint8)
+    picture[:, 100:, 3] = 0
+    layer = Layer.from_array("layer", picture, 7, 13)
+    write_image(tmp_path / "base.tif", picture, offset=(7, 13))
+    scaling.resize_layer(tmp_path / "base.tif", tmp_path / "other.tif", factor)
+    made = read_layer(tmp_path / "other.tif")
+    unit = 2 if factor < 1 else 1
+    left, top = layer.box.left + 7 % unit, layer.box.top + 13 % unit
+    assert (made.box.left, made.box.top) == (left * factor, top * factor)
+    pixels = made.read(0, made.box.height)
+    even = picture[top - 13 :, left - 7 :]
+    even = even[: len(even) // unit * unit, : even.shape[1] // unit * unit]
+    assert np.array_equal(pixels, scaling.resized(even, factor))
+    assert set(np.unique(pixels[..., 3])) == {0, 255}
+
+
+def test_the_plot_of_growth_is_an_svg_and_always_the_same(tmp_path: Path) -> None:
+    pytest.importorskip("matplotlib", reason="only the benchmark needs it")
+    runs = {4500: Run(10, 12, 500), 9000: Run(20, 30, 600)}
+    for name in ("a.svg", "b.svg"):
+        scaling.plot(runs, tmp_path / name)
+    text = (tmp_path / "a.svg").read_text("utf-8")
+    assert text == (tmp_path / "b.svg").read_text("utf-8")
+    assert "<svg" in text
+    assert "| 9000x4500 | 40 | 20.0 | 30.0 | 0.741 | 600 |" in scaling.table(runs)
+
+
+def test_phases_are_told_apart() -> None:
+    """What begins in a phase counts for it, of its process alone."""
+    rows = [
+        ("flow", "phase", 0, 1000, 1), ("flow", "phase", 0, 500, 2), ("blend", "phase", 1000, 3000, 1),
+        ("flow_relax", "kernel", 100, 200, 1), ("flow_relax", "kernel", 50, 100, 2),
+        ("blend_band", "kernel", 1500, 700, 1), ("upload", "transfer", 1100, 50, 1),
+        ("decode", "file", 1000, 900, 1), ("decode", "file", 1200, 900, 1), ("encode", "file", 5000, 9, 1),
+    ]  # fmt: skip
+    spans = [
+        {"name": name, "cat": kind, "ts": start * 1e3, "dur": length * 1e3, "pid": process}
+        for name, kind, start, length, process in rows
+    ]
+    text = phases.table(spans)
+    assert "| flow | 1.500 | 0.300 | 0.000 | 0.000 |" in text
+    assert "| blend | 3.000 | 0.700 | 0.050 | 1.800 |" in text
+    assert "on the device: 1.050 s" in text
+    assert "| flow_relax | 0.300 | 2 |" in text
