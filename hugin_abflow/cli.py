@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any, get_args
@@ -10,16 +10,18 @@ from typing import Any, get_args
 import click
 
 from hugin_abflow import memory
-from hugin_abflow.batch.config import NAME, find_config, read_config, write_config
+from hugin_abflow.batch.config import NAME, find_config
 from hugin_abflow.batch.queue import find_projects
 from hugin_abflow.batch.run import Run, default_jobs, run
 from hugin_abflow.batch.task import Task
-from hugin_abflow.errors import AbflowError, ConfigError, ExitCode
+from hugin_abflow.batch.watch import watch
+from hugin_abflow.choices import OF_THE_RUN, choose, config_text
+from hugin_abflow.errors import AbflowError, ExitCode
 from hugin_abflow.images import COMPRESSIONS
 from hugin_abflow.metadata import PROGRAM, version
 from hugin_abflow.nona import Remap
 from hugin_abflow.opencl import list_devices
-from hugin_abflow.options import ARGUMENTS, Command, Option, Size, kind_of, long_names
+from hugin_abflow.options import ARGUMENTS, Command, Option, Size
 from hugin_abflow.settings import FlowQuality, MergeMode, Settings
 from hugin_abflow.terminal import complain, interruptible, say
 
@@ -48,12 +50,6 @@ EXAMPLES = (
 )
 
 _DEFAULTS = Settings()
-# Options that a file of settings cannot give.
-_UNSETTLED = frozenset({"config", "print-config"})
-# Parameters that say something about the run as a whole, not about a project.
-_OF_THE_RUN = frozenset(
-    {"recursive", "resume", "force", "jobs", "report", "log", "quiet", "verbose", "profile", "print_config"}
-)
 
 
 def _print_devices(context: click.Context, parameter: click.Parameter, wanted: bool) -> None:
@@ -202,6 +198,12 @@ _information = partial(click.option, cls=Option, group="Information")
 )
 @_batch("--recursive", is_flag=True, help="Look for projects in the folders of folders, too.")
 @_batch(
+    "--watch",
+    metavar="FOLDER",
+    type=click.Path(path_type=Path, exists=True, file_okay=False),
+    help="Stitch the projects of FOLDER as they are saved, until interrupted.",
+)
+@_batch(
     "--resume",
     is_flag=True,
     help="Skip panoramas that still hold: same project, photos, settings and version as when they were made. "
@@ -273,66 +275,62 @@ def command(projects: tuple[Path, ...], **given: Any) -> ExitCode:
     The names of the panoramas are printed, a line each.
     """
     config: Path | None = given["config"]
-    if not projects and not given["print_config"]:
+    places = [*projects, given["watch"]] if given["watch"] else list(projects)
+    if not places and not given["print_config"]:
         raise click.UsageError("Missing argument 'PROJECT...'.")
+    if projects and given["watch"]:
+        raise click.UsageError("--watch names the folder; leave out PROJECT")
     # what concerns the run as a whole is said beside what is named first
-    place = projects[0] if projects else Path()
-    first = config or find_config(place / "any" if place.is_dir() else place, projects)
+    place = places[0] if places else Path()
+    first = config or find_config(place / "any" if place.is_dir() else place, places)
     recursive, resume, force, how = _run_options(**_chosen(first))
+
+    def options(project: Path) -> tuple[Path | None, dict[str, Any]]:
+        file = config or find_config(project, places)
+        return file, _chosen(file, alone=file == first)
+
+    if given["watch"]:
+        return run(_saved(watch(given["watch"], recursive), options, force), how)
     found = find_projects(projects, recursive)
-    files = {project: config or find_config(project, projects) for project in found}
-    chosen = {
-        file: _chosen(file, alone=file == first) for file in {first: None, **dict.fromkeys(files.values())}
-    }
+    chosen = {project: options(project) for project in found}
     if given["print_config"]:
-        return _print_configs(chosen, files)
-    options = {file: _options(**values) for file, values in chosen.items()}
-    lone = {name for name in ("output", "layers") for file in files.values() if options[file][name]}
+        return _print_configs(chosen or {Path(): (first, _chosen(first))})
+    tasks = {project: _options(**values) for project, (_, values) in chosen.items()}
+    lone = {name for name in ("output", "layers") for project in found if tasks[project][name]}
     if len(found) > 1 and lone:
         option = "-o" if "output" in lone else "--layers"
         raise click.UsageError(f"{option} is for one project, but there are {len(found)}")
     remember = resume or force or len(found) > 1 or any(place.is_dir() for place in projects)
-    return run([Task(p, options[files[p]], remember and not force, remember) for p in found], how)
+    return run(
+        [Task(project, options, remember and not force, remember) for project, options in tasks.items()],
+        how,
+        lone=len(found) == 1,
+    )
 
 
 def _chosen(file: Path | None, alone: bool = True) -> dict[str, Any]:
-    """All options, by their parameters: of the command line, else of a file of settings, else the default.
-
-    alone       the file may say something about the run as a whole.
-    """
-    if file is None:
-        return dict(click.get_current_context().params)
-    names = long_names(command)
-    kinds = {name: kind_of(option) for name, option in names.items() if name not in _UNSETTLED}
-    values = read_config(
-        file, kinds, [n for n, option in names.items() if isinstance(option.type, click.Path)]
-    )
-    whole = sorted(name for name in values if names[name].name in _OF_THE_RUN)
-    if whole and not alone:
-        raise ConfigError(
-            f"{file}: {whole[0]} is for the whole run; give it on the command line, or in {NAME} beside "
-            "what is named first"
-        )
-    defaults = {str(names[name].name): value for name, value in values.items()}
-    try:
-        with command.make_context(PROGRAM, _arguments(), default_map=defaults) as context:
-            return dict(context.params)
-    except click.UsageError as error:
-        raise ConfigError(f"{file}: {error.format_message()}") from None
+    """What is chosen by the command line and a file of settings, see `choices.choose`."""
+    return choose(command, click.get_current_context().meta[ARGUMENTS], file, alone)
 
 
-def _print_configs(
-    chosen: Mapping[Path | None, dict[str, Any]], files: Mapping[Path, Path | None]
-) -> ExitCode:
-    """Answer --print-config: all options as a file of settings, for each such file that was found."""
-    names = {name: option for name, option in long_names(command).items() if name not in _UNSETTLED}
-    for file, values in chosen.items():
-        projects = [str(project) for project, its_file in files.items() if its_file == file]
-        if files and not projects:
-            continue
-        click.echo(f"# {file or 'no ' + NAME}" + "".join(f"\n# for {project}" for project in projects))
-        plain = {name: values[str(option.name)] for name, option in names.items()}
-        click.echo(write_config(plain))
+def _saved(
+    projects: Iterable[Path | None],
+    options: Callable[[Path], tuple[Path | None, dict[str, Any]]],
+    force: bool,
+) -> Iterator[Task | None]:
+    """Tasks for projects as they are saved; settings that are wrong at the time are told, and no more."""
+    for project in projects:
+        try:
+            yield Task(project, _options(**options(project)[1]), not force, True) if project else None
+        except (AbflowError, click.UsageError) as error:
+            complain(f"{project}: {error.format_message() if isinstance(error, click.UsageError) else error}")
+
+
+def _print_configs(chosen: Mapping[Path, tuple[Path | None, dict[str, Any]]]) -> ExitCode:
+    """Answer --print-config, once for each file of settings."""
+    for file in dict.fromkeys(file for file, _ in chosen.values()):
+        projects = [project for project, (its_file, _) in chosen.items() if its_file == file]
+        click.echo(config_text(command, file, chosen[projects[0]][1], [p for p in projects if p.name]))
     return ExitCode.OK
 
 
@@ -354,7 +352,8 @@ def _run_options(
         raise click.UsageError("-q and -v contradict each other")
     if resume and force:
         raise click.UsageError("--resume and --force contradict each other")
-    return recursive, resume, force, Run(jobs, report, log, quiet, verbose, _arguments(), profile)
+    arguments = click.get_current_context().meta[ARGUMENTS]
+    return recursive, resume, force, Run(jobs, report, log, quiet, verbose, arguments, profile)
 
 
 def _options(
@@ -398,13 +397,8 @@ def _options(
         "prefix": prefix,
         "layers": list(layers) or None,
         "metadata": not no_metadata,
-        **{name: value for name, value in others.items() if name not in _OF_THE_RUN | {"projects", "config"}},
+        **{name: value for name, value in others.items() if name not in OF_THE_RUN},
     }
-
-
-def _arguments() -> list[str]:
-    """What the command was called with, as click got it."""
-    return list(click.get_current_context().meta.get(ARGUMENTS, ()))
 
 
 def _run(arguments: Sequence[str] | None) -> int:

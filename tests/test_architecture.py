@@ -16,7 +16,7 @@ KERNELS = {path.name for path in (ROOT / "kernels").glob("*.cl")}
 
 # The modules that may know a library; no other imports it.
 USERS = {
-    "click": {"cli", "options", "terminal"},
+    "click": {"choices", "cli", "options", "terminal"},
     "rich": {"batch", "terminal"},
     "OpenImageIO": {"images", "imagewriter"},
     "pyopencl": {"opencl"},

@@ -178,7 +178,7 @@ def test_lost_device_costs_an_attempt(tmp_path: Path, monkeypatch: pytest.Monkey
         "a": ("made", 2),
         "b": ("made", 1),
     }
-    assert watch.begun == ["a", "b", "a"]
+    assert watch.begun == ["a", "a", "b"]
     assert temporary(tmp_path) == []
 
 

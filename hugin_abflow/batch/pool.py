@@ -133,14 +133,28 @@ class Pool:
                 worker.process.kill()
                 worker.process.join()
 
-    def run(self, tasks: Iterable[Task]) -> Iterator[Record]:
-        """The records of the tasks, in the order in which they are done."""
-        waiting = deque((task, 1) for task in tasks)
-        while waiting or self._busy():
-            while waiting and (worker := self._free()):
-                begun, attempt = waiting.popleft()
-                worker.begin(begun, attempt, self._watcher.began(begun))
-            for pipe in wait([worker.pipe for worker in self._busy()]):
+    def run(self, tasks: Iterable[Task | None]) -> Iterator[Record]:
+        """The records of the tasks, in the order in which they are done.
+
+        A task is asked for when a process is free; None means that there is none at the moment.
+        """
+        source = iter(tasks)
+        again: deque[tuple[Task, int]] = deque()
+        coming = True
+        while coming or again or self._busy():
+            idle = False
+            while (coming or again) and not idle and len(self._busy()) < self._jobs:
+                try:
+                    task, attempt = again.popleft() if again else (next(source), 1)
+                except StopIteration:
+                    coming = False
+                    break
+                if task is None:
+                    idle = True
+                else:
+                    self._free().begin(task, attempt, self._watcher.began(task))
+            pipes = [worker.pipe for worker in self._busy()]
+            for pipe in wait(pipes, timeout=0 if idle or not pipes else None):
                 worker = next(one for one in self._workers if one.pipe is pipe)
                 record = worker.hear()
                 if record is None:
@@ -149,7 +163,7 @@ class Pool:
                 if worker.process.exitcode is not None:
                     self._workers.remove(worker)
                 if self._retry(worker, record):
-                    waiting.append((task, record.attempts + 1))
+                    again.append((task, record.attempts + 1))
                     continue
                 self._watcher.ended(task, record)
                 yield record
@@ -162,15 +176,13 @@ class Pool:
     def _busy(self) -> list[_Worker]:
         return [worker for worker in self._workers if worker.task is not None]
 
-    def _free(self) -> _Worker | None:
-        """A process with nothing to do, a new one if there may be more."""
+    def _free(self) -> _Worker:
+        """A process with nothing to do, a new one if there is none."""
         for worker in self._workers:
             if worker.task is None:
                 return worker
-        if len(self._workers) < self._jobs:
-            self._workers.append(_Worker(self._level, self._jobs))
-            return self._workers[-1]
-        return None
+        self._workers.append(_Worker(self._level, self._jobs))
+        return self._workers[-1]
 
 
 class Alone:
@@ -185,9 +197,9 @@ class Alone:
     def __exit__(self, *reason: object) -> None:
         return
 
-    def run(self, tasks: Iterable[Task]) -> Iterator[Record]:
+    def run(self, tasks: Iterable[Task | None]) -> Iterator[Record]:
         """The records of the tasks, one after the other."""
-        for task in tasks:
+        for task in filter(None, tasks):
             record = perform(task, self._watcher.began(task), self._level)
             self._watcher.ended(task, record)
             yield record

@@ -30,7 +30,7 @@ def find_projects(places: Iterable[Path], recursive: bool = False) -> list[Path]
 
 def _projects(place: Path, recursive: bool) -> list[Path]:
     if place.is_dir():
-        projects = sorted(_in_folder(place, recursive))
+        projects = projects_in(place, recursive)
         if not projects:
             remedy = "" if recursive else ", or add --recursive to look into its folders"
             raise ProjectError(f"{place}: there is no project (.pto) in this folder; name another{remedy}")
@@ -44,8 +44,12 @@ def _projects(place: Path, recursive: bool) -> list[Path]:
     return [place]
 
 
-def _in_folder(folder: Path, recursive: bool) -> Iterator[Path]:
-    """Projects of a folder; what cannot be listed is passed over."""
+def projects_in(folder: Path, recursive: bool) -> list[Path]:
+    """Projects of a folder, and of the folders in it, by name; what cannot be listed is passed over."""
+    return sorted(_walk(folder, recursive))
+
+
+def _walk(folder: Path, recursive: bool) -> Iterator[Path]:
     for parent, folders, files in os.walk(folder):
         folders[:] = sorted(name for name in folders if recursive and not name.startswith("."))
         for name in files:

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 
 from hugin_abflow import trace
-from hugin_abflow.batch.display import choose_display, open_log
+from hugin_abflow.batch.display import Display, choose_display, open_log
 from hugin_abflow.batch.pool import Alone, Pool
 from hugin_abflow.batch.record import Record
 from hugin_abflow.batch.report import print_table, write_report
@@ -43,20 +43,26 @@ def default_jobs() -> int:
     return min(3, os.cpu_count() or 1)
 
 
-def run(tasks: Sequence[Task], how: Run) -> ExitCode:
-    """Perform tasks, at least one; print the panoramas' names on stdout. Raises `OutputError` for a log or a
-    report that cannot be written.
+def run(tasks: Iterable[Task | None], how: Run, lone: bool = False) -> ExitCode:
+    """Perform tasks; print the panoramas' names on stdout. Raises `OutputError` for a log or a report that
+    cannot be written.
+
+    tasks       None means that there is none at the moment.
+    lone        there is but one: it is done in this process, and no table follows.
     """
     records: list[Record] = []
-    order = {task.project.absolute(): place for place, task in enumerate(tasks)}
-    lone = len(tasks) == 1
+    order: dict[Path, int] = {}
     with ExitStack() as stack:
         log = stack.enter_context(open_log(how.log))
         stack.enter_context(trace.recording(how.profile))
         try:
             with choose_display(lone, how.quiet, how.verbose, log) as display:
-                display.expect(len(tasks))
-                jobs = min(len(tasks), how.jobs or default_jobs())
+                if isinstance(tasks, Sequence):
+                    display.expect(len(tasks))
+                    order = {task.project.absolute(): place for place, task in enumerate(filter(None, tasks))}
+                else:
+                    tasks = _announced(tasks, display)
+                jobs = how.jobs or default_jobs()
                 with (Alone if lone else Pool)(jobs, display.level, display) as performers:
                     for record in performers.run(tasks):
                         records.append(record)
@@ -64,12 +70,20 @@ def run(tasks: Sequence[Task], how: Run) -> ExitCode:
                             for file in record.files:
                                 print_path(file)
         finally:
-            records.sort(key=lambda record: order[record.project])
+            records.sort(key=lambda record: order.get(record.project, 0))
+            if records and not lone and not how.quiet:
+                print_table(records)
             if how.report:
                 write_report(how.report, records, how.arguments)
-    if not lone and not how.quiet:
-        print_table(records)
     return combine([record.exit_code for record in records])
+
+
+def _announced(tasks: Iterable[Task | None], display: Display) -> Iterator[Task | None]:
+    """The same, while the display is told of each."""
+    for task in tasks:
+        if task is not None:
+            display.expect(1)
+        yield task
 
 
 def combine(codes: Sequence[ExitCode]) -> ExitCode:

@@ -1,0 +1,69 @@
+"""What a user chose: options of the command line, else of a file of settings, else the defaults."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import click
+
+from hugin_abflow.batch.config import NAME, read_config, write_config
+from hugin_abflow.errors import ConfigError
+from hugin_abflow.options import kind_of, long_names
+
+# Options that a file of settings cannot give.
+_UNSETTLED = frozenset({"config", "print-config"})
+# Parameters that are not about one project, but the run as a whole.
+OF_THE_RUN = frozenset(
+    {
+        "projects", "recursive", "watch", "resume", "force", "jobs", "report", "log", "quiet", "verbose",
+        "profile", "config", "print_config",
+    }
+)  # fmt: skip
+
+
+def choose(
+    command: click.Command, arguments: Sequence[str], file: Path | None, alone: bool = True
+) -> dict[str, Any]:
+    """All options of a command by their parameters.
+
+    arguments   of the command line.
+    file        of settings; None: there is none.
+    alone       the file may say something about the run as a whole.
+
+    Raises `ConfigError` for what the file should not say.
+    """
+    values = {} if file is None else read_config(file, *_known(command))
+    names = long_names(command)
+    whole = sorted(name for name in values if names[name].name in OF_THE_RUN)
+    if whole and not alone:
+        raise ConfigError(
+            f"{file}: {whole[0]} is for the whole run; give it on the command line, or in {NAME} beside "
+            "what is named first"
+        )
+    defaults = {str(names[name].name): value for name, value in values.items()}
+    try:
+        with command.make_context(command.name, list(arguments), default_map=defaults) as context:
+            return dict(context.params)
+    except click.UsageError as error:
+        if file is None:
+            raise
+        raise ConfigError(f"{file}: {error.format_message()}") from None
+
+
+def _known(command: click.Command) -> tuple[dict[str, str], list[str]]:
+    """Kinds of the options that a file may give, and which of them are files."""
+    names = {name: option for name, option in long_names(command).items() if name not in _UNSETTLED}
+    paths = [name for name, option in names.items() if isinstance(option.type, click.Path)]
+    return {name: kind_of(option) for name, option in names.items()}, paths
+
+
+def config_text(
+    command: click.Command, file: Path | None, values: Mapping[str, Any], projects: Sequence[Path]
+) -> str:
+    """The answer to --print-config: options `values` as a file of settings, from which file and for whom."""
+    names = long_names(command)
+    plain = {name: values[str(names[name].name)] for name in _known(command)[0]}
+    origin = [f"# {file or f'no {NAME}'}", *(f"# for {project}" for project in projects)]
+    return "\n".join([*origin, write_config(plain)])

@@ -1,0 +1,123 @@
+"""Projects as they are saved: when they have settled, once for each time, until interrupted."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from conftest import names_in
+from shoots import write_project
+
+from hugin_abflow import cli
+from hugin_abflow.batch.watch import watch
+from hugin_abflow.errors import ExitCode
+
+
+class Clock:
+    """Time that goes on only while somebody waits."""
+
+    def __init__(self) -> None:
+        self.now = 0.0
+
+    def pause(self, seconds: float) -> None:
+        self.now += seconds
+
+
+def start(folder: Path, recursive: bool = False) -> tuple[Iterator[Path | None], Clock]:
+    clock = Clock()
+    return watch(folder, recursive, clock=lambda: clock.now, pause=clock.pause), clock
+
+
+def after(saved: Iterator[Path | None], looks: int) -> list[str]:
+    """The projects that come up in so many looks."""
+    found = []
+    while looks:
+        project = next(saved)
+        if project is None:
+            looks -= 1
+        else:
+            found.append(project.name)
+    return found
+
+
+def test_project_comes_up_once_it_has_settled(tmp_path: Path) -> None:
+    write_project(tmp_path / "a.pto")
+    saved, _ = start(tmp_path)
+    assert after(saved, 3) == []
+    assert after(saved, 1) == ["a.pto"]
+    assert after(saved, 9) == []
+    (tmp_path / "a.pto").write_text((tmp_path / "a.pto").read_text() + "# saved again\n")
+    write_project(tmp_path / "b.pto")
+    assert after(saved, 3) == []
+    assert after(saved, 1) == ["a.pto", "b.pto"]
+
+
+def test_project_that_is_still_being_saved_waits(tmp_path: Path) -> None:
+    saved, _ = start(tmp_path)
+    for part in range(6):
+        (tmp_path / "a.pto").write_text("#" * part)
+        assert after(saved, 1) == []
+    assert after(saved, 3) == ["a.pto"]
+
+
+def test_photo_that_comes_later_brings_its_project_up_again(tmp_path: Path) -> None:
+    write_project(tmp_path / "a.pto")
+    saved, _ = start(tmp_path)
+    assert after(saved, 4) == ["a.pto"]
+    (tmp_path / "left.png").write_bytes(b"half")
+    assert after(saved, 2) == []
+    (tmp_path / "left.png").write_bytes(b"all of it")
+    assert after(saved, 3) == []
+    assert after(saved, 1) == ["a.pto"]
+
+
+def test_folders_of_folders_on_demand_and_lost_ones_are_no_error(tmp_path: Path) -> None:
+    write_project(tmp_path / "day" / "a.pto")
+    assert after(start(tmp_path)[0], 5) == []
+    saved, _ = start(tmp_path, recursive=True)
+    assert after(saved, 5) == ["a.pto"]
+    (tmp_path / "day" / "a.pto").unlink()
+    assert after(saved, 5) == []
+
+
+@pytest.mark.parametrize(
+    ("arguments", "part"),
+    [(["--watch", "gone"], "gone"), (["--watch", ".", "a.pto"], "leave out PROJECT")],
+)
+def test_wrong_use(capsys: pytest.CaptureFixture[str], arguments: list[str], part: str) -> None:
+    assert cli.main(arguments) == ExitCode.USAGE
+    assert part in capsys.readouterr().err
+
+
+@pytest.mark.skipif(os.name == "nt", reason="Windows has no such signals")
+def test_saved_projects_are_stitched_until_interrupted(tmp_path: Path) -> None:
+    shoot, report = tmp_path / "shoot", tmp_path / "report.json"
+    write_project(shoot / "a.pto")
+    (shoot / "abflow.toml").write_text('seam = "of"')  # a mistake, which is put right later
+    command = [sys.executable, "-m", "hugin_abflow", "--watch", shoot, "--jobs", "1", "--report", report]
+    child = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    assert child.communicate(timeout=60)[1].startswith("hugin-abflow: error: ")
+    (shoot / "abflow.toml").write_text('seam = "off"')
+    child = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    assert child.stdout is not None
+    assert child.stdout.readline() == f"{shoot / 'a.tif'}\n"
+    write_project(shoot / "b.pto")
+    assert child.stdout.readline() == f"{shoot / 'b.tif'}\n"
+    time.sleep(0.1)
+    child.send_signal(signal.SIGINT)
+    _, said = child.communicate(timeout=30)
+    assert child.returncode == ExitCode.INTERRUPTED and "Traceback" not in said
+    assert said.splitlines()[-1] == "hugin-abflow: interrupted" and "what went wrong" in said
+    records = json.loads(report.read_text("utf-8"))["projects"]
+    assert [(Path(r["project"]).name, r["result"], r["settings"]["seam"]) for r in records] == [
+        ("a.pto", "made", False),
+        ("b.pto", "made", False),
+    ]
+    assert [name for name in names_in(shoot) if name.startswith(".abflow-")] == []
