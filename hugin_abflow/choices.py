@@ -13,12 +13,12 @@ from hugin_abflow.errors import ConfigError
 from hugin_abflow.options import kind_of, long_names
 
 # Options that a file of settings cannot give.
-_UNSETTLED = frozenset({"config", "print-config"})
+_UNSETTLED = frozenset({"config", "print-config", "dry-run"})
 # Parameters that are not about one project, but the run as a whole.
 OF_THE_RUN = frozenset(
     {
         "projects", "recursive", "watch", "resume", "force", "jobs", "report", "log", "quiet", "verbose",
-        "profile", "config", "print_config",
+        "profile", "config", "print_config", "dry_run",
     }
 )  # fmt: skip
 

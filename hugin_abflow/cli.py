@@ -12,7 +12,7 @@ import click
 from hugin_abflow import memory
 from hugin_abflow.batch.config import NAME, find_config
 from hugin_abflow.batch.queue import find_projects
-from hugin_abflow.batch.run import Run, default_jobs, run
+from hugin_abflow.batch.run import Run, default_jobs, run, show
 from hugin_abflow.batch.task import Task
 from hugin_abflow.batch.watch import watch
 from hugin_abflow.choices import OF_THE_RUN, choose, config_text
@@ -38,6 +38,7 @@ EXIT_CODES = {
     ExitCode.DEVICE: "no usable OpenCL device",
     ExitCode.PARTIAL: "several projects: some succeeded, some failed",
     ExitCode.ALL_FAILED: "several projects: all failed",
+    ExitCode.PROGRAM: "enfuse, hugin_hdrmerge or pano_trafo is missing, or failed",
     ExitCode.INTERRUPTED: "interrupted (Ctrl-C, SIGTERM); nothing half-written is left",
 }
 
@@ -252,6 +253,9 @@ _information = partial(click.option, cls=Option, group="Information")
     callback=_print_devices,
     help="List the OpenCL devices and exit.",
 )
+@_information(
+    "--dry-run", is_flag=True, help="Print what would be made, and the commands that make it; do nothing."
+)
 @_information("-q", "--quiet", is_flag=True, help="Print nothing but warnings and errors.")
 @_information("-v", "--verbose", is_flag=True, help="Say what is done and how long it takes.")
 @_information(
@@ -280,6 +284,8 @@ def command(projects: tuple[Path, ...], **given: Any) -> ExitCode:
         raise click.UsageError("Missing argument 'PROJECT...'.")
     if projects and given["watch"]:
         raise click.UsageError("--watch names the folder; leave out PROJECT")
+    if given["dry_run"] and given["watch"]:
+        raise click.UsageError("--dry-run is about projects that are there; leave out --watch")
     # what concerns the run as a whole is said beside what is named first
     place = places[0] if places else Path()
     first = config or find_config(place / "any" if place.is_dir() else place, places)
@@ -300,6 +306,8 @@ def command(projects: tuple[Path, ...], **given: Any) -> ExitCode:
     if len(found) > 1 and lone:
         option = "-o" if "output" in lone else "--layers"
         raise click.UsageError(f"{option} is for one project, but there are {len(found)}")
+    if given["dry_run"]:
+        return show(tasks)
     remember = resume or force or len(found) > 1 or any(place.is_dir() for place in projects)
     return run(
         [Task(project, options, remember and not force, remember) for project, options in tasks.items()],

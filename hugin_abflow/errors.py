@@ -24,6 +24,7 @@ class ExitCode(IntEnum):
     DEVICE = 9  # no usable OpenCL device
     PARTIAL = 10  # several projects: some succeeded, some failed
     ALL_FAILED = 11  # several projects: none succeeded
+    PROGRAM = 12  # another program of Hugin's, or enfuse, is missing or failed
     INTERRUPTED = 130  # Ctrl-C
 
 
@@ -92,6 +93,18 @@ class NonaFailedError(AbflowError):
     """nona ran and failed."""
 
     exit_code = ExitCode.NONA
+
+
+class ProgramMissingError(AbflowError):
+    """A program that an output needs is not installed or not in PATH."""
+
+    exit_code = ExitCode.PROGRAM
+
+
+class ProgramFailedError(AbflowError):
+    """A program that an output needs ran and failed."""
+
+    exit_code = ExitCode.PROGRAM
 
 
 class DeviceError(AbflowError):

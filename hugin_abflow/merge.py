@@ -162,11 +162,16 @@ def _bands(
 
 
 def guides_between(plan: Plan, layers: Sequence[Layer], settings: Settings) -> list[Guide]:
-    """The project's control points between the layers."""
-    if not (settings.flow and settings.guides) or len(layers) < 2:
-        return []
+    """The project's control points between the layers, one for each image."""
     images = images_of(plan, layers)
-    return read_guides(plan, {image: index for index, image in enumerate(images) if image is not None})
+    return guides_of(plan, [[] if image is None else [image] for image in images], settings)
+
+
+def guides_of(plan: Plan, images: Sequence[Sequence[int]], settings: Settings) -> list[Guide]:
+    """The project's control points between layers that show several images each, named by their indices."""
+    if not (settings.flow and settings.guides) or len(images) < 2:
+        return []
+    return read_guides(plan, {image: layer for layer, group in enumerate(images) for image in group})
 
 
 def _write(writer: ImageWriter, bands: Iterator[npt.NDArray[Any]]) -> None:

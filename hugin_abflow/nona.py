@@ -10,7 +10,7 @@ import signal
 import subprocess
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal, get_args
@@ -27,9 +27,10 @@ from hugin_abflow.errors import (
 )
 from hugin_abflow.images import read_layers
 from hugin_abflow.layer import Layer, check_layers
+from hugin_abflow.programs import move_whole, stop
 from hugin_abflow.progress import Progress, silent
 from hugin_abflow.project import Plan, PlannedImage
-from hugin_abflow.scratch import part_beside, work_folder
+from hugin_abflow.scratch import work_folder
 
 log = logging.getLogger("hugin_abflow.nona")
 
@@ -38,14 +39,10 @@ Remap = Literal["auto", "always", "never"]
 _STALE_SECONDS = 2.0  # file times closer than this say nothing (FAT counts in steps of 2 s)
 _LAST_LINES = 8  # of nona's output, in the message of a failure
 _STEPS = ("remapping ", "saving ")  # what nona -v says at the end of a photo's loading and remapping
-_KILL_SECONDS = 5.0
 _INSTALL = (
     "nona is not in PATH; install Hugin (Debian, Ubuntu: apt install hugin-tools; Fedora: dnf install hugin; "
     "macOS, Windows: put the folder of Hugin's programs into PATH)"
 )
-
-
-# ------------------------------------------------------------------------------------- the whole
 
 
 @contextmanager
@@ -66,7 +63,7 @@ def open_layers(
     remap           "never": only what is there. "always": nona makes all layers. "auto": nona makes all
                     that are missing, and all if one is more than 2 s older than the project or its
                     photo and they can be made again (else they are used, with a warning).
-    keep_layers     layers that nona made are moved beside the project, under its stem.
+    keep_layers     layers that nona made are moved beside the project, named as Hugin does.
 
     Layers are made in a folder under TMPDIR that is removed in the end. Raises `LayersMissingError`,
     `PhotoMissingError`, `NonaMissingError`, `NonaFailedError`, `LayersMismatchError`,
@@ -162,9 +159,11 @@ def _is_multilayer(path: Path) -> bool:
 
 def _find(plan: Plan) -> _Found | None:
     """Layers under the project's stem or Hugin's default prefix; complete and fresh ones first."""
-    names = [plan.stem, plan.hugin_prefix]
-    names = [f"{name}_hdr_" for name in names if plan.hdr] + names  # what hugin_executor calls them
+    names = [plan.layer_prefix(name) for name in (plan.stem, plan.hugin_prefix)]
+    names += [plan.stem, plan.hugin_prefix] if plan.hdr else []
     found = [layers for name in names if (layers := _find_under(plan, str(plan.folder / name)))]
+    if plan.hdr:  # what is linear; layers of the other panorama may lie there too
+        found = [layers for layers in found if all(path.suffix == ".exr" for path in layers.in_order())]
     return min(found, key=lambda f: (bool(f.missing(plan)), bool(f.stale(plan))), default=None)
 
 
@@ -247,6 +246,13 @@ def _find_or_make(plan: Plan, folder: Path, remap: Remap, keep: bool, progress: 
     return _Found(found.prefix, found.files | made, found.pages)
 
 
+def find_layers(plan: Plan, remap: Remap) -> str | None:
+    """The prefix of layers that `open_layers` takes without making any; None if there are none."""
+    found = None if remap == "always" else _find(plan)
+    usable = found and (remap == "never" or not (found.missing(plan) or found.stale(plan)))
+    return Path(found.prefix).name if found and usable else None
+
+
 def _report_used(plan: Plan, found: _Found) -> None:
     """Warn of what --remap never leaves as it is."""
     for image in found.missing(plan):
@@ -293,7 +299,7 @@ def _make_all(plan: Plan, folder: Path, keep: bool, progress: Progress) -> _Foun
         raise _failure(plan, folder, code, lines)
     if not made:
         raise LayersMissingError(f"{plan.file}: no active image reaches into the crop; nona made no layer")
-    prefix = str(plan.folder / plan.stem)
+    prefix = str(plan.folder / plan.layer_prefix(plan.stem))
     return _Found(prefix, _keep(plan, prefix, made) if keep else made)
 
 
@@ -327,9 +333,8 @@ def _run(
     plan: Plan, folder: Path, options: list[str], advance: Callable[[int], None]
 ) -> tuple[int, list[str]]:
     """Run nona as Hugin does; its exit code and last lines. It does not outlive an exception."""
-    output = ["-r", "hdr", "-m", "EXR_m"] if plan.hdr else ["-r", "ldr", "-m", "TIFF_m"]
-    target, project = folder / plan.stem, _project_for_nona(plan, folder)
-    command = ["nona", "-v", "-z", "LZW", *output, *options, "-o", str(target), str(project)]
+    target, project = folder / plan.layer_prefix(plan.stem), _project_for_nona(plan, folder)
+    command = remapping(plan, options, str(target), str(project))
     log.info("%s", " ".join(command))
     try:
         process = subprocess.Popen(
@@ -354,17 +359,16 @@ def _run(
                 if line.startswith(_STEPS):
                     advance(1)
         except BaseException:
-            _stop(process)
+            stop(process)
             raise
     return process.returncode, list(lines)
 
 
-def _stop(process: subprocess.Popen[str]) -> None:
-    process.terminate()
-    try:
-        process.wait(_KILL_SECONDS)
-    except subprocess.TimeoutExpired:
-        process.kill()
+def remapping(plan: Plan, options: Sequence[str], prefix: str, project: str) -> list[str]:
+    """The command that makes the layers `prefix`0000.tif ..., or .exr; the same as Hugin's."""
+    output = ["-r", "hdr", "-m", "EXR_m"] if plan.hdr else ["-r", "ldr", "-m", "TIFF_m"]
+    output += ["--ignore-exposure"] if plan.ignore_exposure else []
+    return ["nona", "-v", "-z", "LZW", *output, *options, "-o", prefix, project]
 
 
 def _project_for_nona(plan: Plan, folder: Path) -> Path:
@@ -385,7 +389,8 @@ def _project_for_nona(plan: Plan, folder: Path) -> Path:
 def _made(plan: Plan, folder: Path) -> dict[int, Path]:
     """The layers that nona left in the folder."""
     ending = ".exr" if plan.hdr else ".tif"
-    paths = {i.index: _layer_path(str(folder / plan.stem), i.index, ending) for i in plan.images}
+    prefix = str(folder / plan.layer_prefix(plan.stem))
+    paths = {image.index: _layer_path(prefix, image.index, ending) for image in plan.images}
     return {index: path for index, path in paths.items() if path.is_file()}
 
 
@@ -401,28 +406,15 @@ def _failure(plan: Plan, folder: Path, code: int, lines: list[str]) -> NonaFaile
 def _keep(plan: Plan, prefix: str, made: dict[int, Path]) -> dict[int, Path]:
     """Move layers beside the project, each whole or not at all."""
     photos = {image.photo.resolve() for image in plan.images}
-    kept = {}
+    kept, advice = {}, "leave out --keep-layers or free the folder"
     for index, path in made.items():
         final = _layer_path(prefix, index, path.suffix)
         if final.resolve() in photos:
             raise OutputError(
                 f"{final} is a photo, the layer cannot be kept by that name; rename the project"
             )
-        try:
-            _move(path, final)
-        except OSError as error:
-            raise OutputError(
-                f"{final} cannot be written: {error.strerror}; leave out --keep-layers or free the folder"
-            ) from None
+        weights = path.with_name(f"{path.stem}_gray.pgm")  # hugin_hdrmerge asks for them beside the layers
+        for file in (path, weights) if weights.is_file() else (path,):
+            move_whole(file, final.with_name(file.name.replace(path.stem, final.stem)), advice)
         kept[index] = final
     return kept
-
-
-def _move(path: Path, final: Path) -> None:
-    """Move a file, to another file system too; it appears when it is whole."""
-    with suppress(OSError):
-        path.replace(final)
-        return
-    with part_beside(final) as part:
-        shutil.copyfile(path, part)
-        part.replace(final)

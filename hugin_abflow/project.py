@@ -71,6 +71,7 @@ class Plan:
     images          active images in the project's order.
     output          type of the panorama's file.
     hdr             layers are scene-linear EXR (nona ``-r hdr``) instead of TIFF in the photos' depth.
+    ignore_exposure layers keep their photos' exposure (nona ``--ignore-exposure``), to be fused.
     hugin_prefix    what Hugin names layers and panorama by default: "first image - last image".
     """
 
@@ -81,6 +82,7 @@ class Plan:
     output: Output
     hdr: bool
     hugin_prefix: str
+    ignore_exposure: bool = False
 
     @property
     def folder(self) -> Path:
@@ -91,6 +93,12 @@ class Plan:
     def stem(self) -> str:
         """The project's name without .pto; Hugin's temporary projects have no ending to lose."""
         return self.file.stem if self.file.suffix.lower() == ".pto" else self.file.name
+
+    def layer_prefix(self, name: str) -> str:
+        """What comes before the numbers of layers, as Hugin has it, from a panorama's name without ending."""
+        if self.hdr:
+            return f"{name}_hdr_"
+        return f"{name}_exposure_layers_" if self.ignore_exposure else name
 
     def default_output(self, taken: Iterable[Path] = ()) -> Path:
         """Beside the project, named after it: ``pano.pto`` -> ``pano.tif``.
@@ -129,7 +137,7 @@ def read_plan(path: Path | str) -> Plan:
         canvas=_canvas(file, project.panorama),
         projection=_projection(project.panorama.projection),
         images=images,
-        output=_output(project, hdr),
+        output=read_output(project, hdr),
         hdr=hdr,
         hugin_prefix=f"{_stem(names[0])} - {_stem(names[-1])}",
     )
@@ -186,8 +194,11 @@ def _is_hdr(project: pto.Project) -> bool:
     return blended_hdr == "true" and blended_ldr != "true"
 
 
-def _output(project: pto.Project, hdr: bool) -> Output:
-    """From the #hugin_output lines; from the p-line's n where there are none (PanoTools scripts)."""
+def read_output(project: pto.Project, hdr: bool) -> Output:
+    """How panoramas are stored, HDR ones or others.
+
+    From the #hugin_output lines; from the p-line's n where there are none (PanoTools scripts).
+    """
     words = (project.panorama.output_format or "").split()
     from_n = words[0].partition("_")[0].lower() if words else ""
     letters = {word[:1]: word[1:].removeprefix(":") for word in words[1:]}  # c:LZW r:CROP q95

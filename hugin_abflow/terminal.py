@@ -37,9 +37,14 @@ def complain(text: str) -> None:
 
 
 def print_path(path: Path) -> None:
-    """Print a result to stdout, in the bytes of the file's name whatever the locale."""
+    """Print a result to stdout."""
+    print_result(os.fspath(path))
+
+
+def print_result(text: str) -> None:
+    """Print text to stdout; names of files in it in their own bytes whatever the locale."""
     try:
-        click.echo(os.fspath(path) if os.name == "nt" else os.fsencode(path))
+        click.echo(text if os.name == "nt" else os.fsencode(text))
     except BrokenPipeError:
         # Nobody reads stdout any more (`| head -1`): go on, and keep Python's own flush at exit quiet.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

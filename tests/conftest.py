@@ -79,10 +79,10 @@ Merge = Callable[..., Path]
 
 @pytest.fixture
 def replace(monkeypatch: pytest.MonkeyPatch) -> Callable[[Merge], None]:
-    """Put a function in the place of `merge_project`; all projects are then made in this process."""
+    """Put a function in the place of `stitch_project`, for one output; all is made in this process then."""
 
     def put(merge: Merge) -> None:
-        monkeypatch.setattr(task, "merge_project", merge)
+        monkeypatch.setattr(task, "stitch_project", lambda path, **keywords: [merge(path, **keywords)])
         monkeypatch.setattr(run, "Pool", pool.Alone)
 
     return put

@@ -51,7 +51,7 @@ def make(shoot: Path, monkeypatch: pytest.MonkeyPatch) -> Make:
         tifffile.imwrite(target, pixels, photometric="rgb", extrasamples=["unassalpha"])
         return target
 
-    monkeypatch.setattr(task, "merge_project", merge)
+    monkeypatch.setattr(task, "stitch_project", lambda path, **keywords: [merge(path, **keywords)])
 
     def run(folder: Path = shoot, resume: bool = True, **options: object) -> Record:
         keywords = {"settings": Settings(), "output": None, "remap": "auto"} | options
@@ -117,15 +117,15 @@ def test_new_and_lost_inputs_are_seen(make: Make, shoot: Path) -> None:
 def test_input_that_changes_meanwhile_counts_as_changed(
     make: Make, shoot: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    merge = task.merge_project
+    merge = task.stitch_project
 
-    def slow(path: Path, **keywords: Any) -> Path:
+    def slow(path: Path, **keywords: Any) -> list[Path]:
         (shoot / "right.png").write_bytes(b"saved again while the panorama was made")
         return merge(path, **keywords)
 
-    monkeypatch.setattr(task, "merge_project", slow)
+    monkeypatch.setattr(task, "stitch_project", slow)
     make()
-    monkeypatch.setattr(task, "merge_project", merge)
+    monkeypatch.setattr(task, "stitch_project", merge)
     assert make().result == "made"
 
 
@@ -133,13 +133,13 @@ def test_layers_that_were_kept_are_no_change(
     make: Make, shoot: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (shoot / "tiny0001.tif").rename(shoot / "made by nona")
-    merge = task.merge_project
+    merge = task.stitch_project
 
-    def keep(path: Path, **keywords: Any) -> Path:
+    def keep(path: Path, **keywords: Any) -> list[Path]:
         shutil.copy(shoot / "made by nona", shoot / "tiny0001.tif")
         return merge(path, **keywords)
 
-    monkeypatch.setattr(task, "merge_project", keep)
+    monkeypatch.setattr(task, "stitch_project", keep)
     assert make(keep_layers=True).result == "made"
     assert make(keep_layers=True).result == "skipped"
 
@@ -208,7 +208,7 @@ def test_failure_is_not_remembered(make: Make, shoot: Path, monkeypatch: pytest.
     def fail(path: Path, **keywords: Any) -> Path:
         raise RuntimeError("a bug")
 
-    monkeypatch.setattr(task, "merge_project", fail)
+    monkeypatch.setattr(task, "stitch_project", fail)
     assert make().result == "failed"
     assert not (shoot / ".abflow").exists()
 

@@ -48,6 +48,7 @@ def test_commands_are_understood(
     (tmp_path / "shoot").mkdir()
     (tmp_path / "shoot" / "a.pto").touch()
     monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("hugin_abflow.batch.run.show_project", lambda path, **keywords: [])
     monkeypatch.setattr(setup, "install", lambda *given: [])
     monkeypatch.setattr(setup, "uninstall", lambda *given: [])
     text = "\n".join(PAGES.values())

@@ -118,7 +118,7 @@ def test_hdr_layers_are_half_exr(make_project, nona, dtype):
         open_layers(plan) as layers,
         open_layers(read_plan(plan.file.with_name("pano.pto")), prefix="by hand/h") as o,
     ):
-        assert names_of(layers) == ["pano0000.exr", "pano0001.exr", "pano0002.exr"]
+        assert names_of(layers) == [f"pano_hdr_{index:04d}.exr" for index in range(3)]
         for layer, other in zip(layers, o, strict=True):
             assert (layer.dtype, layer.channels, layer.canvas_size) == (np.float16, 3, (802, 401))
             assert layer.box == other.box

@@ -105,7 +105,7 @@ from pathlib import Path
 from hugin_abflow import cli
 from hugin_abflow.batch import pool, run, task
 {merge}
-task.merge_project = merge
+task.stitch_project = lambda path, **keywords: [merge(path, **keywords)]
 run.Pool = pool.Alone
 sys.exit(cli.main(sys.argv[1:]))
 """

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import logging
 import os
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from hugin_abflow import trace
 from hugin_abflow.batch.display import Display, choose_display, open_log
@@ -14,8 +16,9 @@ from hugin_abflow.batch.pool import Alone, Pool
 from hugin_abflow.batch.record import Record
 from hugin_abflow.batch.report import print_table, write_report
 from hugin_abflow.batch.task import Task
-from hugin_abflow.errors import ExitCode
-from hugin_abflow.terminal import print_path
+from hugin_abflow.errors import AbflowError, ExitCode
+from hugin_abflow.stitch import show_project
+from hugin_abflow.terminal import complain, messages, print_path, print_result
 
 
 @dataclass(frozen=True)
@@ -84,6 +87,20 @@ def _announced(tasks: Iterable[Task | None], display: Display) -> Iterator[Task 
         if task is not None:
             display.expect(1)
         yield task
+
+
+def show(options: Mapping[Path, Mapping[str, Any]]) -> ExitCode:
+    """Print on stdout what would be done with each project and its keywords of `stitch_project`."""
+    codes = []
+    with messages(logging.WARNING):
+        for project, keywords in options.items():
+            try:
+                print_result("\n".join(show_project(project, **keywords)))
+                codes.append(ExitCode.OK)
+            except AbflowError as error:
+                complain(str(error))
+                codes.append(error.exit_code)
+    return combine(codes)
 
 
 def combine(codes: Sequence[ExitCode]) -> ExitCode:

@@ -18,11 +18,11 @@ from hugin_abflow import memory, nona, trace
 from hugin_abflow.batch.record import Record
 from hugin_abflow.batch.state import State
 from hugin_abflow.errors import AbflowError, DeviceError
-from hugin_abflow.merge import merge_project
 from hugin_abflow.metadata import version
 from hugin_abflow.opencl import Device
 from hugin_abflow.progress import Advance
 from hugin_abflow.settings import Settings
+from hugin_abflow.stitch import stitch_project
 from hugin_abflow.terminal import explain, is_bug, messages
 
 _log = logging.getLogger(__name__)
@@ -33,7 +33,7 @@ class Task:
     """One project and how it is stitched; travels between processes.
 
     project     the file, as the user named it.
-    options     keywords of `merge_project`.
+    options     keywords of `stitch_project`.
     resume      leave what was made before as it is if it still holds. remember: so that this can be told.
     """
 
@@ -124,10 +124,10 @@ def _stitch(task: Task, record: Record, listener: Listener) -> None:
         record.phases[phase] = round(record.phases.get(phase, 0.0) + seconds, 3)
         listener.phase_ended(phase, seconds)
 
-    made = merge_project(
+    made = stitch_project(
         task.project, **task.options, progress=trace.phases(progress), open_device=open_device
     )
-    record.outputs = _sizes([made])
+    record.outputs = _sizes(made)
     record.result = "made"
 
 

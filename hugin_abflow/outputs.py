@@ -1,0 +1,232 @@
+"""A project's checked outputs, named as Hugin names them, and the steps that make them.
+
+As Hugin's own stitcher has it (``hugin_executor -s -d`` prints its commands); blending is ours.
+"""
+
+from __future__ import annotations
+
+import shlex
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from enum import StrEnum
+
+from hugin_abflow import pto
+from hugin_abflow.metadata import PROGRAM
+from hugin_abflow.nona import layer_name
+from hugin_abflow.programs import missing
+from hugin_abflow.project import Plan, read_output
+from hugin_abflow.stacks import exposure_layers, stacks
+
+ENFUSE, HDRMERGE, BLEND = "enfuse", "hugin_hdrmerge", PROGRAM
+
+
+class Kind(StrEnum):
+    """An output that can be checked; the value is what follows ``#hugin_output``."""
+
+    PANORAMA = "LDRBlended"
+    LAYERS = "LDRLayers"
+    EXPOSURE_REMAPPED = "LDRExposureRemapped"
+    EXPOSURE_LAYERS = "LDRExposureLayers"
+    FUSED_LAYERS = "LDRExposureLayersFused"
+    STACKS = "LDRStacks"
+    FUSED_STACKS = "LDRExposureBlended"
+    HDR = "HDRBlended"
+    HDR_LAYERS = "HDRLayers"
+    HDR_STACKS = "HDRStacks"
+
+
+# As Hugin's stitcher tab calls them.
+WORDS = {
+    Kind.PANORAMA: "panorama, exposure corrected",
+    Kind.LAYERS: "remapped images, exposure corrected",
+    Kind.EXPOSURE_REMAPPED: "remapped images, no exposure correction",
+    Kind.EXPOSURE_LAYERS: "blended layers of similar exposure",
+    Kind.FUSED_LAYERS: "panorama, exposure fused from any arrangement",
+    Kind.STACKS: "exposure fused stacks",
+    Kind.FUSED_STACKS: "panorama, exposure fused from stacks",
+    Kind.HDR: "panorama, high dynamic range",
+    Kind.HDR_LAYERS: "remapped images, high dynamic range",
+    Kind.HDR_STACKS: "high dynamic range stacks",
+}
+_NEEDS = {
+    Kind.FUSED_LAYERS: (ENFUSE,),
+    Kind.STACKS: (ENFUSE, "pano_trafo"),
+    Kind.FUSED_STACKS: (ENFUSE, "pano_trafo"),
+    Kind.HDR: (HDRMERGE, "pano_trafo"),
+    Kind.HDR_STACKS: (HDRMERGE, "pano_trafo"),
+}
+# Which outputs are made of layers of one kind; and which of them are the layers themselves.
+_CORRECTED = frozenset({Kind.PANORAMA, Kind.LAYERS})
+_UNCORRECTED = frozenset(
+    {Kind.EXPOSURE_REMAPPED, Kind.EXPOSURE_LAYERS, Kind.FUSED_LAYERS, Kind.STACKS, Kind.FUSED_STACKS}
+)
+_LINEAR = frozenset({Kind.HDR, Kind.HDR_LAYERS, Kind.HDR_STACKS})
+_REMAPPED = frozenset({Kind.LAYERS, Kind.EXPOSURE_REMAPPED, Kind.HDR_LAYERS})
+
+
+@dataclass(frozen=True)
+class Step:
+    """One file and what it is made of.
+
+    program     enfuse, hugin_hdrmerge, or hugin-abflow: what we do ourselves.
+    options     of the program, before the names of files.
+    result      name of the file.
+    inputs      names of the files that it is made of.
+    images      indices of the images that each of the inputs shows.
+    wanted      the file is an output, and not only needed for another.
+    final       it is a panorama, stored as the project says; else TIFF or EXR, as layers are.
+    """
+
+    program: str
+    options: tuple[str, ...]
+    result: str
+    inputs: tuple[str, ...]
+    images: tuple[tuple[int, ...], ...]
+    wanted: bool
+    final: bool = False
+
+    def command(self, project: str) -> list[str]:
+        """What one would type."""
+        if self.program == BLEND:
+            return [BLEND, "-o", self.result, project, "--layers", *self.inputs]
+        return [self.program, *self.options, "-o", self.result, "--", *self.inputs]
+
+
+@dataclass(frozen=True)
+class Branch:
+    """Layers of one kind and the outputs that are made of them.
+
+    plan        the project; its `hdr`, `ignore_exposure` and `output` are the layers' and outputs'.
+    kinds       what is wanted.
+    """
+
+    plan: Plan
+    kinds: frozenset[Kind]
+
+    @property
+    def keeps_layers(self) -> bool:
+        """Whether the layers are an output themselves."""
+        return bool(self.kinds & _REMAPPED)
+
+    def layer(self, index: int) -> str:
+        """The name of an image's layer."""
+        prefix = self.plan.layer_prefix(self.plan.stem)
+        return layer_name(prefix, index, ".exr" if self.plan.hdr else ".tif")
+
+    def steps(self, images: Sequence[int]) -> list[Step]:
+        """How the outputs are made of the layers of `images`, in this order.
+
+        Not those of exposure-corrected layers, which `merge.merge_project` blends. Raises
+        `ProgramMissingError` and `ProgramFailedError`.
+        """
+        if self.plan.hdr:
+            return self._stack_steps(HDRMERGE, images, Kind.HDR_STACKS, Kind.HDR)
+        if self.plan.ignore_exposure:
+            layers = self._exposure_layer_steps(images)
+            return [*layers, *self._stack_steps(ENFUSE, images, Kind.STACKS, Kind.FUSED_STACKS)]
+        return []
+
+    def _exposure_layer_steps(self, images: Sequence[int]) -> list[Step]:
+        """Photos of one exposure are blended, then these layers fused."""
+        if not self.kinds & {Kind.EXPOSURE_LAYERS, Kind.FUSED_LAYERS}:
+            return []
+        groups = exposure_layers(self.plan, images)
+        wanted = Kind.EXPOSURE_LAYERS in self.kinds
+        steps = [
+            self._step(BLEND, f"_exposure_{number:04d}.tif", [[image] for image in group], wanted)
+            for number, group in enumerate(groups)
+        ]
+        if Kind.FUSED_LAYERS in self.kinds:
+            steps.append(self._gather(ENFUSE, f"_blended_fused{self.plan.output.ending}", steps))
+        return steps
+
+    def _stack_steps(self, program: str, images: Sequence[int], stacked: Kind, blended: Kind) -> list[Step]:
+        """Photos of one view are fused or merged, then these stacks blended."""
+        if not self.kinds & {stacked, blended}:
+            return []
+        name = "_stack_hdr_{:04d}.exr" if self.plan.hdr else "_stack_ldr_{:04d}.tif"
+        steps = [
+            self._step(program, name.format(number), [[image] for image in group], stacked in self.kinds)
+            for number, group in enumerate(stacks(self.plan, images))
+        ]
+        if blended in self.kinds:
+            suffix = "_hdr" if self.plan.hdr else "_fused"
+            steps.append(self._gather(BLEND, f"{suffix}{self.plan.output.ending}", steps))
+        return steps
+
+    def _step(self, program: str, suffix: str, images: Sequence[Sequence[int]], wanted: bool) -> Step:
+        """A step that takes layers."""
+        inputs = tuple(self.layer(image) for group in images for image in group)
+        return Step(
+            program,
+            self._options(program, final=False),
+            f"{self.plan.stem}{suffix}",
+            inputs,
+            tuple(tuple(group) for group in images),
+            wanted,
+        )
+
+    def _gather(self, program: str, suffix: str, steps: Sequence[Step]) -> Step:
+        """A step that makes a panorama of the results of others."""
+        images = tuple(tuple(image for group in step.images for image in group) for step in steps)
+        inputs = tuple(step.result for step in steps)
+        options = self._options(program, final=True)
+        return Step(program, options, f"{self.plan.stem}{suffix}", inputs, images, True, final=True)
+
+    def _options(self, program: str, final: bool) -> tuple[str, ...]:
+        """Options as Hugin gives them: the project's own, size and place, wrapping, compression."""
+        project, crop, output = pto.load(self.plan.file), self.plan.canvas.crop, self.plan.output
+        if program == HDRMERGE:
+            return tuple(_words(project.option("hdrmergeOptions", "")))
+        if program != ENFUSE:
+            return ()
+        wraps = self.plan.canvas.hfov == 360 and crop.width == self.plan.canvas.width
+        size = f"-f{crop.width}x{crop.height}+{crop.left}+{crop.top}"
+        if final and output.ending == ".jpg":
+            compression = [f"--compression={output.jpeg_quality}"]
+        elif final and output.ending != ".tif":
+            compression = []
+        else:
+            layers = project.option("outputLayersCompression", "LZW").strip()
+            compression = [f"--compression={(output.compression if final else layers) or 'LZW'}"]
+        own = _words(project.option("enfuseOptions", ""))
+        return (*own, *(["-w"] if wraps else []), size, *compression)
+
+
+def checked_outputs(plan: Plan) -> list[Kind]:
+    """What is checked in Hugin's stitcher tab; if nothing is, the panorama."""
+    project = pto.load(plan.file)
+    kinds = [kind for kind in Kind if project.option(f"output{kind}", "").strip().lower() == "true"]
+    unsaid = not project.option(f"output{Kind.PANORAMA}", "").strip()
+    if unsaid and not plan.hdr and Kind.PANORAMA not in kinds:
+        kinds.insert(0, Kind.PANORAMA)  # Hugin's default
+    return kinds or [Kind.HDR if plan.hdr else Kind.PANORAMA]
+
+
+def impossible(kinds: Sequence[Kind]) -> dict[Kind, str]:
+    """Which outputs cannot be made here, and what to do about it."""
+    reasons = {kind: [missing(program) for program in _NEEDS.get(kind, ())] for kind in kinds}
+    return {kind: next(filter(None, why)) for kind, why in reasons.items() if any(why)}
+
+
+def branches(plan: Plan, kinds: Sequence[Kind]) -> list[Branch]:
+    """The outputs by the layers that they are made of."""
+    project = pto.load(plan.file)
+    found = []
+    for group, hdr, ignore_exposure in (
+        (_CORRECTED, False, False),
+        (_UNCORRECTED, False, True),
+        (_LINEAR, True, False),
+    ):
+        if wanted := group & set(kinds):
+            own = replace(plan, hdr=hdr, ignore_exposure=ignore_exposure, output=read_output(project, hdr))
+            found.append(Branch(own, wanted))
+    return found
+
+
+def _words(text: str) -> list[str]:
+    """Options as the user wrote them into Hugin's preferences."""
+    try:
+        return shlex.split(text)
+    except ValueError:  # a quote without its other half
+        return text.split()

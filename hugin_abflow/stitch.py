@@ -1,0 +1,238 @@
+"""All outputs that a project asks for, made or shown."""
+
+from __future__ import annotations
+
+import logging
+import shlex
+from collections.abc import Sequence
+from dataclasses import replace
+from functools import partial
+from itertools import groupby
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from hugin_abflow.errors import ProgramMissingError
+from hugin_abflow.exif import embed
+from hugin_abflow.images import COMPRESSIONS, ENDINGS, read_layer
+from hugin_abflow.layer import Layer, check_layers
+from hugin_abflow.merge import OpenDevice, guides_of, merge_project, refuse_input, write_panorama
+from hugin_abflow.metadata import describe
+from hugin_abflow.nona import Remap, find_layers, open_layers, remapping
+from hugin_abflow.outputs import BLEND, WORDS, Branch, Kind, Step, branches, checked_outputs, impossible
+from hugin_abflow.pano_trafo import images_of
+from hugin_abflow.programs import move_whole, run
+from hugin_abflow.progress import Progress, silent
+from hugin_abflow.project import Plan, read_plan
+from hugin_abflow.scratch import work_folder
+from hugin_abflow.settings import Settings
+
+_log = logging.getLogger(__name__)
+
+
+def stitch_project(
+    path: Path | str,
+    settings: Settings | None = None,
+    *,
+    output: Path | str | None = None,
+    prefix: str | Path | None = None,
+    layers: Sequence[str | Path] | None = None,
+    remap: Remap = "auto",
+    keep_layers: bool = False,
+    compression: str | None = None,
+    jpeg_quality: int | None = None,
+    metadata: bool = True,
+    progress: Progress = silent,
+    open_device: OpenDevice | None = None,
+) -> list[Path]:
+    """Make all outputs that are checked in Hugin for a project; returns their files, beside it.
+
+    With `output`, `prefix` or `layers`: the one panorama of `merge.merge_project`, whose arguments these are.
+
+    Outputs whose programs are not installed are left out, with a warning. Each file appears when it is
+    complete; one that fails ends the run, and what was made before stays. Raises the `AbflowError` family,
+    `ProgramMissingError` if nothing can be made.
+    """
+    one = partial(
+        merge_project, path, settings, output=output, prefix=prefix, layers=layers, compression=compression,
+        jpeg_quality=jpeg_quality, metadata=metadata, progress=progress, open_device=open_device,
+    )  # fmt: skip
+    if output or prefix or layers:
+        return [one(remap=remap, keep_layers=keep_layers)]
+    made: list[Path] = []
+    for branch in _branches(read_plan(path)):
+        if Kind.LAYERS in branch.kinds:
+            with open_layers(branch.plan, remap=remap, keep_layers=True, progress=progress) as opened:
+                made += _files(opened)
+        if Kind.PANORAMA in branch.kinds:
+            # layers that were kept just now are not made again
+            made.append(one(remap="auto" if made else remap, keep_layers=keep_layers))
+        if branch.plan.hdr or branch.plan.ignore_exposure:
+            stored = _stored(branch.plan, compression, jpeg_quality)
+            maker = _Maker(
+                replace(branch, plan=stored), settings or Settings(), metadata, progress, open_device
+            )
+            made += maker.make(remap, keep_layers)
+    return made
+
+
+def show_project(
+    path: Path | str,
+    *,
+    output: Path | str | None = None,
+    prefix: str | Path | None = None,
+    layers: Sequence[str | Path] | None = None,
+    remap: Remap = "auto",
+    **others: Any,
+) -> list[str]:
+    """What `stitch_project` would do, as lines of a shell script: a comment on the plan, then the commands.
+
+    Photos that miss the crop, which nona tells later, are taken for part of the panorama. Raises as
+    `stitch_project` does for what the project can get wrong.
+    """
+    plan = read_plan(path)
+    canvas, name = plan.canvas, plan.file.name
+    head = [
+        f"# {name}: {len(plan.images)} photos, {plan.projection}, "
+        f"{canvas.crop.width} x {canvas.crop.height} of {canvas.width} x {canvas.height}",
+        shlex.join(["cd", str(plan.folder)]),
+    ]
+    if output or prefix or layers:
+        target = str(Path(output).absolute()) if output else plan.default_output().name
+        named = ["--layers", *(str(Path(layer).absolute()) for layer in layers)] if layers else []
+        named = ["--prefix", str(prefix)] if prefix else named
+        remapped = [] if named else _remapping(plan, remap)
+        named = named or ["--prefix", _layers_prefix(plan, remap)]
+        return [*head, *remapped, shlex.join([BLEND, "-o", target, name, *named])]
+    lines: list[str] = []
+    for branch in _branches(plan):
+        lines += [f"# {WORDS[kind]}" for kind in Kind if kind in branch.kinds]
+        lines += _remapping(branch.plan, _remap(branch.plan, remap))
+        if Kind.PANORAMA in branch.kinds:
+            found = _layers_prefix(branch.plan, remap)
+            lines.append(shlex.join([BLEND, "-o", plan.default_output().name, name, "--prefix", found]))
+        steps = branch.steps([image.index for image in plan.images])
+        lines += [shlex.join(step.command(name)) for step in steps]
+    return [*head, *lines]
+
+
+def _branches(plan: Plan) -> list[Branch]:
+    """What can be made of what is checked; says what cannot."""
+    kinds = checked_outputs(plan)
+    reasons = impossible(kinds)
+    for kind, reason in reasons.items():
+        _log.warning("%s: left out: %s (%s)", plan.file, WORDS[kind], reason)
+    possible = [kind for kind in kinds if kind not in reasons]
+    if not possible:
+        raise ProgramMissingError(f"{plan.file}: nothing can be made: {next(iter(reasons.values()))}")
+    return branches(plan, possible)
+
+
+def _remap(plan: Plan, remap: Remap) -> Remap:
+    """HDR layers are made again: without nona's files of weights beside them they cannot be merged."""
+    return "always" if plan.hdr and remap == "auto" else remap
+
+
+def _layers_prefix(plan: Plan, remap: Remap) -> str:
+    """What comes before the numbers of layers that are there or that nona makes."""
+    return find_layers(plan, remap) or plan.layer_prefix(plan.stem)
+
+
+def _remapping(plan: Plan, remap: Remap) -> list[str]:
+    """nona's command, if layers have to be made."""
+    if find_layers(plan, remap) is not None:
+        return []
+    return [shlex.join(remapping(plan, [], plan.layer_prefix(plan.stem), plan.file.name))]
+
+
+def _stored(plan: Plan, compression: str | None, jpeg_quality: int | None) -> Plan:
+    """The plan with what was asked for instead of the project's; a compression where the format has it."""
+    possible = COMPRESSIONS.get({".tif": "TIFF", ".exr": "EXR"}.get(plan.output.ending, ""), ())
+    chosen = compression if compression and compression.lower() in possible else plan.output.compression
+    quality = jpeg_quality or plan.output.jpeg_quality
+    return replace(plan, output=replace(plan.output, compression=chosen, jpeg_quality=quality))
+
+
+def _files(layers: Sequence[Layer]) -> list[Path]:
+    """The files of layers; of several pages once."""
+    return list(dict.fromkeys(layer.file for layer in layers if layer.file is not None))
+
+
+class _Maker:
+    """Makes the outputs of one branch, step by step."""
+
+    def __init__(
+        self,
+        branch: Branch,
+        settings: Settings,
+        metadata: bool,
+        progress: Progress,
+        open_device: OpenDevice | None,
+    ) -> None:
+        self.branch, self.plan, self.settings = branch, branch.plan, settings
+        self.metadata = describe(branch.plan) if metadata else None
+        self.progress, self.open_device = progress, open_device
+
+    def make(self, remap: Remap, keep_layers: bool) -> list[Path]:
+        """Make the layers, if need be, then all that is made of them; gives the outputs."""
+        keep = keep_layers or self.branch.keeps_layers
+        remap = _remap(self.plan, remap)
+        with (
+            open_layers(self.plan, remap=remap, keep_layers=keep, progress=self.progress) as opened,
+            work_folder() as scratch,
+        ):
+            images = [image for image in images_of(self.plan, opened) if image is not None]
+            names = [self.branch.layer(image) for image in images]
+            files = dict(zip(names, _files(opened), strict=False))
+            made = _files(opened) if self.branch.keeps_layers else []
+            for program, steps in groupby(self.branch.steps(images), key=lambda step: step.program):
+                if program == BLEND:
+                    for step in steps:
+                        files[step.result] = self._blend(step, files, scratch)
+                        made += [files[step.result]] if step.wanted else []
+                    continue
+                todo = list(steps)
+                with self.progress(program, len(todo)) as advance:
+                    for step in todo:
+                        files[step.result] = self._run(step, files, scratch)
+                        made += [files[step.result]] if step.wanted else []
+                        advance(1)
+        return made
+
+    def _target(self, step: Step, files: dict[str, Path], scratch: Path) -> Path:
+        """Where the result goes, which must be none of the inputs."""
+        target = (self.plan.folder if step.wanted else scratch) / step.result
+        photos = (image.photo for image in self.plan.images)
+        refuse_input(target, [self.plan.file, *photos, *(files[name] for name in step.inputs)])
+        return target
+
+    def _run(self, step: Step, files: dict[str, Path], scratch: Path) -> Path:
+        """Have another program make a file; with metadata, if it is an output."""
+        target, result = self._target(step, files, scratch), scratch / step.result
+        inputs = [str(files[name]) for name in step.inputs]
+        run([step.program, *step.options, "-o", str(result), "--", *inputs], scratch)
+        if step.wanted:
+            if self.metadata:
+                embed(result, ENDINGS[result.suffix], self.metadata)
+            move_whole(result, target, "free the folder")
+        return target
+
+    def _blend(self, step: Step, files: dict[str, Path], scratch: Path) -> Path:
+        """Blend layers, stacks or exposures as `merge.merge_project` does."""
+        target, plan = self._target(step, files, scratch), self.plan
+        layers = [read_layer(files[name]) for name in step.inputs]
+        check_layers(plan.canvas, layers)
+        final = plan.output if step.final else None
+        # few programs read TIFF with half floats; enblend writes floats, too
+        wide = layers[0].dtype == np.float16 and target.suffix == ".tif"
+        write_panorama(
+            target, layers, plan.canvas, self.settings, projection=plan.projection,
+            guides=partial(guides_of, plan, step.images, self.settings),
+            depth=np.float32 if wide else None,
+            compression=final.compression if final else None,
+            jpeg_quality=final.jpeg_quality if final else None,
+            metadata=self.metadata if step.wanted else None,
+            progress=self.progress, open_device=self.open_device,
+        )  # fmt: skip
+        return target

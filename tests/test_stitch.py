@@ -1,0 +1,286 @@
+"""Everything that a project asks for: the files of Hugin's own stitcher, blended by us."""
+
+from __future__ import annotations
+
+import shlex
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import OpenImageIO as oiio
+import pytest
+from conftest import ProjectMaker, names_in, require_program
+from pictures import one_device
+from test_exif import shown
+from test_hugin import CANVAS, NAME, stacked
+from test_metadata import shot
+
+from hugin_abflow import cli
+from hugin_abflow.errors import ExitCode, OutputError, ProgramFailedError
+from hugin_abflow.images import read_layer
+from hugin_abflow.merge import merge_project
+from hugin_abflow.outputs import Kind
+from hugin_abflow.stitch import show_project, stitch_project
+
+__all__ = ["one_device"]
+PART = 'f2 w400 h200 v250 S20,380,10,180 n"TIFF_m c:LZW r:CROP"'
+pytestmark = pytest.mark.usefixtures("one_device")
+
+
+@pytest.fixture(autouse=True)
+def programs() -> None:
+    for name in ("nona", "enfuse", "hugin_hdrmerge", "pano_trafo", "hugin_executor"):
+        require_program(name)
+
+
+def asked(*kinds: Kind, extra: str = "") -> str:
+    """The lines of a project in which these outputs are checked."""
+    lines = [f"#hugin_output{kind} {str(kind in kinds).lower()}" for kind in Kind]
+    return "\n".join([*lines, extra, ""])
+
+
+def pixels_of(path: Path) -> np.ndarray:
+    image = oiio.ImageBuf(str(path))
+    assert not image.has_error, image.geterror()
+    return np.asarray(image.get_pixels(image.spec().format))
+
+
+def hugins(project: Path, folder: Path) -> dict[str, Path]:
+    """What Hugin's stitcher makes of the project, with enblend, in another folder; by name."""
+    folder.mkdir()
+    for file in project.parent.iterdir():
+        (folder / file.name).write_bytes(file.read_bytes())
+    before = set(names_in(folder))
+    prefix = project.stem if project.suffix == ".pto" else project.name
+    command = ["hugin_executor", "-s", "-p", str(folder / prefix), str(folder / project.name)]
+    done = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stdout + done.stderr
+    return {name: folder / name for name in set(names_in(folder)) - before}
+
+
+@pytest.mark.parametrize(
+    ("how", "extra"),
+    [
+        pytest.param({"stem": NAME, "folder": "f é"}, "", id="360, names"),
+        pytest.param(
+            {"panorama": PART, "stem": "huginpto_1a", "ending": ""},
+            "#hugin_outputImageType jpg\n#hugin_outputJPEGQuality 93\n#hugin_outputImageTypeHDR tif",
+            id="part, cropped, JPEG, HDR as TIFF",
+        ),
+        pytest.param(
+            {"panorama": 'f1 w400 h150 v360 n"TIFF_m"'},
+            "#hugin_outputImageType png\n#hugin_enfuseOptions --hard-mask\n#hugin_hdrmergeOptions -m avg -c",
+            id="cylindrical, PNG, options",
+        ),
+    ],
+)
+def test_all_outputs_are_hugins_files(
+    make_project: ProjectMaker, exiftool: str, tmp_path: Path, how: dict, extra: str
+) -> None:
+    """Names, sizes, depth, place; layers and stacks nearly to the pixel."""
+    project = stacked(make_project(**({"panorama": CANVAS} | how)), asked(*Kind, extra=extra))
+    before = set(names_in(project.parent))
+    theirs = hugins(project, tmp_path / "theirs")
+    made = stitch_project(project)
+    new = set(names_in(project.parent)) - before
+    assert new == set(theirs)
+    assert {path.name for path in made} == {name for name in new if not name.endswith(".pgm")}
+    for path in made:
+        ours, other = pixels_of(path), pixels_of(theirs[path.name])
+        assert ours.shape == other.shape and ours.dtype == other.dtype, path.name
+        if path.suffix == ".tif":
+            assert read_layer(path).box == read_layer(theirs[path.name]).box, path.name
+        if "_exposure_layers_" in path.name or "_stack_ldr_" in path.name:
+            assert np.abs(ours.astype(int) - other.astype(int)).max() <= 2, path.name  # nona's dither
+
+
+def test_blends_are_those_of_their_layers(make_project: ProjectMaker, exiftool: str) -> None:
+    """Pixel by pixel what the command makes of the same files; with the first photo's metadata."""
+    project = stacked(make_project(panorama=CANVAS, icc=None), asked(*Kind))
+    shot(exiftool, project)
+    stitch_project(project)
+    folder, stem = project.parent, project.stem
+    for name, layers in {
+        f"{stem}.tif": [f"{stem}{index:04d}.tif" for index in range(6)],
+        f"{stem}_exposure_0000.tif": [f"{stem}_exposure_layers_{index:04d}.tif" for index in (0, 2, 4)],
+        f"{stem}_exposure_0001.tif": [f"{stem}_exposure_layers_{index:04d}.tif" for index in (1, 3, 5)],
+        f"{stem}_fused.tif": [f"{stem}_stack_ldr_{index:04d}.tif" for index in range(3)],
+        f"{stem}_hdr.exr": [f"{stem}_stack_hdr_{index:04d}.exr" for index in range(3)],
+    }.items():
+        again = folder / f"again{Path(name).suffix}"
+        merge_project(project, layers=[folder / layer for layer in layers], output=again)
+        np.testing.assert_array_equal(pixels_of(folder / name), pixels_of(again), err_msg=name)
+    for name in ("", "_fused", "_blended_fused", "_exposure_0001", "_stack_ldr_0002"):
+        tags = shown(exiftool, folder / f"{stem}{name}.tif")
+        assert tags["IFD0:Model"] == "Box", name
+        assert (tags["XMP-GPano:FullPanoWidthPixels"], tags["XMP-GPano:CroppedAreaTopPixels"]) == (400, 0)
+
+
+@pytest.mark.parametrize(
+    ("kinds", "made"),
+    [
+        ((), ["pano.tif"]),
+        ((Kind.PANORAMA,), ["pano.tif"]),
+        ((Kind.FUSED_STACKS,), ["pano_fused.tif"]),
+        ((Kind.FUSED_LAYERS,), ["pano_blended_fused.tif"]),
+        ((Kind.PANORAMA, Kind.HDR), ["pano.tif", "pano_hdr.exr"]),
+        ((Kind.STACKS,), [f"pano_stack_ldr_{number:04d}.tif" for number in range(3)]),
+    ],
+)
+def test_nothing_but_what_is_asked_for(
+    make_project: ProjectMaker, temporary: Path, capsys, kinds: tuple, made: list[str]
+) -> None:
+    """Names on stdout; intermediate files are gone."""
+    project = stacked(make_project(panorama=CANVAS), asked(*kinds))
+    before = set(names_in(project.parent))
+    assert cli.main([str(project)]) == 0
+    printed = capsys.readouterr().out.splitlines()
+    assert [Path(line).name for line in printed] == made
+    assert set(names_in(project.parent)) - before == set(made)
+
+
+def test_output_named_is_the_only_one(make_project: ProjectMaker, capsys) -> None:
+    project = stacked(make_project(panorama=CANVAS), asked(*Kind))
+    before = set(names_in(project.parent))
+    assert cli.main([str(project), "-o", str(project.with_name("only.png"))]) == 0
+    assert set(names_in(project.parent)) - before == {"only.png"}
+
+
+def test_options_reach_the_files(make_project: ProjectMaker) -> None:
+    """Depth of the photos; compression where a format has it; layers kept."""
+    kinds = asked(Kind.FUSED_STACKS, Kind.HDR)
+    project = make_project(panorama=CANVAS, dtype=np.uint16)
+    project.write_text(project.read_text() + kinds)
+    made = stitch_project(project, compression="deflate", metadata=False, keep_layers=True)
+    fused, hdr = made
+    image = oiio.ImageBuf(str(fused))
+    assert image.spec().format == oiio.UINT16 and image.spec().getattribute("compression") == "zip"
+    assert not image.spec().getattribute("Software")
+    assert oiio.ImageBuf(str(hdr)).spec().format == oiio.HALF
+    assert {"pano_exposure_layers_0002.tif", "pano_hdr_0002.exr"} <= set(names_in(project.parent))
+
+
+# What goes wrong
+
+
+@pytest.fixture
+def path_with(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., Path]:
+    """`path_with("nona", ...)`: PATH is a folder with these programs; gives it."""
+
+    def put(*names: str) -> Path:
+        folder = tmp_path / "programs"
+        folder.mkdir()
+        for name in names:
+            (folder / name).symlink_to(require_program(name))
+        monkeypatch.setenv("PATH", str(folder))
+        return folder
+
+    return put
+
+
+def test_what_cannot_be_made_is_said_and_left_out(make_project: ProjectMaker, path_with, capsys) -> None:
+    project = stacked(make_project(panorama=CANVAS), asked(Kind.PANORAMA, Kind.FUSED_STACKS))
+    path_with("nona", "pano_trafo")
+    assert cli.main(["-q", str(project)]) == 0
+    assert project.with_suffix(".tif").exists()
+    said = capsys.readouterr().err
+    assert "panorama, exposure fused from stacks" in said and "apt install enfuse" in said
+
+
+def test_nothing_can_be_made(make_project: ProjectMaker, path_with, capsys) -> None:
+    project = stacked(make_project(panorama=CANVAS), asked(Kind.FUSED_STACKS, Kind.STACKS))
+    before = names_in(project.parent)
+    path_with("nona", "pano_trafo")
+    for arguments in ([], ["--dry-run"]):
+        assert cli.main([*arguments, str(project)]) == ExitCode.PROGRAM
+        assert "nothing can be made: enfuse is not in PATH" in capsys.readouterr().err
+    assert names_in(project.parent) == before
+
+
+def test_program_that_fails_leaves_nothing(make_project: ProjectMaker, path_with, temporary: Path) -> None:
+    project = stacked(make_project(panorama=CANVAS), asked(Kind.FUSED_STACKS))
+    before = names_in(project.parent)
+    enfuse = path_with("nona", "pano_trafo") / "enfuse"
+    enfuse.write_text("#!/bin/sh\necho one; echo no such mask >&2; exit 1\n")
+    enfuse.chmod(0o755)
+    with pytest.raises(ProgramFailedError, match=r"enfuse failed \(exit code 1\).*\n  no such mask"):
+        stitch_project(project)
+    assert names_in(project.parent) == before
+
+
+def test_photo_is_never_replaced(make_project: ProjectMaker) -> None:
+    project = make_project(panorama=CANVAS, photo="pano_stack_ldr_{:04d}.tif".replace("{:04d}", "000{}"))
+    project.write_text(project.read_text() + asked(Kind.STACKS))
+    before = {path: path.read_bytes() for path in project.parent.iterdir()}
+    with pytest.raises(OutputError, match=r"pano_stack_ldr_0000\.tif is an input"):
+        stitch_project(project)
+    assert {path: path.read_bytes() for path in project.parent.iterdir()} == before
+
+
+# Shown, not made
+
+
+def test_dry_run_does_nothing(make_project: ProjectMaker, temporary: Path, capsys) -> None:
+    project = stacked(make_project(panorama=CANVAS, stem=NAME), asked(*Kind))
+    before = {path: path.read_bytes() for path in project.parent.iterdir()}
+    assert cli.main(["--dry-run", str(project)]) == 0
+    assert {path: path.read_bytes() for path in project.parent.iterdir()} == before
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[0] == f"# {NAME}.pto: 6 photos, equirectangular, 400 x 200 of 400 x 200"
+    calls = [shlex.split(line)[0] for line in lines if not line.startswith(("#", "cd "))]
+    assert calls == [
+        "nona", "hugin-abflow",
+        "nona", "hugin-abflow", "hugin-abflow", "enfuse", "enfuse", "enfuse", "enfuse", "hugin-abflow",
+        "nona", "hugin_hdrmerge", "hugin_hdrmerge", "hugin_hdrmerge", "hugin-abflow",
+    ]  # fmt: skip
+
+
+def test_commands_that_are_shown_make_the_files(
+    make_project: ProjectMaker, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Run as a script in another folder."""
+    project = stacked(make_project(panorama=CANVAS, stem=NAME), asked(Kind.FUSED_STACKS, Kind.HDR))
+    script = "\n".join(show_project(project))
+    made = {path.name: pixels_of(path) for path in stitch_project(project)}
+    for name in made:
+        (project.parent / name).unlink()
+    programs = tmp_path / "bin"
+    programs.mkdir()
+    (programs / "hugin-abflow").write_text(f'#!/bin/sh\nexec "{sys.executable}" -m hugin_abflow "$@"\n')
+    (programs / "hugin-abflow").chmod(0o755)
+    monkeypatch.setenv("PATH", str(programs), prepend=":")
+    subprocess.run(["sh", "-e", "-c", script], cwd=tmp_path, check=True, capture_output=True)
+    for name, pixels in made.items():
+        again = pixels_of(project.parent / name)
+        assert again.shape == pixels.shape and again.dtype == pixels.dtype
+        difference = np.abs(again.astype(float) - pixels.astype(float))
+        # nona's dither is another one each time, and with it a cut may take another way
+        assert (difference > 2).mean() < 1e-3 and difference.mean() < 0.1
+
+
+@pytest.mark.parametrize(
+    ("options", "expected"),
+    [
+        ({"output": "x y.jpg"}, ["nona", "hugin-abflow -o '{here}/x y.jpg' pano.pto --prefix pano"]),
+        ({"prefix": "l"}, ["hugin-abflow -o pano.tif pano.pto --prefix l"]),
+        ({"layers": ["a.tif"]}, ["hugin-abflow -o pano.tif pano.pto --layers {here}/a.tif"]),
+    ],
+)
+def test_dry_run_of_one_panorama(
+    make_project: ProjectMaker, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, options: dict, expected: list
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    lines = show_project(make_project(extra=asked(*Kind)), **options)[2:]
+    assert len(lines) == len(expected)
+    for line, begin in zip(lines, expected, strict=True):
+        assert line.startswith(begin.format(here=tmp_path))
+
+
+def test_dry_run_takes_layers_that_are_there(make_project: ProjectMaker) -> None:
+    project = make_project(panorama=CANVAS)
+    assert [line.split()[0] for line in show_project(project)[3:]] == ["nona", "hugin-abflow"]
+    merge_project(project, keep_layers=True)
+    assert [line.split()[0] for line in show_project(project)[3:]] == ["hugin-abflow"]
+    assert [line.split()[0] for line in show_project(project, remap="always")[3:]] == ["nona", "hugin-abflow"]
