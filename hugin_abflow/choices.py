@@ -18,7 +18,7 @@ _UNSETTLED = frozenset({"config", "print-config", "dry-run"})
 OF_THE_RUN = frozenset(
     {
         "projects", "recursive", "watch", "resume", "force", "jobs", "report", "log", "quiet", "verbose",
-        "profile", "config", "print_config", "dry_run",
+        "profile", "scheduler", "config", "print_config", "dry_run",
     }
 )  # fmt: skip
 

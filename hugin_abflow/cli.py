@@ -39,6 +39,7 @@ EXIT_CODES = {
     ExitCode.PARTIAL: "several projects: some succeeded, some failed",
     ExitCode.ALL_FAILED: "several projects: all failed",
     ExitCode.PROGRAM: "enfuse, hugin_hdrmerge or pano_trafo is missing, or failed",
+    ExitCode.CLUSTER: "the Dask cluster does not answer, or gave a project up",
     ExitCode.INTERRUPTED: "interrupted (Ctrl-C, SIGTERM); nothing half-written is left",
 }
 
@@ -219,6 +220,12 @@ _information = partial(click.option, cls=Option, group="Information")
     f"[default: {default_jobs()}, or as many as there are processor cores]",
 )
 @_batch(
+    "--scheduler",
+    metavar="ADDRESS",
+    help="Have the workers of a Dask cluster do the work, over shared storage. ADDRESS: of its scheduler, "
+    "such as tcp://host:8786.",
+)
+@_batch(
     "--report",
     metavar="FILE",
     type=_file,
@@ -353,6 +360,7 @@ def _run_options(
     quiet: bool,
     verbose: bool,
     profile: Path | None,
+    scheduler: str | None,
     **others: Any,
 ) -> tuple[bool, bool, bool, Run]:
     """What the options say about the run as a whole: --recursive, --resume, --force, and how it is done."""
@@ -361,7 +369,7 @@ def _run_options(
     if resume and force:
         raise click.UsageError("--resume and --force contradict each other")
     arguments = click.get_current_context().meta[ARGUMENTS]
-    return recursive, resume, force, Run(jobs, report, log, quiet, verbose, arguments, profile)
+    return recursive, resume, force, Run(jobs, report, log, quiet, verbose, arguments, profile, scheduler)
 
 
 def _options(

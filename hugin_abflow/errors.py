@@ -25,6 +25,7 @@ class ExitCode(IntEnum):
     PARTIAL = 10  # several projects: some succeeded, some failed
     ALL_FAILED = 11  # several projects: none succeeded
     PROGRAM = 12  # another program of Hugin's, or enfuse, is missing or failed
+    CLUSTER = 13  # the Dask cluster does not answer, or gave a project up
     INTERRUPTED = 130  # Ctrl-C
 
 
@@ -117,6 +118,12 @@ class SettingsError(AbflowError):
     """A setting is out of its range or of a wrong type."""
 
     exit_code = ExitCode.USAGE
+
+
+class ClusterError(AbflowError):
+    """The Dask cluster cannot be used."""
+
+    exit_code = ExitCode.CLUSTER
 
 
 class ConfigError(AbflowError):

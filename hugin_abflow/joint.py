@@ -21,6 +21,7 @@ from hugin_abflow import (
     coefficient,
     colour,
     consistency,
+    figures,
     flow,
     geometry,
     guidance,
@@ -137,16 +138,18 @@ def prepare(
     overlaps = _overlaps(device, reduced, masks)
     _check_memory(device, reduced, overlaps, masks, grid, settings)
     its_guides = by_pair(guides if settings.guides else ())
-    flows = (
+    flows, shifts = (
         _flows(device, reduced, masks, grid, overlaps, progress, settings, its_guides, numbers)
         if settings.flow
-        else []
+        else ([], [])
     )
     with progress("align", 1) as advance:
         for index, pair_flow in enumerate(flows):  # one by one: they are large
             flows[index] = consistency.mend(device, pair_flow)
         pairs = [pair for pair, _ in overlaps]
-        fields, correction = _align(device, reduced, pairs, flows, masks, grid, settings)
+        fields, correction, whole = _align(device, reduced, pairs, flows, masks, grid, settings)
+        if _log.isEnabledFor(logging.INFO):
+            _tell_overlaps(reduced, overlaps, shifts, grid, whole)
         final = [
             BlendLayer(layer.layer, layer.box, field, geometry.reach(device, layer, field, grid), gain)
             for layer, field, gain in zip(reduced, fields, correction.gains, strict=True)
@@ -164,13 +167,15 @@ def _align(
     masks: Masks,
     grid: Grid,
     settings: Settings,
-) -> tuple[list[Buffer], Correction]:
+) -> tuple[list[Buffer], Correction, npt.NDArray[np.bool_] | None]:
     """Geometry and colour that make the layers agree, without flow colour alone; where nothing does, one
-    layer whole. `flows` is emptied.
+    layer whole. `flows` is emptied. The last is where one layer was taken, on the seam grid; None: nowhere,
+    or everywhere, if there is no flow.
 
     What flow cannot explain spoils the exposure around it, which is found again without it.
     """
     regions: npt.NDArray[np.bool_] | None = None
+    whole: npt.NDArray[np.bool_] | None = None
     coefficients = transition.narrow(
         device, layers, coefficient.coefficients(device, layers, masks, grid, settings), flows, grid, settings
     )
@@ -194,8 +199,36 @@ def _align(
         # exposures have to agree where the eye compares them; elsewhere unaligned layers tell little
         regions = ~seam.divide(device, layers, fields, pairs, strict, masks, grid)
     elif regions is not None:
+        whole = regions
         seam.cut(device, layers, fields, pairs, strict, regions, masks, grid)
-    return fields, correct(settings, regions)
+    return fields, correct(settings, regions), whole
+
+
+def _tell_overlaps(
+    layers: Sequence[WorkingLayer],
+    overlaps: Sequence[tuple[Pair, npt.NDArray[np.bool_]]],
+    shifts: Sequence[figures.Parallax],
+    grid: Grid,
+    whole: npt.NDArray[np.bool_] | None,
+) -> None:
+    """Say of each overlap how far things shift in it, and how much of it is one layer's.
+
+    The log record has the same as `overlap`, for reports. shifts: empty where there is no flow.
+    """
+    for number, (pair, overlap) in enumerate(overlaps):
+        names = layers[pair.a].layer.name, layers[pair.b].layer.name
+        share = figures.share(overlap, seam.seam_grid(grid), whole) if shifts else 1.0
+        found: dict[str, object] = {"layers": list(names), "one_layer": round(share, 4)}
+        said = f"{share:.0%} from one layer"
+        if shifts:
+            shift = shifts[number]
+            found["parallax_median"], found["parallax_max"] = round(shift.median, 2), round(shift.largest, 2)
+            found["consistent"] = round(shift.consistent, 4)
+            said = (
+                f"parallax {shift.median:.1f} px, up to {shift.largest:.1f} px; "
+                f"{shift.consistent:.0%} consistent; {said}"
+            )
+        _log.info("overlap of %s and %s: %s", *names, said, extra={"overlap": found})
 
 
 def _read(
@@ -307,8 +340,8 @@ def _flows(
     settings: Settings,
     guides: Mapping[tuple[int, int], Sequence[Guide]],
     numbers: Sequence[int],
-) -> list[PairFlow]:
-    """Flow of every pair of layers, on the pair's own chart.
+) -> tuple[list[PairFlow], list[figures.Parallax]]:
+    """Flow of every pair of layers, on the pair's own chart, and figures of it if somebody listens.
 
     overlaps    the pairs, and where they overlap on the grid of `masks`.
     guides      of each two layers, by their numbers; numbers: what guides call each of `layers`.
@@ -317,7 +350,7 @@ def _flows(
     coarse = quality.coarseness(settings.flow_quality, grid.width * grid.height)
     largest = _REACH * (grid.canvas_width or grid.region.width) * grid.width / grid.region.width
     reach = largest / coarse if settings.large_motion else 0.0
-    result = []
+    result, shifts = [], []
     with progress("flow", len(overlaps)) as advance:
         for pair, overlap in overlaps:
             its_layers = (layers[pair.a], layers[pair.b])
@@ -330,7 +363,9 @@ def _flows(
                 placed = guidance.on_chart(its_guides, first, its_chart, grid)
                 found = guidance.lead(device, (image_a, image_b), found, placed, its_chart.around(grid))
             result.append(PairFlow(pair.a, pair.b, its_chart, *found))
+            if _log.isEnabledFor(logging.INFO):
+                shifts.append(figures.parallax(device, result[-1], (image_a, image_b), grid))
             advance(1)
         device.finish()  # kernels are only queued: the last pair's time would be told as that of what follows
     device.give_back()
-    return result
+    return result, shifts

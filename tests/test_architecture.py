@@ -18,6 +18,7 @@ KERNELS = {path.name for path in (ROOT / "kernels").glob("*.cl")}
 USERS = {
     "click": {"choices", "cli", "options", "terminal"},
     "rich": {"batch", "terminal"},
+    "distributed": {"batch"},
     "OpenImageIO": {"images", "imagewriter"},
     "pyopencl": {"opencl"},
 }

@@ -7,8 +7,10 @@ import re
 from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
 import pytest
-from shoots import write_project
+import tifffile
+from shoots import HEIGHT, WIDTH, textured, write_project
 
 from hugin_abflow import cli
 from hugin_abflow.batch.record import Record
@@ -29,6 +31,29 @@ def test_every_field_is_documented() -> None:
     assert set(report) == documented("The run")
     assert set(report["projects"][0]) == documented("A project")
     assert f"`schema` is {SCHEMA}" in PAGE
+
+
+def test_overlaps_are_in_the_report(tmp_path: Path) -> None:
+    """A picture beside itself, moved by three pixels."""
+    project = write_project(tmp_path / "a.pto")
+    path = tmp_path / "a0001.tif"
+    layer = tifffile.imread(path)
+    layer[..., :3] = np.roll(textured(HEIGHT, WIDTH), 3, axis=1) * (layer[..., 3:] > 0)
+    tifffile.imwrite(path, layer, photometric="rgb", extrasamples=["unassalpha"])
+    for arguments in ([], ["--no-flow"]):
+        report = tmp_path / "r.json"
+        assert cli.main([str(project), "--report", str(report), *arguments]) == 0
+        (overlap,) = json.loads(report.read_text("utf-8"))["projects"][0]["overlaps"]
+        assert sorted(overlap["layers"]) == ["a0000.tif", "a0001.tif"]
+        if arguments:
+            assert set(overlap) == {"layers", "one_layer"} and overlap["one_layer"] == 1
+        else:
+            assert set(overlap) == documented("An overlap")
+            # lengths are angles, in pixels of the equator: at 45 degrees the shift is shorter
+            assert overlap["parallax_median"] == pytest.approx(3 * np.sqrt(0.5), abs=0.2)
+            assert overlap["parallax_max"] == pytest.approx(3, abs=0.5)
+            assert 0.7 < overlap["consistent"] <= 1
+            assert 0 <= overlap["one_layer"] <= 0.2
 
 
 def test_report_of_a_run(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -74,11 +74,6 @@ class Display:
         self.quiet, self.verbose, self._log = quiet, verbose, log
         self.total = self.done = self.failed = 0
 
-    @property
-    def level(self) -> int:
-        """The level from which messages are wanted."""
-        return logging.INFO if self.verbose or self._log else logging.WARNING
-
     def __enter__(self) -> Display:
         return self
 

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from hugin_abflow import trace
+from hugin_abflow.batch.cluster import Cluster
 from hugin_abflow.batch.display import Display, choose_display, open_log
 from hugin_abflow.batch.pool import Alone, Pool
 from hugin_abflow.batch.record import Record
@@ -30,6 +31,7 @@ class Run:
     log         file to the end of which everything is written.
     arguments   the command line, for the report.
     profile     file for the trace, see trace.py.
+    scheduler   address of a Dask scheduler, whose workers do the work; None: this machine does.
     """
 
     jobs: int | None = None
@@ -39,6 +41,7 @@ class Run:
     verbose: bool = False
     arguments: Sequence[str] = ()
     profile: Path | None = None
+    scheduler: str | None = None
 
 
 def default_jobs() -> int:
@@ -65,8 +68,7 @@ def run(tasks: Iterable[Task | None], how: Run, lone: bool = False) -> ExitCode:
                     order = {task.project.absolute(): place for place, task in enumerate(filter(None, tasks))}
                 else:
                     tasks = _announced(tasks, display)
-                jobs = how.jobs or default_jobs()
-                with (Alone if lone else Pool)(jobs, display.level, display) as performers:
+                with _performers(how, lone, display) as performers:
                     for record in performers.run(tasks):
                         records.append(record)
                         if not how.quiet:
@@ -79,6 +81,15 @@ def run(tasks: Iterable[Task | None], how: Run, lone: bool = False) -> ExitCode:
             if how.report:
                 write_report(how.report, records, how.arguments)
     return combine([record.exit_code for record in records])
+
+
+def _performers(how: Run, lone: bool, display: Display) -> Alone | Pool | Cluster:
+    """Who performs the tasks."""
+    # figures of overlaps are told as messages
+    level = logging.INFO if how.verbose or how.log or how.report or not lone else logging.WARNING
+    if how.scheduler:
+        return Cluster(how.scheduler, level, display)
+    return (Alone if lone else Pool)(how.jobs or default_jobs(), level, display)
 
 
 def _announced(tasks: Iterable[Task | None], display: Display) -> Iterator[Task | None]:

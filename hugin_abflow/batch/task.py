@@ -72,6 +72,8 @@ def perform(task: Task, listener: Listener, level: int = logging.WARNING) -> Rec
     def show(said: logging.LogRecord) -> None:
         if said.levelno >= logging.WARNING:
             record.warnings.append(said.getMessage())
+        if hasattr(said, "overlap"):
+            record.overlaps.append(said.overlap)
         listener.message(said.levelno, said.getMessage())
 
     with messages(level, show=show):
