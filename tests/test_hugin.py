@@ -13,7 +13,7 @@ import numpy as np
 import OpenImageIO as oiio
 import pytest
 import tifffile
-from conftest import ICC, ProjectMaker, names_in, photo_pixels, require_program
+from conftest import ProjectMaker, names_in, photo_pixels, require_program
 from layer_files import X_POSITION, Y_POSITION
 from pictures import one_device
 
@@ -111,7 +111,6 @@ def ours(hugin: Hugin, project: Path, output: Path) -> np.ndarray:
 @pytest.mark.parametrize(
     ("how", "size", "offset"),
     [
-        pytest.param({}, (400, 200), (0, 0), id="360"),
         pytest.param(
             {"folder": "f é", "stem": NAME, "photo": "p'h {} ß.tif", "channels": 1},
             (400, 200),
@@ -124,14 +123,7 @@ def ours(hugin: Hugin, project: Path, output: Path) -> np.ndarray:
             (0, 30),
             id="rows, disabled",
         ),
-        pytest.param({"dtype": np.uint16, "icc": ICC}, (400, 200), (0, 0), id="16 bit, ICC"),
         pytest.param({"panorama": 'f1 w400 h150 v360 n"TIFF_m"'}, (400, 150), (0, 0), id="cylindrical"),
-        pytest.param(
-            {"panorama": 'f0 w300 h200 v110 S20,280,10,190 n"TIFF_m"', "yaws": (-20, 5, 30)},
-            (260, 180),
-            (20, 10),
-            id="rectilinear, cropped",
-        ),
     ],
 )
 def test_stitcher_runs_through_us(
@@ -222,14 +214,6 @@ def test_project_in_the_options_is_used(hugin: Hugin, make_project: ProjectMaker
     np.testing.assert_array_equal(read(told.parent / f"{NAME}.tif"), ours(hugin, told, tmp_path / "told.tif"))
 
 
-def test_stitcher_makes_jpeg(hugin: Hugin, make_project: ProjectMaker, tmp_path: Path) -> None:
-    asked = "#hugin_outputImageType jpg\n#hugin_outputJPEGQuality 92\n"
-    project = make_project(panorama=CANVAS, extra=asked)
-    hugin.stitch(project)
-    panorama = read(project.parent / f"{NAME}.jpg")
-    np.testing.assert_array_equal(panorama, ours(hugin, project, tmp_path / "ours.jpg"))
-
-
 def test_failure_of_the_blender_is_the_stitchers(hugin: Hugin, make_project: ProjectMaker) -> None:
     """What a user writes into Hugin's options may be wrong."""
     project = make_project(panorama=CANVAS, extra="#hugin_enblendOptions --bogus\n")
@@ -283,17 +267,3 @@ def test_sequence_leaves_only_the_panorama(hugin: Hugin, exiftool: str, make_pro
     assert set(names_in(project.parent)) - before == {panorama.name}
     assert read(panorama).shape == (200, 400, 4)
     assert metadata(exiftool, panorama)["Model"] == "Box"
-
-
-def test_sequence_fuses_stacks_first(hugin: Hugin, make_project: ProjectMaker, tmp_path: Path) -> None:
-    """Two exposures of each view are fused by enfuse, the three fused ones blended."""
-    require_program("enfuse")
-    project = stacked(make_project(panorama=CANVAS))
-    before = set(names_in(project.parent))
-    log = hugin.stitch(project, "-u", "abflow_stacks.executor")
-    assert log.count("Fusing stacks") == 3
-    assert set(names_in(project.parent)) - before == {f"{NAME}_fused.tif"}
-    assert len(hugin.layers()) == 3
-    plain = make_project(folder="plain", panorama=CANVAS)
-    pixels = read(project.parent / f"{NAME}_fused.tif")
-    np.testing.assert_array_equal(pixels, ours(hugin, plain, tmp_path / "ours.tif"))
