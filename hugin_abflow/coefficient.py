@@ -23,10 +23,11 @@ _FINE_PIXELS = 600_000
 
 @dataclass(frozen=True)
 class Coefficients:
-    """Of one layer, float32 on the layer's box of the working grid.
+    """Of one layer, on its box of the working grid.
 
-    blend   w_k, the blend coefficient; 0 outside the layer, 1 where it is alone.
-    rim     m_k = min(1, D_k / feather), which takes the layer's colour weight to 0 at its border.
+    blend   float32, w_k, the blend coefficient; 0 outside the layer, 1 where it is alone.
+    rim     uint8, 255ths of m_k = min(1, D_k / feather), which takes the layer's colour weight to 0 at its
+            border.
     """
 
     blend: Buffer
@@ -130,7 +131,7 @@ def coefficients(
         expanded.append(blend)
     result = []
     for layer, blend in zip(layers, expanded, strict=True):
-        rim = device.empty(blend.shape)
+        rim = device.empty(blend.shape, np.uint8)
         device.run(
             "coefficient", "coefficient_ratio", layer.box[2:], blend, layer.box, grid.border, total,
             settings.border_feather, rim,

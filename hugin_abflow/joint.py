@@ -51,9 +51,9 @@ _LEAST_OVERLAP = 64
 _SEAM_ROUNDS = 2
 # Motion that is looked for, as a share of the canvas's width.
 _REACH = 0.1
-# Bytes that are to come for each working pixel of a layer: a field, three arrays of coefficients; for each
+# Bytes that are to come for each working pixel of a layer: a field, an array of coefficients, a rim; for each
 # that two layers share: flow both ways, on a chart that is half as large again.
-_STEP_BYTES, _FLOW_BYTES = 16 + 3 * 4, 1.5 * 16
+_STEP_BYTES, _FLOW_BYTES = 16 + 4 + 1, 1.5 * 16
 # Below this a working canvas is too small to be worth another attempt.
 _LEAST_WORKING_PIXELS = 20_000
 
@@ -176,9 +176,8 @@ def _align(
     """
     regions: npt.NDArray[np.bool_] | None = None
     whole: npt.NDArray[np.bool_] | None = None
-    coefficients = transition.narrow(
-        device, layers, coefficient.coefficients(device, layers, masks, grid, settings), flows, grid, settings
-    )
+    coefficients = coefficient.coefficients(device, layers, masks, grid, settings)
+    transition.narrow(device, layers, coefficients, flows, grid, settings)
     fields = geometry.fields(device, layers, coefficients, flows, grid, settings)
     flows.clear()  # these are as large as the layers, and not needed again
     del coefficients

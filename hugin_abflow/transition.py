@@ -13,7 +13,6 @@ with a smooth n: most of an overlap comes from one photo as it is, and no transi
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 
 import numpy as np
 import numpy.typing as npt
@@ -43,10 +42,10 @@ def narrow(
     flows: Sequence[PairFlow],
     grid: Grid,
     settings: Settings,
-) -> Sequence[Coefficients]:
-    """Coefficients as steep as `settings.transition_strain` allows; as they are where that is 0."""
+) -> None:
+    """Make coefficients as steep as `settings.transition_strain` allows, in place; 0 changes nothing."""
     if settings.transition_strain == 0 or not flows:
-        return coefficients
+        return
     cells = grid.coarser(_CELL)
     strain = device.zeros((*cells.shape, 2))
     displacements = geometry.displacements(device, layers, coefficients, flows, grid, settings, _EVERY)
@@ -57,19 +56,15 @@ def narrow(
         )  # fmt: skip
     power = device.upload(exponent(strain.get().astype(np.float64), settings.transition_strain, cells.wraps))
     total = device.zeros(grid.shape)
-    result = []
     for layer, coefficient in zip(layers, coefficients, strict=True):
-        blend = device.copy(coefficient.blend)
         device.run(
-            "transition", "transition_sharpen", layer.box[2:], blend, layer.box, grid.border, power,
-            cells.border, total,
+            "transition", "transition_sharpen", layer.box[2:], coefficient.blend, layer.box, grid.border,
+            power, cells.border, total,
         )  # fmt: skip
-        result.append(replace(coefficient, blend=blend))
-    for layer, coefficient in zip(layers, result, strict=True):
+    for layer, coefficient in zip(layers, coefficients, strict=True):
         device.run(
             "transition", "transition_ratio", layer.box[2:], coefficient.blend, layer.box, grid.border, total
         )
-    return result
 
 
 def exponent(strain: npt.NDArray[np.float64], wanted: float, wraps: bool) -> npt.NDArray[np.float32]:

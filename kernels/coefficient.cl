@@ -131,13 +131,14 @@ __kernel void coefficient_ratio(__global float *distance,     /* (box.w, box.z) 
                                 int4 working,                 /* working grid */
                                 __global const float *total,  /* (working.y, working.x) */
                                 float feather,                /* working px, 0: none */
-                                __global float *rim)          /* (box.w, box.z) m_k = min(1, D_k / feather) */
+                                __global uchar *rim)          /* (box.w, box.z) m_k = min(1, D_k / feather), in 255ths */
 {
     const int x = get_global_id(0), y = get_global_id(1);
     if (x >= box.z || y >= box.w)
         return;
     const int at = y * box.z + x;
     const float d = distance[at];
-    rim[at] = d < feather ? d / feather : (d > 0.0f ? 1.0f : 0.0f);
+    /* rounded up: what nothing else shows is not lost */
+    rim[at] = d < feather ? LEAST((int)(255.0f * d / feather) + (d > 0.0f ? 1 : 0), 255) : (d > 0.0f ? 255 : 0);
     distance[at] = d > 0.0f ? d / total[(y + box.y) * working.x + x + box.x] : 0.0f;
 }

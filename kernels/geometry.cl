@@ -71,7 +71,7 @@ __kernel void geometry_activation(__global float4 *field,        /* (box.w, box.
 /* s_k (not yet normalised) = m_k * exp(a_k - max a). */
 __kernel void geometry_softmax(__global float4 *field,       /* (box.w, box.z); s_k replaces a_k */
                                __global const float *blend,  /* (box.w, box.z) w_k */
-                               __global const float *rim,    /* (box.w, box.z) m_k */
+                               __global const uchar *rim,    /* (box.w, box.z) m_k in 255ths */
                                int4 box, int4 border,        /* place on the working grid, run size */
                                __global const float *highest) /* (border.y, border.x) */
 {
@@ -80,7 +80,7 @@ __kernel void geometry_softmax(__global float4 *field,       /* (box.w, box.z); 
         return;
     const int at = y * box.z + x;
     field[at].w = blend[at] > 0.0f
-                      ? rim[at] * exp(field[at].w - highest[(y + box.y) * border.x + x + box.x])
+                      ? rim[at] / 255.0f * exp(field[at].w - highest[(y + box.y) * border.x + x + box.x])
                       : 0.0f;
 }
 

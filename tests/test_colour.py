@@ -44,7 +44,7 @@ def displacement(seed: int, box: tuple[int, int, int, int], grid: Grid) -> np.nd
 
 
 def two_sides(name: str, lamps: bool = False) -> list:
-    """Two layers that overlap, with their fields and boxes, as kernels take them; lamps: bright on one side."""
+    """Two layers that overlap, with fields and boxes, as kernels take them; lamps: bright on one side."""
     grid = GRIDS[name]
     sides: list = []
     for i, box in enumerate(((0, 0, 60, grid.height), (9, 1, grid.width - 9, grid.height - 1))):

@@ -97,7 +97,7 @@ def test_activation_and_softmax_equal_their_twins(device: Device, name: str) -> 
     field = random.normal(size=(29, 51, 4)).astype(np.float32)
     blend = (random.random((29, 51)) * patches(6, 51, 29, 0.8)).astype(np.float32)
     blend[3, 5:9] = 1
-    rim = random.random((29, 51)).astype(np.float32)
+    rim = random.integers(0, 256, (29, 51)).astype(np.uint8)
     before = (random.random(grid.shape) * 12).astype(np.float32)
     highest, out = device.upload(before), device.upload(field)
     device.run(
@@ -131,7 +131,7 @@ def test_twins_of_the_softmax_are_the_formulas() -> None:
         )
         fields.append(field)
     weights = [
-        twin.geometry_softmax(f, np.array([[b]]), np.ones((1, 1)), (0, 0, 1, 1), top)[0, 0, 3]
+        twin.geometry_softmax(f, np.array([[b]]), np.full((1, 1), 255), (0, 0, 1, 1), top)[0, 0, 3]
         for f, b in zip(fields, blends, strict=True)
     ]
     activations = [
@@ -179,7 +179,7 @@ def whole(device: Device, grid: Grid, blend: float | np.ndarray) -> tuple[Workin
     """A layer that covers the grid, with a coefficient."""
     layer = on_device(device, np.ones((*grid.shape, 4)))
     blends = np.broadcast_to(np.float32(blend), grid.shape)
-    return layer, Coefficients(device.upload(blends), device.upload(np.ones(grid.shape, np.float32)))
+    return layer, Coefficients(device.upload(blends), device.empty(grid.shape, np.uint8).fill(255))
 
 
 def whole_chart(grid: Grid) -> Chart:

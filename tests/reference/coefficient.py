@@ -87,8 +87,8 @@ def coefficient_expand(
 def coefficient_ratio(
     distance: Array, box: Sequence[int], total: Array, feather: float
 ) -> tuple[Array, Array]:
-    """w_k and m_k on the layer's box."""
+    """w_k and 255 m_k, rounded up, on the layer's box."""
     summed = total[box[1] : box[1] + box[3], box[0] : box[0] + box[2]]
     outside = distance <= 0
     rim = np.minimum(1, distance / feather) if feather > 0 else np.where(outside, 0.0, 1.0)
-    return np.where(outside, 0.0, distance / np.where(outside, 1, summed)), rim
+    return np.where(outside, 0.0, distance / np.where(outside, 1, summed)), np.ceil(255 * rim)

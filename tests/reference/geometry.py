@@ -75,7 +75,7 @@ def geometry_softmax(field: Array, blend: Array, rim: Array, box: Sequence[int],
     """s_k, not normalised, in the field's last channel."""
     result = field.astype(np.float64)
     top = highest[box[1] : box[1] + box[3], box[0] : box[0] + box[2]]
-    result[..., 3] = np.where(blend > 0, rim * np.exp(np.minimum(field[..., 3] - top, 0)), 0.0)
+    result[..., 3] = np.where(blend > 0, rim / 255 * np.exp(np.minimum(field[..., 3] - top, 0)), 0.0)
     return result
 
 
