@@ -294,6 +294,11 @@ class Device:
         shared = self.device.host_unified_memory
         return 0 if shared else sum(buffer.nbytes for buffer in self.buffers)
 
+    @property
+    def kind(self) -> str:
+        """ "GPU", "CPU" or "other"."""
+        return _kind(self.device)
+
     def empty(self, shape: Sequence[int], dtype: npt.DTypeLike = np.float32) -> Buffer:
         """An uninitialised array."""
         return Buffer(self, tuple(shape), dtype)

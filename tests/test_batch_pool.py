@@ -4,15 +4,19 @@ from __future__ import annotations
 
 import logging
 import os
+from itertools import groupby
 from pathlib import Path
+from typing import Any
 
 import pytest
 from shoots import write_project
 
+from hugin_abflow.batch import pool, worker
 from hugin_abflow.batch.pool import ATTEMPTS, Pool
 from hugin_abflow.batch.record import Record
 from hugin_abflow.batch.task import Task
 from hugin_abflow.errors import ExitCode
+from hugin_abflow.opencl import Device
 from hugin_abflow.settings import Settings
 
 posix = pytest.mark.skipif(os.name == "nt", reason="the stand-in for nona is a shell script")
@@ -55,8 +59,8 @@ class Watch:
 
 def perform(tasks: list[Task], jobs: int) -> tuple[dict[str, Record], Watch]:
     watch = Watch()
-    with Pool(jobs, logging.INFO, watch) as pool:
-        records = {record.project.stem: record for record in pool.run(tasks)}
+    with Pool(jobs, logging.INFO, watch) as processes:
+        records = {record.project.stem: record for record in processes.run(tasks)}
     return records, watch
 
 
@@ -123,8 +127,74 @@ def test_process_that_died_once_is_forgiven(tmp_path: Path, monkeypatch: pytest.
 
 def test_pool_can_be_used_again(tmp_path: Path) -> None:
     watch = Watch()
-    with Pool(1, logging.WARNING, watch) as pool:
+    with Pool(1, logging.WARNING, watch) as processes:
         for name in "ab":
-            (record,) = pool.run(tasks_in(tmp_path, name))
+            (record,) = processes.run(tasks_in(tmp_path, name))
             assert record.result == "made"
     assert watch.done == ["a", "b"]
+
+
+def work_with_graphics_card(*arguments: Any) -> None:
+    """A worker that takes its device for a graphics card."""
+    Device.kind = "GPU"
+    worker.work(*arguments)
+
+
+@pytest.mark.parametrize("card", [True, False])
+def test_one_project_at_a_time_computes_on_a_graphics_card(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, card: bool
+) -> None:
+    told: list[tuple[str, str]] = []
+
+    class Teller(Ear):
+        def __init__(self, name: str) -> None:
+            super().__init__()
+            self.name = name
+
+        def phase_began(self, name: str, total: int) -> None:
+            told.append((self.name, name))
+
+        def phase_ended(self, name: str, seconds: float) -> None:
+            told.append((self.name, f"{name} done"))
+
+    if card:
+        monkeypatch.setattr(pool, "work", work_with_graphics_card)
+    watch = Watch()
+    watch.ears = {name: Teller(name) for name in "abcd"}
+    tasks = tasks_in(tmp_path, *"abcd")
+    (tmp_path / "c0000.tif").write_bytes(
+        (tmp_path / "c0000.tif").read_bytes()[:90_000]
+    )  # fails in the middle
+    with Pool(2, logging.WARNING, watch) as processes:
+        results = {record.project.stem: record.result for record in processes.run(tasks)}
+    assert results == {"a": "made", "b": "made", "c": "failed", "d": "made"}
+    computing = [(who, what) for who, what in told if what.split()[0] in ("flow", "align", "blend")]
+    turns = [who for who, _ in groupby(computing, key=lambda event: event[0])]
+    if card:
+        assert sorted(turns) == sorted(set(turns)) and set(turns) >= set("abd")
+
+
+def test_turn_of_a_dead_process_goes_to_the_next(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(pool, "work", work_until_blend)
+    records, _ = perform(tasks_in(tmp_path, "doomed", "a", "b"), 2)
+    assert records["a"].result == records["b"].result == "made"
+    assert "ended with code 3" in records["doomed"].message and records["doomed"].attempts == ATTEMPTS
+
+
+def work_until_blend(*arguments: Any) -> None:
+    """A worker with a graphics card that dies at it, of one of the projects."""
+
+    def die(listener: object, name: str, total: int) -> None:
+        if name == "blend" and doomed[-1]:
+            os._exit(3)
+
+    doomed: list[bool] = []
+    real = worker.perform
+
+    def perform_or_die(task: Task, *rest: Any) -> Record:
+        doomed.append(task.project.stem == "doomed")
+        return real(task, *rest)
+
+    worker.perform = perform_or_die
+    worker._Sender.phase_began = die
+    work_with_graphics_card(*arguments)

@@ -9,6 +9,7 @@ from __future__ import annotations
 import multiprocessing
 import signal
 import threading
+import time
 from collections import deque
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
@@ -20,7 +21,7 @@ from typing import Protocol
 from hugin_abflow import trace
 from hugin_abflow.batch.record import Record
 from hugin_abflow.batch.task import Listener, Task, perform
-from hugin_abflow.batch.worker import work
+from hugin_abflow.batch.worker import GO, work
 from hugin_abflow.errors import ExitCode
 
 # A project is tried again once if its process dies or its device fails: both may be another project's fault.
@@ -54,12 +55,20 @@ class _Worker:
         self.task: Task | None = None
         self._listener: Listener | None = None
         self._attempt = 0
+        self.turn_wanted: float | None = None  # since when it waits for the device
+        self.has_turn = False
 
     def begin(self, task: Task, attempt: int, listener: Listener) -> None:
         """Have it stitch a project, for the first or second time."""
         self.task, self._attempt, self._listener = task, attempt, listener
         with suppress(OSError):  # dead already: the pipe says so when it is read
             self.pipe.send(task)
+
+    def grant_turn(self) -> None:
+        """Let it compute on the device."""
+        self.turn_wanted, self.has_turn = None, True
+        with suppress(OSError):
+            self.pipe.send(GO)
 
     def end(self) -> None:
         """Let it go once it has nothing to do."""
@@ -78,6 +87,10 @@ class _Worker:
                 "run it alone with -v, and with fewer --jobs"
             )
         else:
+            if name in ("turn_wanted", "turn_done"):
+                self.turn_wanted = time.monotonic() if name == "turn_wanted" else None
+                self.has_turn = False
+                return None
             if name != "ended":
                 getattr(self._listener, name)(*values)
                 return None
@@ -88,6 +101,7 @@ class _Worker:
 
     def release(self) -> Task:
         """What it has done; it is free for another."""
+        self.turn_wanted, self.has_turn = None, False
         task, self.task = self.task, None
         assert task is not None
         return task
@@ -158,8 +172,10 @@ class Pool:
                 worker = next(one for one in self._workers if one.pipe is pipe)
                 record = worker.hear()
                 if record is None:
+                    self._grant_turn()
                     continue
                 task = worker.release()
+                self._grant_turn()
                 if worker.process.exitcode is not None:
                     self._workers.remove(worker)
                 if self._retry(worker, record):
@@ -167,6 +183,12 @@ class Pool:
                     continue
                 self._watcher.ended(task, record)
                 yield record
+
+    def _grant_turn(self) -> None:
+        """Let the one that has waited longest compute, if nobody does."""
+        waiting = [worker for worker in self._workers if worker.turn_wanted is not None]
+        if waiting and not any(worker.has_turn for worker in self._workers):
+            min(waiting, key=lambda worker: worker.turn_wanted or 0.0).grant_turn()
 
     def _retry(self, worker: _Worker, record: Record) -> bool:
         """Whether another attempt may end better."""

@@ -27,6 +27,9 @@ from hugin_abflow.terminal import explain, is_bug, messages
 
 _log = logging.getLogger(__name__)
 
+# Phases that keep the device busy, up to the last; before them layers are remapped and decoded.
+_COMPUTING = ("flow", "align", "blend")
+
 
 @dataclass(frozen=True)
 class Task:
@@ -41,6 +44,16 @@ class Task:
     options: Mapping[str, Any] = field(default_factory=dict)
     resume: bool = False
     remember: bool = False
+
+
+class Turn(Protocol):
+    """The right to compute on a device that several processes share; calls that change nothing are fine."""
+
+    def take(self) -> None:
+        """Wait for it."""
+
+    def give_back(self) -> None:
+        """Let the next one have it."""
 
 
 class Listener(Protocol):
@@ -59,10 +72,11 @@ class Listener(Protocol):
         """A message of `logging`'s level."""
 
 
-def perform(task: Task, listener: Listener, level: int = logging.WARNING) -> Record:
+def perform(task: Task, listener: Listener, level: int = logging.WARNING, turn: Turn | None = None) -> Record:
     """Stitch the project of a task. Errors end in the record; only interruptions are raised.
 
     level       of the messages that `listener` gets; an error is no message but in the record.
+    turn        is waited for before the project computes on a graphics card.
     """
     record = Record(task.project.absolute(), started=datetime.now(UTC).isoformat(timespec="seconds"))
     record.settings = settings_of(task)
@@ -80,7 +94,7 @@ def perform(task: Task, listener: Listener, level: int = logging.WARNING) -> Rec
         try:
             state = _state(task, record)
             if not (state and task.resume and state.restore(record)):
-                _stitch(task, record, listener)
+                _stitch(task, record, listener, turn)
                 if state and task.remember:
                     state.save(record)
         except Exception as error:
@@ -90,6 +104,9 @@ def perform(task: Task, listener: Listener, level: int = logging.WARNING) -> Rec
             if is_bug(error):
                 _log.info("%s", traceback.format_exc().rstrip())
             record.message, record.exit_code = explain(str(task.project), error)
+        finally:
+            if turn:
+                turn.give_back()
     record.seconds = round(time.monotonic() - began, 3)
     record.memory = memory.peak()
     return record
@@ -108,23 +125,29 @@ def _state(task: Task, record: Record) -> State | None:
     return None
 
 
-def _stitch(task: Task, record: Record, listener: Listener) -> None:
+def _stitch(task: Task, record: Record, listener: Listener, turn: Turn | None) -> None:
     """Fill in the record while the panorama is made."""
     record.versions = _versions()
+    shared = False  # a processor serves several at a time; a graphics card's memory may not hold two
 
     def open_device(wanted: str | None, threads: int) -> Device:
+        nonlocal shared
         device = _device(wanted, threads, trace.is_recording())
-        record.device = device.name
+        record.device, shared = device.name, device.kind != "CPU"
         return device
 
     @contextmanager
     def progress(phase: str, total: int) -> Iterator[Advance]:
+        if turn and shared and phase in _COMPUTING:
+            turn.take()
         began = time.monotonic()
         listener.phase_began(phase, total)
         yield lambda units: listener.advanced(phase, units)
         seconds = time.monotonic() - began
         record.phases[phase] = round(record.phases.get(phase, 0.0) + seconds, 3)
         listener.phase_ended(phase, seconds)
+        if turn and phase == _COMPUTING[-1]:
+            turn.give_back()  # what is left is to encode
 
     made = stitch_project(
         task.project, **task.options, progress=trace.phases(progress), open_device=open_device

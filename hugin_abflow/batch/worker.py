@@ -46,6 +46,29 @@ class _Sender:
         self.send("message", level, text)
 
 
+# What the pool answers to "turn_wanted".
+GO = "go"
+
+
+class _Turn:
+    """A turn at the device, which the pool gives to one process at a time."""
+
+    def __init__(self, sender: _Sender) -> None:
+        self._sender, self._held = sender, False
+        self.granted: queue.SimpleQueue[str] = queue.SimpleQueue()
+
+    def take(self) -> None:
+        if not self._held:
+            self._sender.send("turn_wanted")
+            self.granted.get()
+            self._held = True
+
+    def give_back(self) -> None:
+        if self._held:
+            self._sender.send("turn_done")
+            self._held = False
+
+
 def work(pipe: Connection, level: int, traced: bool, sharers: int) -> None:
     """Perform the tasks that come through `pipe`, until None comes or the other end is closed.
 
@@ -56,21 +79,25 @@ def work(pipe: Connection, level: int, traced: bool, sharers: int) -> None:
     memory.share(sharers)
     orders: queue.SimpleQueue[Task | None] = queue.SimpleQueue()
     sender = _Sender(pipe)
+    turn = _Turn(sender)
     try:
         with interruptible(), trace.collecting() if traced else nullcontext(list) as taken:
-            threading.Thread(target=_read, args=(pipe, orders), daemon=True).start()
+            threading.Thread(target=_read, args=(pipe, orders, turn), daemon=True).start()
             while (task := orders.get()) is not None:
-                record = perform(task, sender, level)
+                record = perform(task, sender, level, turn)
                 sender.send("ended", record, taken())
     except KeyboardInterrupt:
         pass  # nobody is left to be told
 
 
-def _read(pipe: Connection, orders: queue.SimpleQueue[Task | None]) -> None:
+def _read(pipe: Connection, orders: queue.SimpleQueue[Task | None], turn: _Turn) -> None:
     """Hand on what the pool sends; when it is gone, end this process as a signal would."""
     try:
         while (order := pipe.recv()) is not None:
-            orders.put(order)
+            if order == GO:
+                turn.granted.put(order)
+            else:
+                orders.put(order)
         orders.put(None)
     except (EOFError, OSError):
         if os.name == "nt":
