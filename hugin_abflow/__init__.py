@@ -10,6 +10,7 @@ from hugin_abflow.images import read_layer, read_layers, write_image
 from hugin_abflow.layer import Box, Canvas, Layer
 from hugin_abflow.merge import merge_layers, merge_project
 from hugin_abflow.settings import Settings
+from hugin_abflow.stitch import stitch_project
 
 __all__ = [
     "AbflowError",
@@ -24,5 +25,6 @@ __all__ = [
     "pto",
     "read_layer",
     "read_layers",
+    "stitch_project",
     "write_image",
 ]

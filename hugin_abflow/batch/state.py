@@ -37,7 +37,7 @@ Entry = dict[str, Any]
 class State:
     """The memory of one project.
 
-    project     its file. options: keywords of `merge_project`. settings: all options as plain values.
+    project     its file. options: keywords of `stitch_project`. settings: all options as plain values.
 
     Raises the `AbflowError` family for a project that cannot be read.
     """

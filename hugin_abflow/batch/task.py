@@ -114,7 +114,7 @@ def perform(task: Task, listener: Listener, level: int = logging.WARNING, turn: 
 
 def _state(task: Task, record: Record) -> State | None:
     """What is remembered of the project; tells `record` of the inputs. None where one of them cannot be read,
-    of which `merge_project` tells.
+    of which `stitch_project` tells.
     """
     with suppress(AbflowError, OSError):
         state = State(task.project, task.options, settings_of(task))
