@@ -80,13 +80,13 @@ def test_report_of_a_run(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> 
     assert "b0000.tif" in capsys.readouterr().err
 
 
-def test_report_that_cannot_be_written_is_told(
+def test_report_that_cannot_be_written_ends_the_run_before_it_starts(
     replace: Callable[..., None], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     replace(lambda path, **keywords: path.with_suffix(".tif"))
     assert cli.main(["a.pto", "--report", str(tmp_path / "no" / "r.json")]) == ExitCode.OUTPUT
     output = capsys.readouterr()
-    assert output.out == "a.tif\n" and "--report" in output.err
+    assert output.out == "" and "--report" in output.err
 
 
 def test_report_is_replaced_whole(tmp_path: Path) -> None:

@@ -61,6 +61,8 @@ def run(tasks: Iterable[Task | None], how: Run, lone: bool = False) -> ExitCode:
     with ExitStack() as stack:
         log = stack.enter_context(open_log(how.log))
         stack.enter_context(trace.recording(how.profile))
+        if how.report:
+            write_report(how.report, [], how.arguments)  # now: a run may be long
         try:
             with choose_display(lone, how.quiet, how.verbose, log) as display:
                 if isinstance(tasks, Sequence):
