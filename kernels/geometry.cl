@@ -41,7 +41,8 @@ __kernel void geometry_add(__global const float *blend_j,   /* (box_j.w, box_j.z
     const float2 f = bilinear_flow(flow, u, grid);
     if (f.x == 0.0f && f.y == 0.0f)
         return;
-    const float3 d = chart_point(u + f, &chart) - chart_point(u, &chart);
+    /* on a sphere q is the chart's point at u, on a plane that wraps a copy of it */
+    const float3 d = chart.sd == 0.0f ? (float3)(f.x / chart.s9, f.y / chart.sa, 0.0f) : chart_point(u + f, &chart) - q;
     field[at].xyz += (use_guess ? -w : w) * d;
 }
 
