@@ -27,7 +27,7 @@ _log = logging.getLogger(__name__)
 
 # Bands of about this many output pixels, where the settings leave the choice and memory allows it.
 _BAND_PIXELS = 1 << 20
-_LEAST_ROWS = 16
+_LEAST_ROWS = 4
 # What files keep of each layer between two reads, and what is allocated beside that which is reckoned.
 _STRIP_ROWS = 64
 _SLACK = 48 << 20

@@ -10,7 +10,7 @@ import errno
 import logging
 import os
 import shutil
-import struct
+from collections.abc import Iterator
 from pathlib import Path
 from types import TracebackType
 from typing import Any
@@ -19,7 +19,7 @@ import numpy as np
 import numpy.typing as npt
 import OpenImageIO as oiio  # noqa: N813
 
-from hugin_abflow import tifftags, trace
+from hugin_abflow import tiffwriter, trace
 from hugin_abflow.errors import OutputError
 from hugin_abflow.exif import Metadata, embed
 from hugin_abflow.layer import full_scale
@@ -28,9 +28,6 @@ from hugin_abflow.scratch import part_beside
 Pixels = npt.NDArray[Any]
 
 log = logging.getLogger("hugin_abflow.images")
-
-# Without it OpenImageIO silently writes half pixels to TIFF as 32-bit float.
-oiio.attribute("tiff:half", 1)
 
 _OIIO_NAMES = {
     np.dtype(np.uint8): "uint8",
@@ -50,19 +47,10 @@ ENDINGS = {
 }
 # What the documentation names; more is understood, since projects and other programs say it.
 COMPRESSIONS = {
-    "TIFF": ("none", "packbits", "lzw", "deflate"),
+    "TIFF": ("none", "packbits", "lzw", "deflate", "zstd", "jpeg"),
     "EXR": ("none", "rle", "zips", "zip", "piz"),
 }
-_TIFF_COMPRESSIONS = {
-    "none": "none",
-    "lzw": "lzw",
-    "packbits": "packbits",
-    "deflate": "zip",
-    "zip": "zip",
-    # OpenImageIO silently writes these as deflate for RGBA; so ask for it, and say so
-    "jpeg": "zip",
-    "zstd": "zip",
-}
+_TIFF_COMPRESSIONS = {name: name for name in tiffwriter.COMPRESSIONS} | {"zip": "deflate"}
 _EXR_COMPRESSIONS = {"none": "none", "rle": "rle", "zip": "zip", "zips": "zips", "piz": "piz"}
 _PNG_LEVEL = 4  # twice as fast as zlib's usual 6 for 2 % more bytes
 _JPEG_LIMIT = 65500  # pixels a side, of libjpeg
@@ -83,9 +71,11 @@ class ImageWriter:
                     with 8 bit, PNG with 8 or 16; EXR needs floats.
     offset          (x, y) on the canvas: TIFF position at 150 dpi as enblend writes it, EXR data window.
     canvas_size     (width, height) for the EXR display window; default: the data window.
-    compression     TIFF: none, lzw (default), packbits, deflate; jpeg and zstd become deflate, with a
-                    warning. EXR: none, rle, zips, zip (default), piz. JPEG and PNG: not used.
+    compression     TIFF: none, lzw (default), packbits, deflate, zstd, jpeg (or jpeg:85; 8-bit RGB, else
+                    deflate, with a warning; it blurs alpha, too). EXR: none, rle, zips, zip (default),
+                    piz. JPEG and PNG: not used.
     jpeg_quality    1..100, default 90 as Hugin's.
+    threads         cores that encode TIFF; default: all.
     icc             profile, carried as it is; PNG leaves a broken one out, with a warning.
     metadata        EXIF and XMP; of EXR what OpenImageIO carries, as its attributes.
 
@@ -109,18 +99,24 @@ class ImageWriter:
         jpeg_quality: int | None = None,
         canvas_size: tuple[int, int] | None = None,
         metadata: Metadata | None = None,
+        threads: int | None = None,
     ) -> None:
         self.path, self.metadata = Path(path), metadata
+        self._threads = threads or os.cpu_count() or 1
         self.width, self.height, self.channels, self.dtype = width, height, channels, np.dtype(dtype)
         self.format = _format_of(self.path)
         self.stored = _stored_dtype(self.path, self.format, self.dtype, depth)
         if self.format == "jpeg" and max(width, height) > _JPEG_LIMIT:
             raise OutputError(f"{path}: JPEG ends at {_JPEG_LIMIT} pixels a side; choose .tif or .png")
-        self.compression, self._option = _compression(self.path, self.format, compression, jpeg_quality)
+        self.compression, self._option = _compression(
+            self.path, self.format, self.stored, channels, compression, jpeg_quality
+        )
+        self._offset, self._icc = offset, icc
         self._spec = self._make_spec(offset, icc, canvas_size)
         self._done = 0
         self._clipped = False
         self._output: Any = None
+        self._tiff: tiffwriter.TiffWriter | None = None
         self._final = self._part = self.path
         self._scratch = contextlib.ExitStack()
 
@@ -142,13 +138,6 @@ class ImageWriter:
         if self.format == "tiff":
             if min(offset) < 0:
                 raise OutputError(f"{self.path}: TIFF holds no negative position {offset}; choose .exr")
-            # a full size that equals the image's makes OpenImageIO leave PIXAR's tags out, as enblend does
-            spec.x, spec.y = offset
-            spec["XResolution"] = spec["YResolution"] = 150.0
-            spec["ResolutionUnit"] = "in"
-            spec["DateTime"] = ""  # no time of writing; the empty tag is dropped in the end
-            worst = _LZW_WORST if self.compression == "lzw" else 1.01
-            spec["tiff:bigtiff"] = int(spec.image_bytes() * worst > _CLASSIC_LIMIT)
         elif self.format == "openexr":
             spec.x, spec.y = spec.full_x, spec.full_y = offset
             if canvas_size is not None:
@@ -203,6 +192,16 @@ class ImageWriter:
 
     def _open(self) -> str:
         """Begin the file; an error's text, or nothing."""
+        if self.format == "tiff":
+            shape = self.height, self.width, self.channels + 1
+            compression, _, quality = self.compression.partition(":")
+            worst = _LZW_WORST if self.compression == "lzw" else 1.01
+            self._tiff = tiffwriter.TiffWriter(
+                self._part, shape, self.stored, compression=compression,
+                quality=int(quality or 0), offset=self._offset, icc=self._icc, threads=self._threads,
+                big=int(np.prod(shape)) * self.stored.itemsize * worst > _CLASSIC_LIMIT,
+            )  # fmt: skip
+            return ""
         self._output = oiio.ImageOutput.create(str(self._part))
         if self._output is None:
             return str(oiio.geterror())
@@ -232,6 +231,11 @@ class ImageWriter:
         if not len(rows):
             return
         samples = np.ascontiguousarray(self._convert(rows))
+        if self._tiff:
+            with self._told():
+                self._tiff.write(samples)
+            self._done += len(rows)
+            return
         if self.format == "jpeg":
             self._refuse_full_disk(_JPEG_WORST * samples.nbytes + _JPEG_LEAST)
         top = self._spec.y + self._done
@@ -240,6 +244,14 @@ class ImageWriter:
         if not written or self._has_hidden_error(self._output):
             raise self._failure(self._output.geterror())
         self._done += len(rows)
+
+    @contextlib.contextmanager
+    def _told(self) -> Iterator[None]:
+        """Turn the system's errors into ours."""
+        try:
+            yield
+        except OSError as error:
+            raise self._failure(error.strerror or str(error)) from None
 
     def _has_hidden_error(self, output: Any) -> bool:
         """Whether a disk was full, of which PNG's writer only takes a note; TIFF's notes are no errors."""
@@ -270,21 +282,21 @@ class ImageWriter:
         if self._done < self.height:
             raise OutputError(f"{self.path}: only {self._done} of {self.height} rows were made; not written")
         output, self._output = self._output, None
-        if not output.close() or self._has_hidden_error(output):
+        if output and (not output.close() or self._has_hidden_error(output)):
             raise self._failure(output.geterror())
-        try:
-            if self.format == "tiff":
-                tifftags.drop_tag(self._part, tifftags.DATE_TIME)
+        with self._told():
+            if self._tiff:
+                self._tiff.close()
+                self._tiff = None
             if self.metadata:
                 embed(self._part, self.format, self.metadata)
             self._part.replace(self._final)
-        except OSError as error:
-            raise self._failure(error.strerror or str(error)) from None
-        except struct.error:  # libtiff does not tell when it could not write the last of a file
-            raise self._failure("the file is incomplete") from None
 
     def _discard(self) -> None:
         """Close and remove what is not finished; nothing is left of it after `_finish`."""
+        tiff, self._tiff = self._tiff, None
+        if tiff:
+            tiff.abandon()
         output, self._output = self._output, None
         if output is not None:
             with contextlib.suppress(RuntimeError):
@@ -365,15 +377,25 @@ def _stored_dtype(
     return wanted if wanted == np.float16 else np.dtype(np.float32)
 
 
+def _jpeg_quality(path: Path, quality: int | None) -> int:
+    quality = 90 if quality is None else quality
+    if not 1 <= quality <= 100:
+        raise OutputError(f"{path}: JPEG quality {quality}; choose 1 to 100")
+    return quality
+
+
 def _compression(
-    path: Path, format_name: str, name: str | None, jpeg_quality: int | None
+    path: Path,
+    format_name: str,
+    stored: np.dtype[Any],
+    channels: int,
+    name: str | None,
+    jpeg_quality: int | None,
 ) -> tuple[str, str | None]:
     """(what is really used, OpenImageIO's name for it)."""
     if format_name == "jpeg":
-        quality = 90 if jpeg_quality is None else jpeg_quality
-        if not 1 <= quality <= 100:
-            raise OutputError(f"{path}: JPEG quality {quality}; choose 1 to 100")
-        return f"jpeg:{quality}", f"jpeg:{quality}"
+        quality = f"jpeg:{_jpeg_quality(path, jpeg_quality)}"
+        return quality, quality
     if format_name == "png":
         return "deflate", None
     known = _TIFF_COMPRESSIONS if format_name == "tiff" else _EXR_COMPRESSIONS
@@ -381,11 +403,16 @@ def _compression(
     if wanted.partition(":")[0] not in known:
         offered = ", ".join(COMPRESSIONS["TIFF" if format_name == "tiff" else "EXR"])
         raise OutputError(f"{path}: compression {name!r}; choose one of {offered}")
-    option = known[wanted.partition(":")[0]]
-    used = "deflate" if format_name == "tiff" and option == "zip" else option
-    if used != wanted and wanted != "zip":
-        log.warning("%s: %s is not possible for TIFF with alpha; deflate is used", path, wanted)
-    return used, option
+    used = known[wanted.partition(":")[0]]
+    if used == "jpeg":
+        if stored != np.uint8 or channels != 3:  # of grey OpenImageIO misreads the alpha
+            log.warning("%s: jpeg in TIFF is for 8-bit RGB; deflate is used", path)
+            return "deflate", None
+        quality_given = wanted.partition(":")[2]
+        if jpeg_quality is None and quality_given.isdecimal():
+            jpeg_quality = int(quality_given)
+        return f"jpeg:{_jpeg_quality(path, jpeg_quality)}", None
+    return used, used
 
 
 def _to_depth(rows: Pixels, stored: np.dtype[Any]) -> Pixels:

@@ -21,7 +21,7 @@ import numpy as np
 from hugin_abflow.errors import ImageReadError
 
 SUBFILE_TYPE, X_RESOLUTION, Y_RESOLUTION, X_POSITION, Y_POSITION = 254, 282, 283, 286, 287
-DATE_TIME, FULL_WIDTH, FULL_HEIGHT = 306, 33300, 33301
+FULL_WIDTH, FULL_HEIGHT = 33300, 33301
 MAIN, EXIF, GPS = 0, 34665, 34853  # directories, by the tag in the main one that points to them
 ASCII, SHORT, LONG, RATIONAL, UNDEFINED = 2, 3, 4, 5, 7  # TIFF types
 _NUMBERS = {3: "H", 4: "I", 5: "II", 9: "i", 10: "ii", 11: "f", 12: "d", 16: "Q"}  # TIFF type -> struct
@@ -100,16 +100,6 @@ def read_places(path: Path) -> list[Place]:
             return [_place(_numbers(file, layout, start)) for start in _directories(file, layout, first)]
     except (OSError, struct.error, OverflowError, ZeroDivisionError) as error:
         raise ImageReadError(f"{path} is not a readable TIFF file ({error}); make the layer again") from None
-
-
-def drop_tag(path: Path, tag: int) -> None:
-    """Remove one tag from the first page, in place. Does nothing where it is missing."""
-    with path.open("r+b") as file:
-        layout, start = _read_header(file)
-        entries, following = _entries(file, layout, start)
-        entries.pop(tag, None)
-        file.seek(start)
-        file.write(struct.pack(layout.count, len(entries)) + b"".join(entries.values()) + following)
 
 
 def read_directories(file: BinaryIO) -> dict[int, dict[int, Value]]:

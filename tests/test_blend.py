@@ -264,14 +264,14 @@ def test_bands_are_as_high_as_memory_allows(device: Device, monkeypatch: pytest.
     monkeypatch.setattr(blend, "_SLACK", 0)
     monkeypatch.setattr(blend.memory, "resident", lambda: 0)
     monkeypatch.setattr(blend._log, "warning", lambda *said: warnings.append(said))
-    for limit in (0, 6 << 20, 3 << 20, 1 << 19):
+    for limit in (0, 6 << 20, 3 << 20, 1 << 18):
         settings = Settings(max_memory=limit)
         cells = grid.resized(7, 5)
         found = blend.bands(device, layers, full, grid, cells, 1.0, full.region, settings, lambda units: None)
         parts = list(found)
         heights.append(len(parts[0]))
         results.append(np.concatenate(parts))
-    assert heights[0] == 400 > heights[1] > heights[2] > heights[3] == 16
+    assert heights[0] == 400 > heights[1] > heights[2] > heights[3] == blend._LEAST_ROWS
     assert all(np.array_equal(result, results[0]) for result in results)
     assert len(warnings) == 1
 

@@ -214,7 +214,7 @@ INPUT... are the layers that nona makes, or @LIST: a file with a name on each li
   -f WIDTHxHEIGHT[+X+Y]  size and position of the output; default: all that the layers cover
   -w, --wrap[=MODE]      "horizontal" (also without MODE): left and right border are one; "none"
   -d, --depth=DEPTH      samples of the output: 8, 16, r32, r64; default: as the layers'
-  --compression=NAME     TIFF: none, packbits, lzw, deflate; JPEG: quality, 0 to 100
+  --compression=NAME     TIFF: none, packbits, lzw, deflate, zstd; JPEG: quality, 0 to 100
   -v, --verbose[=LEVEL]  0: warnings only; 1: phases (default); 2: say what is done
   --save-masks[=NAME]    write each layer's weight; NAME may hold %n (number), %i (index), %f (the layer's
                          name), %d (its folder), %b (its file), %p (its path), %e (its ending), and the same

@@ -1,0 +1,68 @@
+"""TIFF encoded on several cores: each compression is what it says, and nothing depends on cores or bands."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import tifffile
+from conftest import noise, whole
+
+from hugin_abflow import tiffwriter
+from hugin_abflow.errors import OutputError
+from hugin_abflow.images import ImageWriter, read_layer, write_image
+
+
+@pytest.mark.parametrize(("dtype", "channels"), [(np.uint16, 3), (np.uint8, 1)])
+def test_jpeg_in_tiff_is_for_8_bit_rgb(tmp_path, caplog, dtype, channels):
+    write_image(tmp_path / "a.tif", noise(dtype, channels), compression="jpeg")
+    assert "jpeg" in caplog.text and "deflate is used" in caplog.text
+    assert int(tifffile.TiffFile(tmp_path / "a.tif").pages[0].compression) == 8
+    np.testing.assert_array_equal(tifffile.imread(tmp_path / "a.tif"), noise(dtype, channels))
+
+
+def test_jpeg_in_tiff_is_as_good_as_asked_for(tmp_path):
+    """Other programs read it, alpha as well."""
+    y, x = np.mgrid[:77, :131]
+    smooth = np.stack([x, y, x + y, np.full_like(x, 255)], -1).astype(np.uint8)
+    sizes = []
+    for compression, quality in (("jpeg", None), ("jpeg:30", None), ("jpeg", 98)):
+        write_image(tmp_path / "a.tif", smooth, compression=compression, jpeg_quality=quality)
+        assert int(tifffile.TiffFile(tmp_path / "a.tif").pages[0].compression) == 7
+        for read in (tifffile.imread(tmp_path / "a.tif"), whole(read_layer(tmp_path / "a.tif"))):
+            assert np.abs(read.astype(int) - smooth).max() <= (24 if compression == "jpeg:30" else 6)
+        sizes.append((tmp_path / "a.tif").stat().st_size)
+    assert sizes[1] < sizes[0] < sizes[2]
+
+
+def test_zstd_is_zstd(tmp_path):
+    for dtype in (np.uint8, np.float32):
+        write_image(tmp_path / "a.tif", noise(dtype), compression="zstd")
+        assert int(tifffile.TiffFile(tmp_path / "a.tif").pages[0].compression) == 50000
+        np.testing.assert_array_equal(tifffile.imread(tmp_path / "a.tif"), noise(dtype))
+
+
+@pytest.mark.parametrize("compression", ["none", "packbits", "lzw", "deflate", "zstd", "jpeg"])
+def test_neither_threads_nor_bands_change_the_file(tmp_path, compression):
+    files = set()
+    for threads, rows in ((1, 77), (3, 5), (2, 33)):
+        with ImageWriter(
+            tmp_path / "a.tif", 131, 77, 3, np.uint8, compression=compression, threads=threads
+        ) as writer:
+            for top in range(0, 77, rows):
+                writer.write_rows(noise(np.uint8)[top : top + rows])
+        files.add((tmp_path / "a.tif").read_bytes())
+    assert len(files) == 1
+
+
+def test_what_fails_in_the_background_is_told(tmp_path, monkeypatch):
+    """By the next call, or when the file is closed; nothing is left."""
+
+    def full(*arguments, **more):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(tiffwriter, "encode", full)
+    writer = ImageWriter(tmp_path / "a.tif", 131, 7700, 3, np.uint8)
+    with pytest.raises(OutputError, match=r"a\.tif cannot be written: No space left on device"), writer:
+        for _ in range(100):
+            writer.write_rows(noise(np.uint8))
+    assert not list(tmp_path.iterdir())
