@@ -51,7 +51,7 @@ __kernel void chart_sample(__global const float4 *layer, /* (box.w, box.z) r, g,
         all += wy.w * chart_row(row + 3 * box.z, wx, &valid);
         if (valid != 0.0f) {
             const float3 c = GREATEST(all.xyz, (float3)(0.0f));
-            image[j * size.x + i] = log(0.299f * c.x + 0.587f * c.y + 0.114f * c.z + floor_value);
+            image[j * size.x + i] = logarithm1(0.299f * c.x + 0.587f * c.y + 0.114f * c.z + floor_value);
             mask[j * size.x + i] = 1.0f;
             return;
         }
@@ -72,6 +72,6 @@ __kernel void chart_sample(__global const float4 *layer, /* (box.w, box.z) r, g,
         }
     const float3 found = outer ? cubic.xyz : linear.xyz, c = GREATEST(found, (float3)(0.0f));
     const float brightness = 0.299f * c.x + 0.587f * c.y + 0.114f * c.z;
-    image[j * size.x + i] = inner ? log(brightness + floor_value) : 0.0f;
+    image[j * size.x + i] = inner ? logarithm1(brightness + floor_value) : 0.0f;
     mask[j * size.x + i] = inner ? 1.0f : 0.0f;
 }

@@ -59,6 +59,15 @@ static inline float4 exponential(float4 a) {
     return power * as_float4((whole + 127) << 23);
 }
 
+/* The natural logarithm of a normal number above 0, to 1e-7: of its power of two, and of what is left, between the
+   roots of 1/2 and 2, by the series of the inverse hyperbolic tangent. */
+static inline float logarithm1(float a) {
+    const int bits = as_int(a) - 0x3f3504f3, power = bits >> 23;
+    const float m = as_float((bits & 0x007fffff) + 0x3f3504f3), t = (m - 1.0f) / (m + 1.0f), t2 = t * t;
+    return (float)power * 0.693147181f +
+           2.0f * t * (1.0f + t2 * (0.333333333f + t2 * (0.2f + t2 * (0.142857143f + t2 * 0.111111111f))));
+}
+
 /* Borders of a grid, given as (width, height, wraps, poles): columns are taken modulo the width where the
    grid wraps; a row beyond a pole is the mirrored row half a turn further. Returns false outside. */
 static inline bool grid_border(int2 *p, int4 grid) {
