@@ -6,8 +6,8 @@ through each layer, smoothly, and fades out. It is the minimum of
 
     sum_pairs c (g_a - g_b + d_ab)^2  +  sum_k |grad g_k|^2  +  g_k^2 / fade^2
 
-with d_ab the measured difference of the aligned layers: a sparse linear system, solved directly. Where there
-is no difference it is exactly zero.
+with d_ab the measured difference of the aligned layers, and c how far it can be trusted and both are seen: a
+sparse linear system, solved directly. Where there is no difference it is exactly zero.
 
 Cameras' curves level off towards white, by which log odds move colours as exposure does; others run straight
 into it. The scale's shoulder, between both, is the one that leaves the least of the differences: else a
@@ -23,6 +23,7 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+from scipy import ndimage
 from scipy.sparse import csr_array, diags_array
 from scipy.sparse.linalg import splu
 
@@ -49,6 +50,11 @@ _ROUNDS = ((0.1, 4.0), (1.0, 3.0), (100.0, 2.5))
 _STRICT = ((0.01, 4.0), (0.03, 2.5), (0.3, 1.6), (3.0, 1.2), (100.0, 1.0))
 # Weight of a clipped cell against smoothness: what it tells is a bound, of a brightness that nobody knows.
 _BOUND = 0.1
+# Weight of what is seen of one layer alone. Layers have to agree where they are mixed, or cut; elsewhere they
+# are best left as they are.
+_UNSEEN = 0.003
+# Cells around what is ignored that count in full: cuts lie there.
+_BESIDE = 2
 # The correction fades out over this share of the canvas's width; a trend hardly does.
 _FADE, _TREND_FADE = 0.12, 1.0
 # All gains shrink towards 0 by this, at most a quarter of an 8-bit level, so that small ones are exactly 0.
@@ -75,6 +81,7 @@ class Difference:
     b: int
     values: npt.NDArray[np.float64]
     beyond: npt.NDArray[np.float64]
+    mixing: npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -122,7 +129,7 @@ def measure(
     grid: Grid,
     covered: npt.NDArray[np.bool_],
 ) -> Measured:
-    """Compare the aligned layers in their overlaps. fields: of geometry.py, whose weights do not count here.
+    """Compare the aligned layers in their overlaps. fields: of geometry.py.
     covered: (layers, height, width) on any grid over the same region.
     """
     cells = colour_grid(grid, covered)
@@ -150,11 +157,13 @@ def correction(
     if not settings.exposure:
         return none
     differences = measured.differences
+    near = np.zeros(cells.shape, bool)
     if ignored is not None:
-        counts = ~on_cells(ignored[None], cells, np.logical_or)[0, ..., None]
-        differences = tuple(
-            replace(d, values=d.values * counts, beyond=d.beyond * counts) for d in differences
-        )
+        found = on_cells(ignored[None], cells, np.logical_or)[0]
+        differences = tuple(_weighed(d, ~found) for d in differences)
+        modes = ("nearest", "wrap" if cells.wraps else "nearest")
+        near = ndimage.maximum_filter(found, 2 * _BESIDE + 1, mode=modes)
+    differences = tuple(_weighed(d, np.maximum(d.mixing, near) + _UNSEEN) for d in differences)
     if not any(np.any(v[..., :3] * v[..., 3:]) for d in differences for v in (d.values, d.beyond)):
         return none
     gains = solve(replace(measured, differences=differences), _STRICT if strict else _ROUNDS)
@@ -168,6 +177,12 @@ def correction(
         packed[..., :3] = _extend(gain, mask, cells.wraps)
         result.append(device.upload(packed))
     return replace(none, gains=tuple(result))
+
+
+def _weighed(difference: Difference, weight: npt.NDArray[Any]) -> Difference:
+    """The same, believed as far as (height, width) says."""
+    scale = np.stack([np.ones(weight.shape)] * 3 + [weight], -1)
+    return replace(difference, values=difference.values * scale, beyond=difference.beyond * scale)
 
 
 @dataclass(frozen=True)
@@ -195,11 +210,12 @@ class _Overlap:
     def difference(self, shoulder: float) -> Difference:
         """The difference on the exposure scale of a shoulder."""
         values, beyond = (self.device.empty((*self.cells.shape, 4)) for _ in range(2))
+        mixing = self.device.empty(self.cells.shape)
         self.device.run(
             "colour", "colour_difference", self.cells.border[:2],
-            *self._sides, shoulder, self._clipping, _SPREAD, values, beyond,
+            *self._sides, shoulder, self._clipping, _SPREAD, values, beyond, mixing,
         )  # fmt: skip
-        host = (v.get().astype(np.float64) for v in (values, beyond))
+        host = (v.get().astype(np.float64) for v in (values, beyond, mixing))
         return Difference(self.pair.a, self.pair.b, *host)
 
     def misfit(self) -> npt.NDArray[np.float64]:

@@ -57,7 +57,7 @@ class Settings:
     large_motion: bool = False
     exposure: bool = True
     seam: bool = True
-    transition_strain: float = 0.06
+    transition_strain: float = 0.085
     guides: bool = True
     interpolation: Interpolation = "bicubic"
     working_pixels: int = 0

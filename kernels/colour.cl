@@ -7,7 +7,7 @@ static inline bool colour_clips(float4 c, float clipped) {
 /* Mean difference a - b on the exposure scale over the pixels of a cell (every second one in x and y) that both
    layers show unclipped, and how far it can be trusted: less where the pixels disagree among themselves, that
    is, where the layers do not show the same thing. The same where one of them is clipped, if that is most of
-   the cell: the other has to be raised by that much at least. */
+   the cell: the other has to be raised by that much at least. And how far both are seen, by their weights. */
 __kernel void colour_difference(__global const float4 *layer_a, __global const float4 *field_a, int4 box_a,
                                 __global const float4 *layer_b, __global const float4 *field_b, int4 box_b,
                                 int4 border, float4 lens,   /* working grid */
@@ -16,7 +16,8 @@ __kernel void colour_difference(__global const float4 *layer_a, __global const f
                                 float clipped,              /* brighter samples may have been any brighter */
                                 float spread,               /* disagreement that halves the trust */
                                 __global float4 *difference, /* (cells.y, cells.x): r, g, b, weight 0..1 */
-                                __global float4 *beyond)     /* the same; weight > 0: a is clipped, < 0: b */
+                                __global float4 *beyond,     /* the same; weight > 0: a is clipped, < 0: b */
+                                __global float *mixing)      /* (cells.y, cells.x) 0..1 */
 {
     const int cx = get_global_id(0), cy = get_global_id(1);
     if (cx >= cells.x || cy >= cells.y)
@@ -24,13 +25,16 @@ __kernel void colour_difference(__global const float4 *layer_a, __global const f
     const int left = cx * border.x / cells.x, right = (cx + 1) * border.x / cells.x;
     const int top = cy * border.y / cells.y, bottom = (cy + 1) * border.y / cells.y;
     float3 sum = (float3)(0.0f), more = (float3)(0.0f), less = (float3)(0.0f);
-    float squares = 0.0f, n = 0.0f, tried = 0.0f, above = 0.0f, below = 0.0f;
+    float squares = 0.0f, n = 0.0f, tried = 0.0f, above = 0.0f, below = 0.0f, mixed = 0.0f;
     for (int y = top; y < bottom; y += 2)
         for (int x = left; x < right; x += 2) {
             tried += 1.0f;
             float4 a, b;
             if (!layer_pair(layer_a, field_a, box_a, layer_b, field_b, box_b, (int2)(x, y), border, lens, &a, &b))
                 continue;
+            const float s = field_a[box_index((int2)(x, y), box_a)].w;
+            const float t = field_b[box_index((int2)(x, y), box_b)].w;
+            mixed += 4.0f * s * t / GREATEST((s + t) * (s + t), 1e-20f);
             const float3 d = exposure_scale(a.xyz, shoulder) - exposure_scale(b.xyz, shoulder);
             const bool clips_a = colour_clips(a, clipped), clips_b = colour_clips(b, clipped);
             if (clips_a && !clips_b) {
@@ -58,6 +62,7 @@ __kernel void colour_difference(__global const float4 *layer_a, __global const f
     if (2.0f * below > tried)
         result = (float4)(less / below, 1.0f - 2.0f * below / tried);
     beyond[cy * cells.x + cx] = result;
+    mixing[cy * cells.x + cx] = mixed / GREATEST(tried, 1.0f);
 }
 
 /* How far exposure scales of four shoulders are from explaining the difference of two aligned layers: per cell

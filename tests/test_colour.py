@@ -44,7 +44,7 @@ def displacement(seed: int, box: tuple[int, int, int, int], grid: Grid) -> np.nd
 
 
 def two_sides(name: str, lamps: bool = False) -> list:
-    """Two layers that overlap, with fields and boxes, as kernels take them; lamps: bright on one side."""
+    """Two layers that overlap, as kernels take them; lamps: each is bright on one side."""
     grid = GRIDS[name]
     sides: list = []
     for i, box in enumerate(((0, 0, 60, grid.height), (9, 1, grid.width - 9, grid.height - 1))):
@@ -67,7 +67,7 @@ def test_difference_equals_its_twin(device: Device, name: str, shoulder: float, 
     cells = grid.resized(7, 3)
     sides = two_sides(name, lamps)
     clipped = CLIPPED if shoulder else 1e30
-    results = [device.empty((3, 7, 4)) for _ in range(2)]
+    results = [device.empty((3, 7, 4)), device.empty((3, 7, 4)), device.empty((3, 7))]
     device.run(
         "colour", "colour_difference", (7, 3), *uploaded(device, sides),
         grid.border, grid.lens, cells.border, shoulder, clipped, SPREAD, *results,
@@ -137,7 +137,7 @@ def test_twin_of_difference_measures_a_gain(shoulder: float) -> None:
     middle[..., :3] = common.exposure_shift(a[..., :3], -gains / 2, shoulder)
     still = np.zeros_like(a)
     box = (0, 0, 77, 53)
-    result, _ = colour_difference(
+    result, *_ = colour_difference(
         a, still, box, b, still, box, grid.border, grid.lens, (7, 3, 0, 0), shoulder, 9, SPREAD
     )
     known = result[..., 3] > 0
@@ -245,7 +245,8 @@ def overlapping(seed: int, cells: Grid) -> colour.Measured:
         beyond = np.zeros_like(d)
         beyond[3:, ::2] = [0.9, 0.5, 0.7, 0.6]  # a is clipped
         beyond[4:, 1::2] = [-0.2, -0.6, -0.8, -0.9]
-        differences.append(colour.Difference(a, b, d, beyond * (inside[a] & inside[b])[..., None]))
+        mixing = np.ones(d.shape[:2])
+        differences.append(colour.Difference(a, b, d, beyond * (inside[a] & inside[b])[..., None], mixing))
     return colour.Measured(cells, inside, 1.0, tuple(differences))
 
 
@@ -303,7 +304,7 @@ def test_what_is_clipped_is_a_bound_for_the_other() -> None:
     nothing = np.zeros_like(beyond)
 
     def solve(values: np.ndarray, beyond: np.ndarray) -> np.ndarray:
-        difference = colour.Difference(0, 1, values, beyond)
+        difference = colour.Difference(0, 1, values, beyond, np.ones((5, 9)))
         return colour.solve(colour.Measured(CELLS["plane"], inside, 1.0, (difference,)))
 
     raised, other = solve(nothing, beyond)
@@ -313,6 +314,24 @@ def test_what_is_clipped_is_a_bound_for_the_other() -> None:
     less = beyond * [0.1, 0.1, 0.1, 1.0]
     assert (solve(brighter, nothing)[0][:, 3:6] > 0.1).all()
     assert np.allclose(solve(brighter, less), solve(brighter, nothing), atol=0.02)
+
+
+def test_layers_agree_where_they_are_mixed(device: Device) -> None:
+    """What is seen of one layer alone has little to say."""
+    cells, inside = GRIDS["plane"].resized(40, 5), np.ones((2, 5, 40), bool)
+    values = np.full((5, 40, 4), 1.0)
+    values[:, 16:24, :3] = 0.4
+    found = []
+    for everywhere in (True, False):
+        mixing = np.full((5, 40), float(everywhere))
+        mixing[:, 16:24] = 1
+        difference = colour.Difference(0, 1, values, np.zeros((5, 40, 4)), mixing)
+        measured = colour.Measured(cells, inside, 1.0, (difference,))
+        a, b = (gain.get()[..., 0] for gain in colour.correction(device, measured, Settings()).gains)
+        found.append(b - a)
+    assert np.allclose([one[:, 18:22] for one in found], 0.4, atol=0.01)
+    assert (found[0][:, 12:15] > 0.9).all()
+    assert (found[1][:, 12:15] < found[0][:, 12:15] - 0.1).all()
 
 
 def test_gains_reach_two_cells_beyond_a_layer() -> None:
@@ -367,7 +386,8 @@ def corrected(
     covered[0, :, :448] = covered[1, :, 320:] = True
     found = pair_chart(covered.all(0), grid, grid)
     zero = device.zeros((found.height, found.width, 2))
-    fields = [device.zeros(layer.pixels.shape) for layer in layers]
+    still = [np.zeros(layer.pixels.shape, np.float32) + np.float32([0, 0, 0, 1]) for layer in layers]
+    fields = [device.upload(field) for field in still]
     flows = [PairFlow(0, 1, found, zero, zero)]
     measured = colour.measure(device, layers, fields, flows, grid, covered)
     return colour.correction(device, measured, settings, ignored)

@@ -122,8 +122,8 @@ def test_narrowed_coefficients(device: Device, flow: float) -> None:
     assert (np.diff(after, axis=1) >= -1e-6).all()
     assert (np.sign(np.round(after - 0.5, 5)) == np.sign(np.round(before - 0.5, 5))).all()
     steepest = np.diff(after, axis=1).max()
-    strongest = 12 / 57
-    assert steepest == pytest.approx(min(max(1 / 57, 0.06 / max(flow, 1e-9)), strongest), rel=0.15)
+    strongest, wanted = 12 / 57, Settings().transition_strain / max(flow, 1e-9)
+    assert steepest == pytest.approx(min(max(1 / 57, wanted), strongest), rel=0.15)
     assert steepest > 0.99 / 57
 
 

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from reference.common import EXPOSURE_FLOOR, Array, Numbers, exposure_scale, layer_seen, pixels
+from reference.common import EXPOSURE_FLOOR, Array, Numbers, exposure_scale, layer_seen, pixels, take
 
 
 def colour_difference(
@@ -23,17 +23,23 @@ def colour_difference(
     shoulder: float,
     clipped: float,
     spread: float,
-) -> tuple[Array, Array]:
+) -> tuple[Array, Array, Array]:
     """Mean difference a - b of every cell's pixels, every other one in x and y, and its weight; the same of
-    those that one layer shows clipped, where these are most.
+    those that one layer shows clipped, where these are most; and how far both layers are seen.
     """
     a, b, clips_a, clips_b, known = _seen(
         layer_a, field_a, box_a, layer_b, field_b, box_b, border, lens, clipped
     )
+    columns, rows = pixels(border[0], border[1])
+    sides = ((field_a, box_a), (field_b, box_b))
+    s, t = (take(field, box, columns, rows)[..., 3].astype(np.float64) for field, box in sides)
+    mixed = np.where(known, 4 * s * t / np.maximum((s + t) ** 2, 1e-20), 0)
+    mixing = np.zeros((cells[1], cells[0]))
     difference = exposure_scale(a, shoulder) - exposure_scale(b, shoulder)
     result, beyond = np.zeros((2, cells[1], cells[0], 4))
     for place, part in _parts(border, cells, 2):
         count = known[part].size
+        mixing[place] = mixed[part].mean()
         values = difference[part][(known & ~clips_a & ~clips_b)[part]]
         if len(values):
             result[place] = [*values.mean(0), len(values) / count / (1 + values.var(0).sum() / spread**2)]
@@ -41,7 +47,7 @@ def colour_difference(
             values = difference[part][(known & alone)[part]]
             if 2 * len(values) > count:
                 beyond[place] = [*values.mean(0), sign * (2 * len(values) / count - 1)]
-    return result, beyond
+    return result, beyond, mixing
 
 
 def colour_misfit(
