@@ -133,14 +133,15 @@ def test_every_layer_to_every_file(project_of: Callable, kind: str, ending: str)
         assert np.abs(found[~covered][:, :-1].astype(int)).mean() < 4  # black, but for what JPEG spreads
 
 
-@pytest.mark.parametrize("compression", COMPRESSIONS["TIFF"])
+@pytest.mark.parametrize("compression", [name for name in COMPRESSIONS["TIFF"] if name != "jpeg"])
 @pytest.mark.parametrize("kind", ["8 bit TIFF", "16 bit TIFF", "float TIFF", "grey 16 bit TIFF", "half EXR"])
 def test_every_compression_of_every_depth(project_of: Callable, kind: str, compression: str) -> None:
     project, layers = project_of(kind)
     exact = pixels_of(merged(project, layers, "exact.tif", compression="none"))
-    panorama = merged(project, layers, f"{compression}.tif", compression=compression)
-    np.testing.assert_array_equal(pixels_of(panorama), exact)
-    with tifffile.TiffFile(project.with_name(f"{compression}.tif")) as written:
+    target = project.with_name(f"{compression}.tif")
+    merge_project(project, SETTINGS, layers=layers, output=target, compression=compression)
+    with tifffile.TiffFile(target) as written:
+        np.testing.assert_array_equal(written.pages[0].asarray(), exact)
         assert compression in written.pages[0].compression.name.lower().replace("adobe_", "")
 
 
