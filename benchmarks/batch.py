@@ -54,6 +54,11 @@ def together(runs: list[Run]) -> Run:
     return Run(sum(run.wall for run in runs), sum(run.cpu for run in runs), max(run.peak for run in runs))
 
 
+def said(run: Run) -> str:
+    """A run, in words."""
+    return f"{run.wall:.1f} s, {run.cpu:.1f} s of processor"
+
+
 def kernel_seconds(profile: Path) -> float:
     """How long kernels ran, of all processes of a run."""
     events = json.loads(profile.read_text("utf-8"))["traceEvents"]
@@ -92,11 +97,11 @@ def main() -> None:
     for turn in range(options.runs):
         clear(folder)
         singles.append(together([measure([*PROGRAM, str(project)]) for project in projects]))
-        print(f"run {turn + 1}, single runs: {singles[-1].wall:.1f} s", file=sys.stderr)
+        print(f"run {turn + 1}, single runs: {said(singles[-1])}", file=sys.stderr)
         for name, choice in choices.items():
             clear(folder)
             batches[name].append(measure([*PROGRAM, "--recursive", str(folder), *choice]))
-            print(f"run {turn + 1}, {name}: {batches[name][-1].wall:.1f} s", file=sys.stderr)
+            print(f"run {turn + 1}, {name}: {said(batches[name][-1])}", file=sys.stderr)
     clear(folder)
     profile = options.cache / "batch.json"
     measure([*PROGRAM, "--recursive", str(folder), "--profile", str(profile)])

@@ -44,6 +44,8 @@ from hugin_abflow.settings import Settings
 from hugin_abflow.working import Grid, WorkingLayer
 
 _log = logging.getLogger(__name__)
+# Of layers that take no part; abflow-enblend shows this, and of the rest warnings alone.
+_unused_log = logging.getLogger("hugin_abflow.unused")
 
 # Overlaps of fewer working pixels than this have nothing to match.
 _LEAST_OVERLAP = 64
@@ -270,7 +272,7 @@ def _redundant(index: int, layers: Sequence[WorkingLayer], masks: Masks) -> bool
     own = masks.host[index]
     for other, mask in enumerate(masks.host):
         if other != index and not (own & ~mask).any() and (mask & ~own).any():
-            _log.info(
+            _unused_log.info(
                 "%s is not used: it lies wholly inside %s, so nothing is its own; where it shall show, "
                 "mask the other photos in Hugin",
                 layers[index].layer.name, layers[other].layer.name,

@@ -26,7 +26,7 @@ class Record:
     message     what went wrong and what to do; empty if nothing.
     exit_code   what a run of this project alone ends with.
     started     UTC, ISO 8601. seconds: the whole time, phases: of each phase.
-    memory      largest resident memory of the process, bytes; None where the system does not tell.
+    memory      largest resident memory of the process, bytes; None if nothing was begun.
     attempts    how often it was begun.
     overlaps    figures of each overlap.
     """

@@ -62,7 +62,7 @@ def _run(arguments: Sequence[str]) -> bool:
     verbose = request.verbosity > 1
     with (
         # that a layer is left out is known to `joint`, which tells it to those who ask; enblend warns of it
-        messages(logging.INFO if verbose else logging.WARNING, always="hugin_abflow.joint"),
+        messages(logging.INFO if verbose else logging.WARNING, always="hugin_abflow.unused"),
         catching(str(request.output), verbose) as failures,
         display_progress("", quiet=request.verbosity == 0, verbose=True) as progress,
     ):
