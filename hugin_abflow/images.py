@@ -19,7 +19,15 @@ from hugin_abflow.errors import ImageReadError
 from hugin_abflow.imagewriter import COMPRESSIONS, ENDINGS, ImageWriter, named_in_unicode, write_image
 from hugin_abflow.layer import Box, Layer, full_scale
 
-__all__ = ["COMPRESSIONS", "ENDINGS", "ImageWriter", "read_layer", "read_layers", "write_image"]
+__all__ = [
+    "COMPRESSIONS",
+    "ENDINGS",
+    "ImageWriter",
+    "read_layer",
+    "read_layers",
+    "use_threads",
+    "write_image",
+]
 
 Pixels = npt.NDArray[Any]
 
@@ -62,6 +70,11 @@ def read_layers(path: Path | str) -> list[Layer]:
     if not layers:
         raise ImageReadError(f"{path} holds no full-size image; make the layer again")
     return layers
+
+
+def use_threads(count: int) -> None:
+    """Have OpenImageIO decode and encode one file on so many cores, in the whole process."""
+    oiio.attribute("threads", count)
 
 
 def _open(path: Path, page: int) -> Any:

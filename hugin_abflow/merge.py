@@ -16,7 +16,7 @@ from hugin_abflow import joint, sequential
 from hugin_abflow.errors import LayersMissingError, OutputError
 from hugin_abflow.exif import Metadata
 from hugin_abflow.guides import Guide
-from hugin_abflow.images import ENDINGS, ImageWriter
+from hugin_abflow.images import ENDINGS, ImageWriter, use_threads
 from hugin_abflow.layer import Canvas, Layer, check_layers
 from hugin_abflow.metadata import describe
 from hugin_abflow.nona import Remap, open_layers
@@ -112,6 +112,7 @@ def write_panorama(
         target, crop.width, crop.height, first.channels, first.dtype, depth=depth,
         offset=(crop.left, crop.top), canvas_size=(canvas.width, canvas.height), icc=first.icc,
         compression=compression, jpeg_quality=jpeg_quality, metadata=metadata,
+        threads=settings.cores,
     ) as writer:  # fmt: skip
         _report(canvas, projection, layers, writer)
         _write(writer, _bands(layers, canvas, settings, progress, guides(), method, open_device))
@@ -148,6 +149,7 @@ def _bands(
     open_device: OpenDevice | None = None,
 ) -> Iterator[npt.NDArray[Any]]:
     """The panorama's rows from top to bottom."""
+    use_threads(settings.cores)
     device = (open_device or Device)(settings.device, settings.threads)
     method = method or {"joint": joint.merge, "sequential": sequential.merge}[settings.merge]
     visible = False

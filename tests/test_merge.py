@@ -279,6 +279,25 @@ def test_settings_out_of_range(values):
         Settings(**values)
 
 
+def test_threads_bound_reading_and_writing_as_well(tmp_path, monkeypatch):
+    """OpenImageIO decodes, our own threads encode."""
+    seen = {}
+    monkeypatch.setattr(merge, "use_threads", lambda count: seen.setdefault("decoding", count))
+    writer = merge.ImageWriter
+    monkeypatch.setattr(
+        merge,
+        "ImageWriter",
+        lambda *a, threads, **more: seen.setdefault("encoding", threads) and writer(*a, **more),
+    )
+    canvas = CANVASES["plane"]
+    settings = Settings(threads=1, flow=False)
+    merge.write_panorama(
+        tmp_path / "a.tif", with_parallax(canvas), canvas, settings, projection="flat", metadata=None
+    )
+    assert seen == {"decoding": 1, "encoding": 1}
+    assert (tmp_path / "a.tif").exists()
+
+
 # Devices with little memory
 
 
