@@ -23,7 +23,6 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from scipy import ndimage
 from scipy.sparse import csr_array, diags_array
 from scipy.sparse.linalg import splu
 
@@ -50,11 +49,8 @@ _ROUNDS = ((0.1, 4.0), (1.0, 3.0), (100.0, 2.5))
 _STRICT = ((0.01, 4.0), (0.03, 2.5), (0.3, 1.6), (3.0, 1.2), (100.0, 1.0))
 # Weight of a clipped cell against smoothness: what it tells is a bound, of a brightness that nobody knows.
 _BOUND = 0.1
-# Weight of what is seen of one layer alone. Layers have to agree where they are mixed, or cut; elsewhere they
-# are best left as they are.
+# Weight of what is seen of one layer alone: where layers are not mixed they are best left as they are.
 _UNSEEN = 0.003
-# Cells around what is ignored that count in full: cuts lie there.
-_BESIDE = 2
 # The correction fades out over this share of the canvas's width; a trend hardly does.
 _FADE, _TREND_FADE = 0.12, 1.0
 # All gains shrink towards 0 by this, at most a quarter of an 8-bit level, so that small ones are exactly 0.
@@ -157,13 +153,11 @@ def correction(
     if not settings.exposure:
         return none
     differences = measured.differences
-    near = np.zeros(cells.shape, bool)
     if ignored is not None:
-        found = on_cells(ignored[None], cells, np.logical_or)[0]
-        differences = tuple(_weighed(d, ~found) for d in differences)
-        modes = ("nearest", "wrap" if cells.wraps else "nearest")
-        near = ndimage.maximum_filter(found, 2 * _BESIDE + 1, mode=modes)
-    differences = tuple(_weighed(d, np.maximum(d.mixing, near) + _UNSEEN) for d in differences)
+        counts = ~on_cells(ignored[None], cells, np.logical_or)[0]
+        differences = tuple(_weighed(d, counts) for d in differences)
+    if settings.flow:  # without, layers are cut, and `ignored` leaves what is beside the cuts
+        differences = tuple(_weighed(d, d.mixing + _UNSEEN) for d in differences)
     if not any(np.any(v[..., :3] * v[..., 3:]) for d in differences for v in (d.values, d.beyond)):
         return none
     gains = solve(replace(measured, differences=differences), _STRICT if strict else _ROUNDS)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import shutil
+import signal
 import subprocess
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
@@ -19,6 +20,10 @@ from hugin_abflow.project import Plan
 
 DTYPES = [np.uint8, np.uint16, np.float16, np.float32]
 ICC = bytes(range(256)) * 3  # carried, never interpreted
+
+# A shell's background jobs ignore it, and would hand that on to the programs that tests interrupt.
+if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 def require_program(name: str) -> str:

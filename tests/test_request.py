@@ -81,7 +81,7 @@ def test_option_means(line: str, changed: dict[str, Any]) -> None:
         ("--wrap=Both", "--wrap=both is not possible"),
         ("-wsideways", "choose none or horizontal"),
         ("-d 64", "--depth=64 is not possible; choose 8, 16, r32 or r64"),
-        ("--compression=zip", "choose none, packbits, lzw, deflate, or 0 to 100"),
+        ("--compression=zip", "choose none, packbits, lzw, deflate, zstd, jpeg, or 0 to 100"),
         ("--compression=-5", "or 0 to 100"),
         ("--compression=lzw:3", "or 0 to 100"),
         ("--compression=jpeg:best", "or 0 to 100"),
