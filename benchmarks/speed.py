@@ -9,6 +9,7 @@ medians over the runs; the table is Markdown. The layers are rendered once and k
 from __future__ import annotations
 
 import argparse
+import multiprocessing
 import os
 import shutil
 import statistics
@@ -121,7 +122,12 @@ def main() -> None:
     )
     options = parser.parse_args()
     folder = options.cache / f"speed-{options.width}"
-    make_layers(folder, options.width)
+    # by itself: the memory of this process is counted as that of those that it starts
+    renderer = multiprocessing.get_context("spawn").Process(target=make_layers, args=(folder, options.width))
+    renderer.start()
+    renderer.join()
+    if renderer.exitcode:
+        raise SystemExit(renderer.exitcode)
     chosen = {
         name: command
         for name, command in commands(folder, options.width).items()
