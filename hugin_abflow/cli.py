@@ -189,7 +189,7 @@ _information = partial(click.option, cls=Option, group="Information")
     type=click.Choice(get_args(FlowQuality)),
     default=_DEFAULTS.flow_quality,
     help="Time against quality of the optical flow. fast: coarser, in less than half the flow's time. "
-    "best: finer on panoramas above 2 megapixels, in up to three times of it.",
+    "best: much finer on panoramas above 2 megapixels, in up to eight times of it.",
 )
 @_blending(
     "--device",

@@ -94,6 +94,15 @@ def replace(monkeypatch: pytest.MonkeyPatch) -> Callable[[Merge], None]:
     return put
 
 
+@pytest.fixture
+def shoot(replace: Callable[[Merge], None], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The current folder has a folder of a project, as documented commands want it; nothing is stitched."""
+    replace(lambda path, **keywords: path)
+    (tmp_path / "shoot").mkdir()
+    (tmp_path / "shoot" / "a.pto").touch()
+    monkeypatch.chdir(tmp_path)
+
+
 ProjectMaker = Callable[..., Path]
 
 

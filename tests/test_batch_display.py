@@ -5,7 +5,6 @@ from __future__ import annotations
 import logging
 import os
 import re
-import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -13,6 +12,7 @@ from typing import Any
 
 import pytest
 from shoots import write_project
+from terminals import on_terminal
 
 from hugin_abflow import cli
 from hugin_abflow.batch.display import Bars, Display, duration, phase_table
@@ -95,29 +95,13 @@ def test_log_that_cannot_be_written_ends_the_run_before_it_starts(
 
 @pytest.mark.skipif(os.name == "nt", reason="Windows has no pseudo-terminals")
 def test_bars_on_a_terminal(tmp_path: Path) -> None:
-    import pty
-
     for name in "abc":
         write_project(tmp_path / f"{name}.pto")
     (tmp_path / "b0000.tif").write_bytes(b"no picture")
-    ours, theirs = pty.openpty()
-    child = subprocess.Popen(
-        [sys.executable, "-m", "hugin_abflow", tmp_path, "--jobs", "2"],
-        stdout=subprocess.PIPE,
-        stderr=theirs,
-        env=os.environ | {"TERM": "xterm", "COLUMNS": "150"},
-    )
-    os.close(theirs)
-    shown = b""
-    try:
-        while part := os.read(ours, 4096):
-            shown += part
-    except OSError:  # the other end is closed
-        pass
-    out, _ = child.communicate(timeout=60)
-    os.close(ours)
+    command = [sys.executable, "-m", "hugin_abflow", tmp_path, "--jobs", "2"]
+    code, out, shown = on_terminal(command, {"TERM": "xterm", "COLUMNS": "150"}, 60)
     text = re.sub(r"\x1b\[[\d;?]*\w", "", shown.decode())
-    assert child.returncode == ExitCode.PARTIAL
+    assert code == ExitCode.PARTIAL
     assert sorted(out.decode().split()) == [str(tmp_path / f"{name}.tif") for name in "ac"]
     assert "0 of 3 projects" in text and re.search(r"[12] of 3 projects, 1 failed", text)
     assert re.search(r"a\.pto: (read|flow|align|blend) ", text) and re.search(r"c\.pto: \w+ ", text)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 import shlex
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -41,13 +40,8 @@ def test_pages_are_reached_from_the_first() -> None:
     assert set(PAGES) == linked | {"hugin.md"} and "docs/hugin.md" in (ROOT / "README.md").read_text("utf-8")
 
 
-def test_commands_are_understood(
-    replace: Callable[..., None], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    replace(lambda path, **keywords: path)
-    (tmp_path / "shoot").mkdir()
-    (tmp_path / "shoot" / "a.pto").touch()
-    monkeypatch.chdir(tmp_path)
+@pytest.mark.usefixtures("shoot")
+def test_commands_are_understood(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("hugin_abflow.batch.run.show_project", lambda path, **keywords: [])
     monkeypatch.setattr(setup, "install", lambda *given: [])
     monkeypatch.setattr(setup, "uninstall", lambda *given: [])

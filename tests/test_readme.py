@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 import shlex
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -86,13 +85,8 @@ def test_exit_codes_are_documented() -> None:
     assert rows("Exit codes") == [[str(int(code)), text] for code, text in cli.EXIT_CODES.items()]
 
 
-def test_commands_are_valid(
-    replace: Callable[..., None], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    replace(lambda path, **keywords: path)
-    (tmp_path / "shoot").mkdir()
-    (tmp_path / "shoot" / "a.pto").touch()
-    monkeypatch.chdir(tmp_path)
+@pytest.mark.usefixtures("shoot")
+def test_commands_are_valid() -> None:
     commands = re.findall(r"^ {4,}(hugin-abflow [^\[\n]*)$", README, re.MULTILINE)
     commands += re.findall(r"`(hugin-abflow [^`\n]*)`", README)
     assert len(commands) >= 4

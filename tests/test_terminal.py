@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from terminals import on_terminal
 
 from hugin_abflow import cli
 from hugin_abflow.errors import ExitCode
@@ -131,23 +132,8 @@ def merge(path, progress, **keywords):
     ("term", "quiet", "bars"), [("xterm", [], True), ("xterm", ["-q"], False), ("dumb", [], False)]
 )
 def test_bars_on_a_terminal_only_and_on_stderr(term: str, quiet: list[str], bars: bool) -> None:
-    import pty
-
-    ours, theirs = pty.openpty()
-    environment = os.environ | {"TERM": term}
-    process = subprocess.Popen(
-        child(PHASES, "a.pto", *quiet), stdout=subprocess.PIPE, stderr=theirs, env=environment
-    )
-    os.close(theirs)
-    shown = b""
-    try:
-        while part := os.read(ours, 4096):
-            shown += part
-    except OSError:  # the other end is closed
-        pass
-    out, _ = process.communicate(timeout=30)
-    os.close(ours)
-    assert process.returncode == 0
+    code, out, shown = on_terminal(child(PHASES, "a.pto", *quiet), {"TERM": term}, 30)
+    assert code == 0
     assert out == (b"" if quiet else b"a.tif\n")
     assert (b"Flow" in shown and b"100%" in shown and b"Blend" in shown) if bars else shown == b""
 

@@ -9,6 +9,9 @@ import numpy as np
 
 from reference.common import EXPOSURE_FLOOR, Array, Numbers, exposure_scale, layer_seen, pixels, take
 
+# A layer's pixels, its field, and their box.
+Side = tuple[Array, Array, Sequence[int]]
+
 
 def colour_difference(
     layer_a: Array,
@@ -28,7 +31,7 @@ def colour_difference(
     those that one layer shows clipped, where these are most; and how far both layers are seen.
     """
     a, b, clips_a, clips_b, known = _seen(
-        layer_a, field_a, box_a, layer_b, field_b, box_b, border, lens, clipped
+        (layer_a, field_a, box_a), (layer_b, field_b, box_b), border, lens, clipped
     )
     columns, rows = pixels(border[0], border[1])
     sides = ((field_a, box_a), (field_b, box_b))
@@ -65,7 +68,7 @@ def colour_misfit(
 ) -> Array:
     """What the best gain of a cell leaves of the difference, by weighted least squares on each scale."""
     a, b, clips_a, clips_b, known = _seen(
-        layer_a, field_a, box_a, layer_b, field_b, box_b, border, lens, clipped
+        (layer_a, field_a, box_a), (layer_b, field_b, box_b), border, lens, clipped
     )
     a, b = np.maximum(a, EXPOSURE_FLOOR), np.maximum(b, EXPOSURE_FLOOR)
     result = np.zeros((cells[1], cells[0], len(shoulders)))
@@ -84,20 +87,11 @@ def colour_misfit(
 
 
 def _seen(
-    layer_a: Array,
-    field_a: Array,
-    box_a: Sequence[int],
-    layer_b: Array,
-    field_b: Array,
-    box_b: Sequence[int],
-    border: Sequence[int],
-    lens: Numbers,
-    clipped: float,
+    side_a: Side, side_b: Side, border: Sequence[int], lens: Numbers, clipped: float
 ) -> tuple[Array, Array, Array, Array, Array]:
     """Colours of both aligned layers, where each is clipped, and where both are."""
     columns, rows = pixels(border[0], border[1])
-    a = layer_seen(layer_a, field_a, box_a, columns, rows, border, lens)
-    b = layer_seen(layer_b, field_b, box_b, columns, rows, border, lens)
+    a, b = (layer_seen(*side, columns, rows, border, lens) for side in (side_a, side_b))
     clips = (one[..., :3].max(-1) > clipped for one in (a, b))
     return a[..., :3], b[..., :3], *clips, (a[..., 3] > 0) & (b[..., 3] > 0)
 
