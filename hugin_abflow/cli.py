@@ -188,7 +188,7 @@ _information = partial(click.option, cls=Option, group="Information")
     "--flow-quality",
     type=click.Choice(get_args(FlowQuality)),
     default=_DEFAULTS.flow_quality,
-    help="Time against quality of the optical flow. fast: coarser, in less than half the flow's time. "
+    help="Time against quality of the optical flow. fast: coarser, in three quarters of the flow's time or less. "
     "best: much finer on panoramas above 2 megapixels, in up to eight times of it.",
 )
 @_blending(
