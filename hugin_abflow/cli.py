@@ -21,7 +21,7 @@ from hugin_abflow.images import COMPRESSIONS
 from hugin_abflow.metadata import PROGRAM, version
 from hugin_abflow.nona import Remap
 from hugin_abflow.opencl import list_devices
-from hugin_abflow.options import ARGUMENTS, Command, Option, Size
+from hugin_abflow.options import ARGUMENTS, Command, NewFile, Option, Size
 from hugin_abflow.settings import FlowQuality, MergeMode, Settings
 from hugin_abflow.terminal import complain, interruptible, say
 
@@ -71,6 +71,7 @@ def _names_of_compressions() -> str:
 
 
 _file = click.Path(path_type=Path)
+_new_file = NewFile(path_type=Path)
 _layers = partial(click.option, cls=Option, group="Layers")
 _blending = partial(click.option, cls=Option, group="Blending", show_default=True)
 _result = partial(click.option, cls=Option, group="Result")
@@ -85,7 +86,7 @@ _information = partial(click.option, cls=Option, group="Information")
     "-o",
     "--output",
     metavar="FILE",
-    type=_file,
+    type=_new_file,
     help="The panorama; its ending chooses the type: .tif, .jpg, .png or .exr. Only with one project. "
     "[default: name and type that the project asks for, beside it]",
 )
@@ -228,7 +229,7 @@ _information = partial(click.option, cls=Option, group="Information")
 @_batch(
     "--report",
     metavar="FILE",
-    type=_file,
+    type=_new_file,
     help="Write what became of each project, with times and figures, into FILE, as JSON.",
 )
 @_batch(
@@ -238,7 +239,7 @@ _information = partial(click.option, cls=Option, group="Information")
     help=f"Take options from FILE. [default: {NAME} beside each project, or above it up to a named folder]",
 )
 @_batch("--print-config", is_flag=True, help=f"Print all options as they would be in {NAME}, and exit.")
-@_batch("--log", metavar="FILE", type=_file, help="Add all messages, with the time, to the end of FILE.")
+@_batch("--log", metavar="FILE", type=_new_file, help="Add all messages, with the time, to the end of FILE.")
 @_resources(
     "--max-memory",
     metavar="SIZE",
@@ -268,7 +269,7 @@ _information = partial(click.option, cls=Option, group="Information")
 @_information(
     "--profile",
     metavar="FILE",
-    type=_file,
+    type=_new_file,
     help="Write where the time goes, as a trace (JSON) that chrome://tracing and ui.perfetto.dev open.",
 )
 @click.version_option(

@@ -35,6 +35,17 @@ class Size(click.ParamType):  # type: ignore[type-arg]
             self.fail(str(error), param, ctx)
 
 
+class NewFile(click.Path):
+    """A file to be written: no project, as where its name was forgotten before ``*.pto``."""
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        """Its path; ends with click's message for a project."""
+        path = super().convert(value, param, ctx)
+        if str(path).lower().endswith(".pto"):
+            self.fail(f"{value} is a project, which is never written to; name another file", param, ctx)
+        return path
+
+
 class Command(click.Command):
     """A command whose help has headings, and whose `--layers` takes several files.
 

@@ -143,6 +143,10 @@ def test_layers_takes_several_files(calls: Calls, given: str, layers: str, proje
         (["--softmax-sharpness", "-1", "a.pto"], "-1"),
         (["--flow-magnitude", "1e9", "a.pto"], "choose a value from 0 to 10000"),
         (["a.pto", "--layers"], "--layers"),
+        (["--report", "a.pto", "b.pto"], "'--report': a.pto is a project"),  # from --report *.pto
+        (["--log", "a.PTO", "b.pto"], "'--log': a.PTO is a project"),
+        (["--profile", "a.pto", "b.pto"], "'--profile': a.pto is a project"),
+        (["-o", "a.pto", "b.pto"], "a.pto is a project"),
     ],
 )
 def test_wrong_command_line(
