@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import os
+from collections.abc import Iterator
 from itertools import groupby
 from pathlib import Path
 from typing import Any
@@ -132,6 +133,25 @@ def test_pool_can_be_used_again(tmp_path: Path) -> None:
             (record,) = processes.run(tasks_in(tmp_path, name))
             assert record.result == "made"
     assert watch.done == ["a", "b"]
+
+
+def test_pool_does_not_ask_for_tasks_to_hear_of_others(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As where a folder is watched: what a process sends is taken in at once."""
+    monkeypatch.setattr(pool, "PAUSE", 3600.0)
+    (task,) = tasks_in(tmp_path, "a")
+    asked: list[int] = []
+
+    def source() -> Iterator[Task | None]:
+        yield task
+        while True:
+            asked.append(1)
+            yield None
+
+    with Pool(2, logging.INFO, Watch()) as processes:
+        assert next(processes.run(source())).result == "made"
+    assert len(asked) == 1
 
 
 def work_with_graphics_card(*arguments: Any) -> None:

@@ -9,6 +9,8 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
+from functools import partial
+from itertools import count
 from pathlib import Path
 
 import pytest
@@ -16,23 +18,16 @@ from conftest import names_in
 from shoots import write_project
 
 from hugin_abflow import cli
+from hugin_abflow.batch import run
+from hugin_abflow.batch.display import Display
+from hugin_abflow.batch.task import Task
 from hugin_abflow.batch.watch import watch
 from hugin_abflow.errors import ExitCode
 
 
-class Clock:
-    """Time that goes on only while somebody waits."""
-
-    def __init__(self) -> None:
-        self.now = 0.0
-
-    def pause(self, seconds: float) -> None:
-        self.now += seconds
-
-
-def start(folder: Path, recursive: bool = False) -> tuple[Iterator[Path | None], Clock]:
-    clock = Clock()
-    return watch(folder, recursive, clock=lambda: clock.now, pause=clock.pause), clock
+def start(folder: Path, recursive: bool = False) -> Iterator[Path | None]:
+    """Look at a folder, by a clock that goes on by a second from look to look."""
+    return watch(folder, recursive, clock=partial(next, count(0.0)))
 
 
 def after(saved: Iterator[Path | None], looks: int) -> list[str]:
@@ -49,7 +44,7 @@ def after(saved: Iterator[Path | None], looks: int) -> list[str]:
 
 def test_project_comes_up_once_it_has_settled(tmp_path: Path) -> None:
     write_project(tmp_path / "a.pto")
-    saved, _ = start(tmp_path)
+    saved = start(tmp_path)
     assert after(saved, 3) == []
     assert after(saved, 1) == ["a.pto"]
     assert after(saved, 9) == []
@@ -60,7 +55,7 @@ def test_project_comes_up_once_it_has_settled(tmp_path: Path) -> None:
 
 
 def test_project_that_is_still_being_saved_waits(tmp_path: Path) -> None:
-    saved, _ = start(tmp_path)
+    saved = start(tmp_path)
     for part in range(6):
         (tmp_path / "a.pto").write_text("#" * part)
         assert after(saved, 1) == []
@@ -69,7 +64,7 @@ def test_project_that_is_still_being_saved_waits(tmp_path: Path) -> None:
 
 def test_photo_that_comes_later_brings_its_project_up_again(tmp_path: Path) -> None:
     write_project(tmp_path / "a.pto")
-    saved, _ = start(tmp_path)
+    saved = start(tmp_path)
     assert after(saved, 4) == ["a.pto"]
     (tmp_path / "left.png").write_bytes(b"half")
     assert after(saved, 2) == []
@@ -80,11 +75,22 @@ def test_photo_that_comes_later_brings_its_project_up_again(tmp_path: Path) -> N
 
 def test_folders_of_folders_on_demand_and_lost_ones_are_no_error(tmp_path: Path) -> None:
     write_project(tmp_path / "day" / "a.pto")
-    assert after(start(tmp_path)[0], 5) == []
-    saved, _ = start(tmp_path, recursive=True)
+    assert after(start(tmp_path), 5) == []
+    saved = start(tmp_path, recursive=True)
     assert after(saved, 5) == ["a.pto"]
     (tmp_path / "day" / "a.pto").unlink()
     assert after(saved, 5) == []
+
+
+def test_project_that_is_saved_again_waits_until_it_is_done() -> None:
+    first, second, other = Task(Path("a.pto")), Task(Path("a.pto"), {"jpeg_quality": 1}), Task(Path("b.pto"))
+    running: set[Path] = set()
+    display = Display(quiet=True, verbose=False, log=None)
+    tasks = run._announced(iter([first, second, other, None, None]), running, display)
+    assert [next(tasks) for _ in range(3)] == [first, None, other]
+    assert display.total == 2
+    running.discard(Path("a.pto").absolute())
+    assert list(tasks) == [second, None]
 
 
 @pytest.mark.parametrize(

@@ -13,11 +13,12 @@ import secrets
 import threading
 import time
 from collections.abc import Iterable, Iterator, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from hugin_abflow.batch.pool import Watcher
+from hugin_abflow.batch.pool import PAUSE, Watcher
 from hugin_abflow.batch.record import Record
 from hugin_abflow.batch.task import Listener, Task, perform
 from hugin_abflow.errors import ClusterError, ExitCode
@@ -115,10 +116,9 @@ class Cluster:
         for task in tasks:
             if task is not None:
                 self._submit(task)
-            while not self._heard.empty():
-                yield from self._hear()
+            yield from self._hear_for(PAUSE if task is None else 0.0)
         while self._tasks:
-            yield from self._hear()
+            yield from self._take_in(self._heard.get())
 
     def _submit(self, task: Task) -> None:
         """Have one of the workers stitch a project."""
@@ -129,9 +129,15 @@ class Cluster:
         )
         future.add_done_callback(self._heard.put)
 
-    def _hear(self) -> Iterator[Record]:
+    def _hear_for(self, seconds: float) -> Iterator[Record]:
+        """Take in what comes within a time."""
+        end = time.monotonic() + seconds
+        with suppress(queue.Empty):
+            while True:
+                yield from self._take_in(self._heard.get(timeout=max(0.0, end - time.monotonic())))
+
+    def _take_in(self, heard: Any) -> Iterator[Record]:
         """Take in an event or a future that is done; gives the record of a task that is done."""
-        heard = self._heard.get()
         if isinstance(heard, list | tuple):
             key, name, *values = heard
             if key not in self._tasks:

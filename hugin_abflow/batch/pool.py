@@ -16,7 +16,7 @@ from contextlib import contextmanager, suppress
 from multiprocessing.connection import wait
 from multiprocessing.context import SpawnProcess
 from types import TracebackType
-from typing import Protocol
+from typing import Any, Protocol
 
 from hugin_abflow import trace
 from hugin_abflow.batch.record import Record
@@ -28,6 +28,8 @@ from hugin_abflow.errors import ExitCode
 ATTEMPTS = 2
 # Time to tidy up after an interruption, seconds.
 _GRACE = 15.0
+# Seconds until it is asked again for a task where there was none.
+PAUSE = 1.0
 
 
 class Watcher(Protocol):
@@ -154,21 +156,19 @@ class Pool:
         """
         source = iter(tasks)
         again: deque[tuple[Task, int]] = deque()
-        coming = True
+        coming, asking = True, 0.0  # from when on a task is asked for
         while coming or again or self._busy():
-            idle = False
-            while (coming or again) and not idle and len(self._busy()) < self._jobs:
+            while len(self._busy()) < self._jobs and (again or (coming and time.monotonic() >= asking)):
                 try:
                     task, attempt = again.popleft() if again else (next(source), 1)
                 except StopIteration:
                     coming = False
                     break
                 if task is None:
-                    idle = True
+                    asking = time.monotonic() + PAUSE
                 else:
                     self._free().begin(task, attempt, self._watcher.began(task))
-            pipes = [worker.pipe for worker in self._busy()]
-            for pipe in wait(pipes, timeout=0 if idle or not pipes else None):
+            for pipe in self._ready(asking if coming else None):
                 worker = next(one for one in self._workers if one.pipe is pipe)
                 record = worker.hear()
                 if record is None:
@@ -183,6 +183,18 @@ class Pool:
                     continue
                 self._watcher.ended(task, record)
                 yield record
+
+    def _ready(self, asking: float | None) -> list[Any]:
+        """The pipes of processes that have sent something; waits for that, but not beyond the time `asking`
+        if a process is free then.
+        """
+        busy = self._busy()
+        free = len(busy) < self._jobs
+        timeout = max(0.0, asking - time.monotonic()) if free and asking is not None else None
+        if not busy:  # nothing to wait for, which Windows would not do
+            time.sleep(timeout or 0.0)
+            return []
+        return wait([worker.pipe for worker in busy], timeout)
 
     def _grant_turn(self) -> None:
         """Let the one that has waited longest compute, if nobody does."""

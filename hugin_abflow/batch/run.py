@@ -58,6 +58,7 @@ def run(tasks: Iterable[Task | None], how: Run, lone: bool = False) -> ExitCode:
     """
     records: list[Record] = []
     order: dict[Path, int] = {}
+    running: set[Path] = set()
     with ExitStack() as stack:
         log = stack.enter_context(open_log(how.log))
         stack.enter_context(trace.recording(how.profile))
@@ -69,10 +70,11 @@ def run(tasks: Iterable[Task | None], how: Run, lone: bool = False) -> ExitCode:
                     display.expect(len(tasks))
                     order = {task.project.absolute(): place for place, task in enumerate(filter(None, tasks))}
                 else:
-                    tasks = _announced(tasks, display)
+                    tasks = _announced(tasks, running, display)
                 with _performers(how, lone, display) as performers:
                     for record in performers.run(tasks):
                         records.append(record)
+                        running.discard(record.project)
                         if not how.quiet:
                             for file in record.files:
                                 print_path(file)
@@ -94,12 +96,23 @@ def _performers(how: Run, lone: bool, display: Display) -> Alone | Pool | Cluste
     return (Alone if lone else Pool)(how.jobs or default_jobs(), level, display)
 
 
-def _announced(tasks: Iterable[Task | None], display: Display) -> Iterator[Task | None]:
-    """The same, while the display is told of each."""
+def _announced(tasks: Iterable[Task | None], running: set[Path], display: Display) -> Iterator[Task | None]:
+    """The same, while the display is told of each. A project that was saved again while it is stitched waits
+    until that is done: else the older panorama might be the last to be written.
+
+    running     projects that are being stitched; here they are added.
+    """
+    waiting: dict[Path, Task] = {}
     for task in tasks:
         if task is not None:
+            waiting[task.project.absolute()] = task
+        project = next((one for one in waiting if one not in running), None)
+        if project is None:
+            yield None
+        else:
             display.expect(1)
-        yield task
+            running.add(project)
+            yield waiting.pop(project)
 
 
 def show(options: Mapping[Path, Mapping[str, Any]]) -> ExitCode:

@@ -14,22 +14,18 @@ from hugin_abflow.batch.queue import projects_in
 from hugin_abflow.errors import AbflowError
 from hugin_abflow.project import read_plan
 
-# Seconds between looks, and for which a project and its photos must have stayed as they are.
-_INTERVAL = 1.0
+# Seconds for which a project and its photos must have stayed as they are.
 _SETTLED = 3.0
 
 Sign = tuple[tuple[str, int, int], ...]
 
 
 def watch(
-    folder: Path,
-    recursive: bool,
-    *,
-    clock: Callable[[], float] = time.monotonic,
-    pause: Callable[[float], None] = time.sleep,
+    folder: Path, recursive: bool, *, clock: Callable[[], float] = time.monotonic
 ) -> Iterator[Path | None]:
     """Projects under `folder` that were saved, or whose photos came or changed, once they stay as they are;
-    those that are there in the beginning too. None when there is nothing at the moment. Never ends.
+    those that are there in the beginning too. None when there is nothing at the moment; ask again
+    after a while. Never ends.
     """
     seen: dict[Path, tuple[Sign, float]] = {}  # what each looked like, and since when
     done: dict[Path, Sign] = {}
@@ -43,7 +39,6 @@ def watch(
                 done[project] = sign
                 yield project
         yield None
-        pause(_INTERVAL)
 
 
 def _sign(project: Path) -> Sign:
