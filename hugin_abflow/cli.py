@@ -425,6 +425,10 @@ def _run(arguments: Sequence[str] | None) -> int:
     except (click.Abort, KeyboardInterrupt):
         say(f"{PROGRAM}: interrupted")
         return ExitCode.INTERRUPTED
+    except OSError as error:
+        if not isinstance(error.__context__, KeyboardInterrupt):
+            raise
+        return ExitCode.INTERRUPTED  # with a terminal that is gone, which click would write to
     except click.ClickException as error:
         complain(f"{error.format_message()}\nTry '{PROGRAM} --help'.")
         return ExitCode.USAGE

@@ -17,12 +17,16 @@ from contextlib import AbstractContextManager, contextmanager, suppress
 from functools import partial
 from pathlib import Path
 from types import FrameType
+from typing import TYPE_CHECKING, Any, TextIO, cast
 
 import click
 
 from hugin_abflow.errors import AbflowError, ExitCode
 from hugin_abflow.metadata import PROGRAM
 from hugin_abflow.progress import Advance, Progress, silent
+
+if TYPE_CHECKING:
+    from rich.console import Console
 
 
 def say(text: str) -> None:
@@ -129,6 +133,32 @@ def on_terminal() -> bool:
     return sys.stderr is not None and sys.stderr.isatty() and os.environ.get("TERM") != "dumb"
 
 
+class _Enduring:
+    """A stream to which writing never fails: who read it may be gone."""
+
+    def __init__(self, stream: TextIO) -> None:
+        self._stream = stream
+
+    def write(self, text: str) -> int:
+        with suppress(OSError):
+            self._stream.write(text)
+        return len(text)
+
+    def flush(self) -> None:
+        with suppress(OSError):
+            self._stream.flush()
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._stream, name)
+
+
+def console() -> Console:
+    """Rich's console on stderr. By itself it ends the run where nobody reads that any more."""
+    from rich.console import Console  # takes a while to load, and is needed seldom
+
+    return Console(file=cast(TextIO, _Enduring(sys.stderr)))
+
+
 def display_progress(heading: str, quiet: bool, verbose: bool) -> AbstractContextManager[Progress]:
     """How phases are shown: bars on a terminal, lines with -v elsewhere, else not at all."""
     if quiet:
@@ -156,7 +186,6 @@ def _lines(heading: str, phase: str, total: int) -> Iterator[Advance]:
 def _bars(heading: str) -> Iterator[Progress]:
     """A bar for each phase on the terminal; they go when the project is done."""
     from rich import progress as rich_progress  # takes a while to load, and is needed here only
-    from rich.console import Console
 
     columns = (
         rich_progress.TextColumn("{task.description}", markup=False),
@@ -166,7 +195,7 @@ def _bars(heading: str) -> Iterator[Progress]:
     )
     # stdout is for results: it must not be led through the display, which writes to stderr.
     with rich_progress.Progress(
-        *columns, console=Console(stderr=True), transient=True, redirect_stdout=False
+        *columns, console=console(), transient=True, redirect_stdout=False
     ) as display:
 
         @contextmanager

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import json
 import logging
 import os
 import re
+import signal
+import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -91,6 +94,56 @@ def test_log_that_cannot_be_written_ends_the_run_before_it_starts(
     assert cli.main(["a.pto", "--log", str(tmp_path)]) == ExitCode.OUTPUT
     output = capsys.readouterr()
     assert "--log" in output.err and output.out == ""
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs a device that is always full")
+def test_log_on_a_full_disk_is_given_up(
+    replace: Callable[..., None], capsys: pytest.CaptureFixture[str]
+) -> None:
+    replace(working)
+    assert cli.main(["a.pto", "c.pto", "--log", "/dev/full"]) == 0
+    assert capsys.readouterr().err.count("/dev/full cannot be written: No space left") == 1
+
+
+@pytest.mark.skipif(os.name == "nt", reason="Windows has no pseudo-terminals")
+@pytest.mark.parametrize(
+    ("hang_up", "names", "code"),
+    [(False, "a", 0), (False, "abc", 0), (True, "abc", ExitCode.INTERRUPTED)],
+)
+def test_terminal_that_is_closed_meanwhile(tmp_path: Path, hang_up: bool, names: str, code: int) -> None:
+    """As when a connection is lost: with or without SIGHUP, of which a shell may keep its jobs."""
+    projects = [write_project(tmp_path / f"{name}.pto") for name in names]
+    report = tmp_path / "report.json"
+    command = [sys.executable, "-m", "hugin_abflow", *projects, "--jobs", "1", "--report", report]
+    ours, theirs = os.openpty()
+    child = subprocess.Popen(
+        command, stdout=subprocess.PIPE, stderr=theirs, env={**os.environ, "TERM": "xterm"}
+    )
+    os.close(theirs)
+    shown = b""
+    while b"flow" not in shown:
+        shown += os.read(ours, 4096)
+    os.close(ours)
+    if hang_up:
+        child.send_signal(signal.SIGHUP)
+    child.communicate(timeout=60)
+    assert child.returncode == code
+    written = json.loads(report.read_text("utf-8"))
+    assert written["made"] == len(written["projects"]) and (written["made"] == len(names) or hang_up)
+
+
+@pytest.mark.skipif(os.name == "nt", reason="Windows has no signals for that")
+def test_messages_that_nobody_reads_end_no_run(tmp_path: Path) -> None:
+    """As behind `2>&1 | head -1`."""
+    for name in "ab":
+        write_project(tmp_path / f"{name}.pto")
+    report = tmp_path / "report.json"
+    command = [sys.executable, "-m", "hugin_abflow", tmp_path, "--report", report]
+    child = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE)
+    assert child.stderr is not None
+    child.stderr.close()
+    assert child.wait(60) == 0
+    assert json.loads(report.read_text("utf-8"))["made"] == 2
 
 
 @pytest.mark.skipif(os.name == "nt", reason="Windows has no pseudo-terminals")

@@ -16,7 +16,7 @@ from hugin_abflow.batch.task import Task
 from hugin_abflow.errors import OutputError
 from hugin_abflow.memory import size
 from hugin_abflow.progress import Advance
-from hugin_abflow.terminal import display_progress, label, on_terminal, say
+from hugin_abflow.terminal import console, display_progress, label, on_terminal, say
 
 
 def duration(seconds: float) -> str:
@@ -59,8 +59,11 @@ def open_log(path: Path | None) -> Iterator[TextIO | None]:
         raise OutputError(
             f"{path} cannot be written: {error.strerror}; name another file with --log"
         ) from None
-    with file:
+    try:
         yield file
+    finally:
+        with suppress(OSError):  # a full disk, of which `write_log` told
+            file.close()
 
 
 class Display:
@@ -128,8 +131,13 @@ class Display:
         """A line of the log file."""
         if self._log is not None:
             stamp = datetime.now().astimezone().isoformat(timespec="seconds")
-            with suppress(OSError):  # a full disk: the panoramas are worth more
+            try:
                 self._log.write(f"{stamp} {logging.getLevelName(level):7} {text}\n")
+            except OSError as error:  # a full disk: the panoramas are worth more
+                name, self._log = self._log.name, None
+                self._show(
+                    f"{label(logging.WARNING)}{name} cannot be written: {error.strerror}; going on without"
+                )
 
     def _heading(self, task: Task, text: str) -> str:
         return "" if task.project.name in text else f"{task.project.name}: "
@@ -143,7 +151,6 @@ class Bars(Display):
 
     def __enter__(self) -> Bars:
         from rich import progress  # takes a while to load, and is needed here only
-        from rich.console import Console
 
         self._bars = progress.Progress(
             progress.TextColumn("{task.description}", markup=False),
@@ -152,7 +159,7 @@ class Bars(Display):
             progress.TimeElapsedColumn(),
             progress.TimeRemainingColumn(),
             # stdout is for results: it must not be led through the display, which writes to stderr
-            console=Console(stderr=True), transient=True, redirect_stdout=False,
+            console=console(), transient=True, redirect_stdout=False,
             speed_estimate_period=24 * 3600,
         )  # fmt: skip
         self._bars.start()

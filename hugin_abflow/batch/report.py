@@ -12,6 +12,7 @@ from hugin_abflow.batch.record import Record, write_json
 from hugin_abflow.errors import OutputError
 from hugin_abflow.memory import size
 from hugin_abflow.metadata import PROGRAM, version
+from hugin_abflow.terminal import console
 
 SCHEMA = 1
 
@@ -19,7 +20,6 @@ SCHEMA = 1
 def print_table(records: Sequence[Record]) -> None:
     """Projects, results, times, sizes, and what went wrong, on stderr."""
     from rich import box  # takes a while to load, and is needed here only
-    from rich.console import Console
     from rich.table import Table
     from rich.text import Text
 
@@ -37,10 +37,10 @@ def print_table(records: Sequence[Record]) -> None:
             size(record.bytes) if record.outputs else "",
             Text(record.message or "; ".join(record.warnings)),
         )
-    console = Console(stderr=True)
-    if not console.is_terminal:
-        console.width = 160  # a file is read in an editor, which does not mind
-    console.print(table)
+    shown_on = console()
+    if not shown_on.is_terminal:
+        shown_on.width = 160  # a file is read in an editor, which does not mind
+    shown_on.print(table)
 
 
 def _shown(project: Path) -> str:
