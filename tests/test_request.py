@@ -34,6 +34,7 @@ def request(line: str) -> Request:
         ("-wHorizontal", {"wraps": True}),
         ("--wrap=NONE", {}),
         ("-w --wrap=none", {}),
+        ("-w --wrap=Open", {}),
         ("-d 8", {"depth": np.uint8}),
         ("--depth=16", {"depth": np.uint16}),
         ("-dR32", {"depth": np.float32}),
@@ -79,6 +80,7 @@ def test_option_means(line: str, changed: dict[str, Any]) -> None:
         ("-f0x100", "give WIDTHxHEIGHT"),
         ("-wvertical", "--wrap=vertical is not possible"),
         ("--wrap=Both", "--wrap=both is not possible"),
+        ("--wrap=vertical+horizontal", "--wrap=vertical+horizontal is not possible"),
         ("-wsideways", "choose none or horizontal"),
         ("-d 64", "--depth=64 is not possible; choose 8, 16, r32 or r64"),
         ("--compression=zip", "choose none, packbits, lzw, deflate, zstd, jpeg, or 0 to 100"),
@@ -119,6 +121,15 @@ def test_every_option_of_enblend_is_known(enblend: str) -> None:
         assert known[long] == ("required" if long == "-f" else kinds.get(value, "none")), long
         assert not short or known[short] == known[long]
     assert set(re.findall(r'"(--no-[\w-]+)"', shown)) <= set(known)
+
+
+def test_options_take_a_value_where_enblend_takes_one(enblend: str) -> None:
+    """Also those that its help does not list: what follows them is a value, or a file."""
+    for option in OPTIONS:
+        for name in option.names:
+            done = subprocess.run([enblend, "gone.tif", name], capture_output=True, text=True)
+            needed = f'option "{name}" requires an argument' in done.stderr
+            assert needed == (option.value == "required"), name
 
 
 def test_help_lists_what_has_a_meaning() -> None:

@@ -81,12 +81,12 @@ def _crop(request: Request, value: str) -> Request:
 
 def _wrap(request: Request, value: str) -> Request:
     mode = value.lower() or "horizontal"
-    if mode in ("vertical", "both"):
+    if mode in ("vertical", "both", "horizontal+vertical", "vertical+horizontal"):
         raise CommandLineError(
             f"--wrap={mode} is not possible: only the left and right border can be one; "
             "leave it out, or use enblend for this panorama"
         )
-    if mode not in ("none", "horizontal"):
+    if mode not in ("none", "open", "horizontal"):
         raise CommandLineError(f"--wrap={value}: choose none or horizontal")
     return replace(request, wraps=mode == "horizontal")
 
@@ -190,15 +190,16 @@ _IGNORED = [
     *(
         Option((name,))
         for name in (
-            "--no-ciecam", "--no-parameter", "--fine-mask", "--optimize", "--no-optimize", "--gpu", "--no-gpu"
+            "--no-ciecam", "--fine-mask", "--optimize", "--no-optimize", "--gpu", "--no-gpu"
         )
     ),
-    *(Option((name,), "optional") for name in ("--coarse-mask", "--visualize", "--prefer-gpu")),
+    *(Option((name,), "optional") for name in ("--coarse-mask", "--visualize")),
     *(
         Option((name,), "required")
         for name in (
             "--blend-colorspace", "--fallback-profile", "--primary-seam-generator", "--image-difference",
-            "--optimizer-weights", "--mask-vectorize", "--anneal", "--dijkstra",
+            "--optimizer-weights", "--mask-vectorize", "--anneal", "--dijkstra", "--no-parameter",
+            "--prefer-gpu",
         )
     ),
 ]  # fmt: skip
