@@ -35,9 +35,9 @@ def say(text: str) -> None:
         click.echo(text, err=True)
 
 
-def complain(text: str) -> None:
-    """Print an error to stderr."""
-    say(f"{PROGRAM}: error: {text}")
+def complain(text: str, program: str = PROGRAM) -> None:
+    """Print an error of one of our programs to stderr."""
+    say(f"{program}: error: {text}")
 
 
 def print_path(path: Path) -> None:
@@ -55,8 +55,8 @@ def print_result(text: str) -> None:
 
 
 @contextmanager
-def catching(task: str, verbose: bool) -> Iterator[list[ExitCode]]:
-    """Report an error in a task instead of ending the run; gives the list that its code goes to."""
+def catching(task: str, verbose: bool, program: str = PROGRAM) -> Iterator[list[ExitCode]]:
+    """Report an error in a program's task instead of ending the run; gives the list that its code goes to."""
     failures: list[ExitCode] = []
     try:
         yield failures
@@ -64,7 +64,7 @@ def catching(task: str, verbose: bool) -> Iterator[list[ExitCode]]:
         if verbose and is_bug(error):
             say(traceback.format_exc().rstrip())
         message, code = explain(task, error)
-        complain(message)
+        complain(message, program)
         failures.append(code)
 
 
@@ -88,14 +88,14 @@ def explain(task: str, error: Exception) -> tuple[str, ExitCode]:
     ), ExitCode.FAILED
 
 
-def print_message(record: logging.LogRecord) -> None:
+def print_message(record: logging.LogRecord, program: str = PROGRAM) -> None:
     """Print a log message to stderr."""
-    say(label(record.levelno) + record.getMessage())
+    say(label(record.levelno, program) + record.getMessage())
 
 
-def label(level: int) -> str:
+def label(level: int, program: str = PROGRAM) -> str:
     """What stands before a message of `logging`'s level."""
-    return f"{PROGRAM}: {logging.getLevelName(level).lower()}: " if level >= logging.WARNING else ""
+    return f"{program}: {logging.getLevelName(level).lower()}: " if level >= logging.WARNING else ""
 
 
 class _Handler(logging.Handler):

@@ -132,7 +132,7 @@ def test_ends_as_enblend_does(
     assert ours == theirs.returncode, (output.err, theirs.stderr)
     assert output.out == "" and "Traceback" not in output.err
     if ours:
-        assert output.err.startswith("hugin-abflow: error: ")
+        assert output.err.startswith("abflow-enblend: error: ")
         assert names_in(Path()) == before
         return
     assert set(names_in(Path())) - set(before) == {"out.tif", "theirs.tif"}
@@ -290,7 +290,7 @@ def test_warnings(layers: list[str], line: str, said: str, capsys: pytest.Captur
     part("inside.tif", 40, 30, 20, 30)
     assert run("-v0", *line.split()) == 0
     (warning,) = capsys.readouterr().err.splitlines()
-    assert said in warning
+    assert said in warning and "hugin-abflow" not in warning
 
 
 def test_verbosity(layers: list[str], capsys: pytest.CaptureFixture[str]) -> None:
@@ -306,7 +306,7 @@ def test_verbosity(layers: list[str], capsys: pytest.CaptureFixture[str]) -> Non
 def test_wrong_line_names_the_help(capsys: pytest.CaptureFixture[str]) -> None:
     assert run("--bogus") == 1
     message = capsys.readouterr().err
-    assert message == "hugin-abflow: error: unknown option --bogus\nTry 'abflow-enblend --help'.\n"
+    assert message == "abflow-enblend: error: unknown option --bogus\nTry 'abflow-enblend --help'.\n"
 
 
 def test_version_names_enblend_in_its_first_line(capsys: pytest.CaptureFixture[str]) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import subprocess
 import sys
 from pathlib import Path, PurePosixPath, PureWindowsPath
 
@@ -213,5 +214,14 @@ def test_error_ends_in_one_line(home: Path, capsys: pytest.CaptureFixture[str]) 
     (home / "config").write_text("no folder")
     assert setup.main(["install"]) == 1
     output = capsys.readouterr()
-    assert output.err.startswith("hugin-abflow: error: ") and output.err.count("\n") == 1
+    assert output.err.startswith("hugin-abflow-setup: error: ") and output.err.count("\n") == 1
     assert "Traceback" not in output.err
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="other systems' names of folders are always Unicode")
+def test_folder_that_is_no_unicode_is_said_in_its_own_bytes(tmp_path: Path, programs: Path) -> None:
+    line = [sys.executable, "-c", "import sys; from hugin_abflow.dropin.setup import main; sys.exit(main())"]
+    environment = {**os.environ, "PATH": str(programs), "XDG_CONFIG_HOME": os.fsdecode(b"/caf\xe9")}
+    environment["PYTHONIOENCODING"] = "utf-8:strict"  # what stdout is in all locales but C
+    done = subprocess.run([*line, "install", "--dry-run"], env=environment, capture_output=True)
+    assert done.returncode == 0 and b"wrote /caf\xe9/hugin.conf\n" in done.stdout

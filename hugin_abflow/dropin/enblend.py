@@ -16,7 +16,7 @@ from hugin_abflow.guides import Guide
 from hugin_abflow.images import read_layers
 from hugin_abflow.layer import Box, Canvas, Layer, bounding_box, check_layers
 from hugin_abflow.merge import guides_between, refuse_input, write_panorama
-from hugin_abflow.metadata import PROGRAM, describe, version
+from hugin_abflow.metadata import describe, version
 from hugin_abflow.progress import Progress
 from hugin_abflow.project import read_plan
 from hugin_abflow.settings import Settings
@@ -26,6 +26,8 @@ from hugin_abflow.terminal import (
     display_progress,
     interruptible,
     messages,
+    print_message,
+    print_result,
     say,
 )
 
@@ -42,28 +44,29 @@ def main(arguments: Sequence[str] | None = None) -> int:
             succeeded = _run(sys.argv[1:] if arguments is None else arguments)
             return ExitCode.OK if succeeded else ExitCode.FAILED
         except KeyboardInterrupt:
-            say(f"{PROGRAM}: interrupted")
+            say(f"{NAME}: interrupted")
             return ExitCode.INTERRUPTED
 
 
 def _run(arguments: Sequence[str]) -> bool:
     """Whether the command line's panorama, or its answer, is there."""
-    with messages(logging.WARNING), catching(NAME, verbose=False) as failures:
+    show = partial(print_message, program=NAME)
+    with messages(logging.WARNING, show=show), catching(NAME, verbose=False, program=NAME) as failures:
         try:
             request = read_command_line(arguments)
         except CommandLineError as error:
-            complain(f"{error}\nTry '{NAME} --help'.")
+            complain(f"{error}\nTry '{NAME} --help'.", NAME)
             return False
     if failures:
         return False
     if request.answer:
-        print(HELP if request.answer == "help" else f"{NAME} {version()}, in place of enblend 4.2")
+        print_result(HELP if request.answer == "help" else f"{NAME} {version()}, in place of enblend 4.2")
         return True
     verbose = request.verbosity > 1
     with (
         # that a layer is left out is known to `joint`, which tells it to those who ask; enblend warns of it
-        messages(logging.INFO if verbose else logging.WARNING, always="hugin_abflow.unused"),
-        catching(str(request.output), verbose) as failures,
+        messages(logging.INFO if verbose else logging.WARNING, always="hugin_abflow.unused", show=show),
+        catching(str(request.output), verbose, NAME) as failures,
         display_progress("", quiet=request.verbosity == 0, verbose=True) as progress,
     ):
         blend(request, progress)

@@ -12,7 +12,7 @@ from hugin_abflow.dropin import wxconfig
 from hugin_abflow.dropin.places import Places, our_places, program
 from hugin_abflow.errors import ExitCode, SetupError
 from hugin_abflow.metadata import version
-from hugin_abflow.terminal import catching
+from hugin_abflow.terminal import catching, print_result
 
 NAME = "hugin-abflow-setup"
 _GROUP = "Enblend"
@@ -44,10 +44,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
         given = parser.parse_args(arguments)
     except SystemExit as end:  # argparse has printed why
         return int(end.code or 0)
-    with catching(NAME, verbose=False) as failures:
+    with catching(NAME, verbose=False, program=NAME) as failures:
         action = install if given.action == "install" else uninstall
         done = action(our_places(), given.dry_run)
-        print("\n".join(["Nothing is done; without --dry-run:", *done] if given.dry_run else done))
+        print_result("\n".join(["Nothing is done; without --dry-run:", *done] if given.dry_run else done))
     return failures[0] if failures else ExitCode.OK
 
 
