@@ -52,6 +52,13 @@ def choose(
         raise ConfigError(f"{file}: {error.format_message()}") from None
 
 
+def for_several(values: Mapping[str, Any], why: str) -> None:
+    """Raise `click.UsageError` for options that name the files of one project; why: there may be several."""
+    for name, option in (("output", "-o"), ("layers", "--layers")):
+        if values[name]:
+            raise click.UsageError(f"{option} is for one project, but {why}")
+
+
 def _known(command: click.Command) -> tuple[dict[str, str], list[str]]:
     """Kinds of the options that a file may give, and which of them are files."""
     names = {name: option for name, option in long_names(command).items() if name not in _UNSETTLED}

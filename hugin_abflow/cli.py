@@ -11,11 +11,11 @@ import click
 
 from hugin_abflow import memory
 from hugin_abflow.batch.config import NAME, find_config
-from hugin_abflow.batch.queue import find_projects
+from hugin_abflow.batch.queue import find_projects, refuse_same_output
 from hugin_abflow.batch.run import Run, default_jobs, run, show
 from hugin_abflow.batch.task import Task
 from hugin_abflow.batch.watch import watch
-from hugin_abflow.choices import OF_THE_RUN, choose, config_text
+from hugin_abflow.choices import OF_THE_RUN, choose, config_text, for_several
 from hugin_abflow.errors import AbflowError, ExitCode
 from hugin_abflow.images import COMPRESSIONS
 from hugin_abflow.metadata import PROGRAM, version
@@ -301,19 +301,23 @@ def command(projects: tuple[Path, ...], **given: Any) -> ExitCode:
 
     def options(project: Path) -> tuple[Path | None, dict[str, Any]]:
         file = config or find_config(project, places)
-        return file, _chosen(file, alone=file == first)
+        values = _chosen(file, alone=file == first)
+        if given["watch"]:
+            for_several(values, "--watch takes all of a folder")
+        return file, values
 
     if given["watch"]:
+        options(place / "any")  # what is wrong already is told at once
         return run(_saved(watch(given["watch"], recursive), options, force), how)
     found = find_projects(projects, recursive)
     chosen = {project: options(project) for project in found}
     if given["print_config"]:
         return _print_configs(chosen or {Path(): (first, _chosen(first))})
     tasks = {project: _options(**values) for project, (_, values) in chosen.items()}
-    lone = {name for name in ("output", "layers") for project in found if tasks[project][name]}
-    if len(found) > 1 and lone:
-        option = "-o" if "output" in lone else "--layers"
-        raise click.UsageError(f"{option} is for one project, but there are {len(found)}")
+    if len(found) > 1:
+        for its_options in tasks.values():
+            for_several(its_options, f"there are {len(found)}")
+        refuse_same_output({project: its_options["prefix"] for project, its_options in tasks.items()})
     if given["dry_run"]:
         return show(tasks)
     remember = resume or force or len(found) > 1 or any(place.is_dir() for place in projects)

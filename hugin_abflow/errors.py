@@ -120,6 +120,12 @@ class SettingsError(AbflowError):
     exit_code = ExitCode.USAGE
 
 
+class SameOutputError(AbflowError):
+    """Two projects of a run would write the same panorama."""
+
+    exit_code = ExitCode.USAGE
+
+
 class ClusterError(AbflowError):
     """The Dask cluster cannot be used."""
 

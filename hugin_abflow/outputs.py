@@ -9,6 +9,7 @@ import shlex
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from enum import StrEnum
+from pathlib import Path
 
 from hugin_abflow import pto
 from hugin_abflow.metadata import PROGRAM
@@ -55,6 +56,8 @@ _NEEDS = {
     Kind.HDR: (HDRMERGE, "pano_trafo"),
     Kind.HDR_STACKS: (HDRMERGE, "pano_trafo"),
 }
+# What follows the project's name in those of panoramas, before the ending.
+_PANORAMAS = {Kind.FUSED_LAYERS: "_blended_fused", Kind.FUSED_STACKS: "_fused", Kind.HDR: "_hdr"}
 # Which outputs are made of layers of one kind; and which of them are the layers themselves.
 _CORRECTED = frozenset({Kind.PANORAMA, Kind.LAYERS})
 _UNCORRECTED = frozenset(
@@ -137,7 +140,7 @@ class Branch:
             for number, group in enumerate(groups)
         ]
         if Kind.FUSED_LAYERS in self.kinds:
-            steps.append(self._gather(ENFUSE, f"_blended_fused{self.plan.output.ending}", steps))
+            steps.append(self._gather(ENFUSE, Kind.FUSED_LAYERS, steps))
         return steps
 
     def _stack_steps(self, program: str, images: Sequence[int], stacked: Kind, blended: Kind) -> list[Step]:
@@ -150,8 +153,7 @@ class Branch:
             for number, group in enumerate(stacks(self.plan, images))
         ]
         if blended in self.kinds:
-            suffix = "_hdr" if self.plan.hdr else "_fused"
-            steps.append(self._gather(BLEND, f"{suffix}{self.plan.output.ending}", steps))
+            steps.append(self._gather(BLEND, blended, steps))
         return steps
 
     def _step(self, program: str, suffix: str, images: Sequence[Sequence[int]], wanted: bool) -> Step:
@@ -166,12 +168,16 @@ class Branch:
             wanted,
         )
 
-    def _gather(self, program: str, suffix: str, steps: Sequence[Step]) -> Step:
+    def panorama(self, kind: Kind) -> str:
+        """The name of a panorama that is made of several files."""
+        return f"{self.plan.stem}{_PANORAMAS[kind]}{self.plan.output.ending}"
+
+    def _gather(self, program: str, kind: Kind, steps: Sequence[Step]) -> Step:
         """A step that makes a panorama of the results of others."""
         images = tuple(tuple(image for group in step.images for image in group) for step in steps)
         inputs = tuple(step.result for step in steps)
         options = self._options(program, final=True)
-        return Step(program, options, f"{self.plan.stem}{suffix}", inputs, images, True, final=True)
+        return Step(program, options, self.panorama(kind), inputs, images, True, final=True)
 
     def _options(self, program: str, final: bool) -> tuple[str, ...]:
         """Options as Hugin gives them: the project's own, size and place, wrapping, compression."""
@@ -221,6 +227,16 @@ def branches(plan: Plan, kinds: Sequence[Kind]) -> list[Branch]:
         if wanted := group & set(kinds):
             own = replace(plan, hdr=hdr, ignore_exposure=ignore_exposure, output=read_output(project, hdr))
             found.append(Branch(own, wanted))
+    return found
+
+
+def panoramas(plan: Plan) -> list[Path]:
+    """The panoramas that are checked, whether or not they can be made here; not the layers and stacks."""
+    found = []
+    for branch in branches(plan, checked_outputs(plan)):
+        if Kind.PANORAMA in branch.kinds:
+            found.append(plan.default_output())
+        found += [plan.folder / branch.panorama(kind) for kind in branch.kinds if kind in _PANORAMAS]
     return found
 
 

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 import pytest
+from shoots import write_project
 
-from hugin_abflow.batch.queue import find_projects
-from hugin_abflow.errors import ProjectError
+from hugin_abflow import cli
+from hugin_abflow.batch.queue import find_projects, refuse_same_output
+from hugin_abflow.errors import ExitCode, ProjectError, SameOutputError
 
 
 @pytest.fixture
@@ -41,6 +44,42 @@ def test_projects_are_found_once_and_in_order(
     places: list[str], recursive: bool, projects: list[str]
 ) -> None:
     assert found(*places, recursive=recursive) == projects
+
+
+@pytest.mark.skipif(os.name == "nt", reason="links need rights there")
+def test_links_lead_nowhere_twice(shoot: Path) -> None:
+    """Two that lead back make endless ways to each project."""
+    (shoot / "day 1" / "up").symlink_to("..")
+    (shoot / "day 1" / "late" / "up").symlink_to("../..")
+    (shoot / "same day").symlink_to("day 1")
+    (shoot / "link.pto").symlink_to("b.pto")
+    projects = ["b.pto", "day 1/c.pto", "day 1/late/d.pto", "link.pto"]
+    assert found("**/*.pto") == projects
+    assert found(str(shoot / "**" / "*.pto")) == [str(shoot / project) for project in projects]
+    assert found(".", recursive=True) == ["a.PTO", *projects]
+    assert found("day 1", "same day", "day 1/up/day 1") == ["day 1/c.pto"]
+
+
+def test_hidden_files_fit_a_pattern_that_names_them(shoot: Path) -> None:
+    assert found(".trash/*.pto", f"../{shoot.name}/.trash/*.pto", "*/*.pto") == [
+        ".trash/e.pto",
+        "day 1/c.pto",
+    ]
+
+
+def test_two_projects_with_one_panorama_are_refused(shoot: Path) -> None:
+    """Also where it is the fused panorama of one, and the ordinary one of the other."""
+    one, two, fused = (write_project(shoot / "new" / name) for name in ("n.pto", "n.PTO", "n_fused.pto"))
+    refuse_same_output({one: None, fused: None, shoot / "gone.pto": None, shoot / "b.pto": None})
+    with pytest.raises(SameOutputError, match=r"n\.pto and .*n\.PTO would both write .*n\.tif; .* -o"):
+        refuse_same_output({one: None, fused: None, two: None})
+    assert cli.main([str(shoot / "new")]) == ExitCode.USAGE and not (shoot / "new" / "n.tif").exists()
+    two.write_text(two.read_text().replace("ImageType tif", "ImageType jpg"))
+    refuse_same_output({one: None, two: None})
+    one.write_text(one.read_text() + "#hugin_outputLDRExposureBlended true\n")
+    with pytest.raises(SameOutputError, match=r"n_fused\.tif"):
+        refuse_same_output({one: None, fused: None})
+    refuse_same_output({one: "layer", fused: None})
 
 
 def test_name_with_a_star_is_a_name_if_there_is_such_a_file(shoot: Path) -> None:

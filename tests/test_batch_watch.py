@@ -95,7 +95,11 @@ def test_project_that_is_saved_again_waits_until_it_is_done() -> None:
 
 @pytest.mark.parametrize(
     ("arguments", "part"),
-    [(["--watch", "gone"], "gone"), (["--watch", ".", "a.pto"], "leave out PROJECT")],
+    [
+        (["--watch", "gone"], "gone"),
+        (["--watch", ".", "a.pto"], "leave out PROJECT"),
+        (["--watch", ".", "-o", "a.tif"], "-o is for one project"),
+    ],
 )
 def test_wrong_use(capsys: pytest.CaptureFixture[str], arguments: list[str], part: str) -> None:
     assert cli.main(arguments) == ExitCode.USAGE

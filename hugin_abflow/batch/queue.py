@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import glob
 import os
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import suppress
 from pathlib import Path
 
-from hugin_abflow.errors import ProjectError
+from hugin_abflow.errors import ProjectError, SameOutputError
+from hugin_abflow.outputs import panoramas
+from hugin_abflow.project import read_plan
 
 
 def find_projects(places: Iterable[Path], recursive: bool = False) -> list[Path]:
@@ -17,15 +20,38 @@ def find_projects(places: Iterable[Path], recursive: bool = False) -> list[Path]
                 ``?`` and ``**``, which not every shell expands.
     recursive   look into the folders' folders too; hidden ones are left out.
 
-    A file that is not there stays in the list: it fails by itself. Raises `ProjectError` for a folder or a
-    pattern without any project.
+    A file that is not there stays in the list: it fails by itself. Folders that are links are not looked
+    into, unless they are named: they may lead back. Raises `ProjectError` for a folder or a pattern without
+    any project.
     """
     found: dict[str, Path] = {}
     for place in places:
         for project in _projects(place, recursive):
-            # not resolved: photos are looked for beside a link, not beside what it points to
-            found.setdefault(os.path.normcase(os.path.abspath(project)), project)  # noqa: PTH100
+            found.setdefault(_key(project), project)
     return list(found.values())
+
+
+def _key(file: Path) -> str:
+    """Equal for a file's names by way of different folders. A link to a file is a file of its own: photos are
+    looked for, and panoramas written, beside it.
+    """
+    return os.path.normcase(file.parent.resolve() / file.name)
+
+
+def refuse_same_output(projects: Mapping[Path, str | None]) -> None:
+    """Raise `SameOutputError` for projects that would write the same panorama.
+
+    projects    with the prefix of their layers, if that is named: then the ordinary panorama alone is made.
+    """
+    writers: dict[str, Path] = {}
+    for project, prefix in projects.items():
+        with suppress(ProjectError, OSError):  # it will fail by itself
+            plan = read_plan(project)
+            for output in [plan.default_output()] if prefix else panoramas(plan):
+                other = writers.setdefault(_key(output), project)
+                if other != project:
+                    remedy = "rename one, or stitch it alone with -o"
+                    raise SameOutputError(f"{other} and {project} would both write {output}; {remedy}")
 
 
 def _projects(place: Path, recursive: bool) -> list[Path]:
@@ -36,12 +62,22 @@ def _projects(place: Path, recursive: bool) -> list[Path]:
             raise ProjectError(f"{place}: there is no project (.pto) in this folder; name another{remedy}")
         return projects
     if glob.has_magic(str(place)) and not place.exists():
-        # Path.glob takes no absolute patterns
-        matches = sorted(Path(name) for name in glob.glob(str(place), recursive=True))  # noqa: PTH207
+        matches = sorted(_matches(place))
         if not matches:
             raise ProjectError(f"{place}: no project has such a name; check the pattern")
         return [project for match in matches for project in _projects(match, recursive)]
     return [place]
+
+
+def _matches(pattern: Path) -> Iterator[Path]:
+    """What fits a pattern; as in a shell no hidden files, unless the pattern names them."""
+    top = Path(pattern.anchor)
+    wanted = pattern.relative_to(top) if pattern.anchor else pattern
+    shown = {part for part in wanted.parts if part.startswith(".")}
+    # unlike glob.glob it follows no links for **, which may lead back
+    for match in top.glob(str(wanted)):
+        if all(part in shown or not part.startswith(".") for part in match.relative_to(top).parts):
+            yield match
 
 
 def projects_in(folder: Path, recursive: bool) -> list[Path]:
