@@ -126,6 +126,13 @@ def test_names_of_masks(template: str, expected: str) -> None:
     assert name(template, 2, layer, Path("out/p.png")) == expected.replace("/", str(Path("/"))[0])
 
 
-def test_name_with_an_unknown_letter() -> None:
-    with pytest.raises(CommandLineError, match="%x in"):
-        name("a%x", 0, Layer.from_array("x", np.zeros((1, 1, 4), np.uint8)), Path("o"))
+@pytest.mark.parametrize(
+    ("template", "why"),
+    [
+        ("a%x", "%x in a%x means nothing"),
+        ("a%99999999999n", "%99999999999n in .*: choose a width of at most 99"),
+    ],
+)
+def test_name_that_cannot_be(template: str, why: str) -> None:
+    with pytest.raises(CommandLineError, match=why):
+        name(template, 0, Layer.from_array("x", np.zeros((1, 1, 4), np.uint8)), Path("o"))

@@ -104,7 +104,7 @@ def name(template: str, index: int, layer: Layer, output: Path) -> str:
                 ``%f``: name without ending, ``%e``: ending, of the layer or in capitals of the output;
                 ``%%``: a percent sign. Numbers may have a width: ``%03n``.
 
-    Raises `CommandLineError` for another letter.
+    Raises `CommandLineError` for another letter, or a width that no file's name has.
     """
     path = layer.file or Path(layer.name)
 
@@ -113,6 +113,8 @@ def name(template: str, index: int, layer: Layer, output: Path) -> str:
         if letter == "%":
             return "%"
         if letter in "in":
+            if len(width.lstrip("0")) > 2:  # names of files end at 255 bytes
+                raise CommandLineError(f"%{width}{letter} in {template}: choose a width of at most 99 digits")
             return f"{index + (letter == 'n'):0{int(width or 0)}}"
         file = output if letter.isupper() else path
         parts = {
