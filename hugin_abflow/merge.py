@@ -102,12 +102,15 @@ def write_panorama(
     projection      of the canvas, in words.
     guides          gives the places that layers have in common; asked once the file can be written.
     method          merges the layers; default: what `settings.merge` says.
-    depth, compression, jpeg_quality, metadata    of the file, see `images.ImageWriter`.
+    depth, compression, jpeg_quality, metadata    of the file, see `images.ImageWriter`; half floats become
+                    floats in TIFF unless `depth` is said.
     open_device     see `merge_project`.
 
     Raises `OutputError`, `ImageReadError` (a layer cannot be decoded), `DeviceError`.
     """
     crop, first = canvas.crop, layers[0]
+    if depth is None and first.dtype == np.float16 and ENDINGS.get(target.suffix.lower()) == "tiff":
+        depth = np.float32  # few programs read TIFF with half floats; enblend writes floats, too
     with ImageWriter(
         target, crop.width, crop.height, first.channels, first.dtype, depth=depth,
         offset=(crop.left, crop.top), canvas_size=(canvas.width, canvas.height), icc=first.icc,
@@ -192,8 +195,8 @@ def _report(canvas: Canvas, projection: str, layers: Sequence[Layer], writer: Im
     """Say what is merged, and into what."""
     crop = canvas.crop
     _log.info(
-        "canvas: %d x %d, %s, %g degrees; crop: %d x %d at (%d, %d)",
-        canvas.width, canvas.height, projection, canvas.hfov,
+        "canvas: %d x %d, %s%s; crop: %d x %d at (%d, %d)",
+        canvas.width, canvas.height, projection, f", {canvas.hfov:g} degrees" if canvas.hfov else "",
         crop.width, crop.height, crop.left, crop.top,
     )  # fmt: skip
     kind = {1: "grey", 3: "RGB"}[layers[0].channels]

@@ -11,8 +11,6 @@ from itertools import groupby
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from hugin_abflow.errors import ProgramMissingError
 from hugin_abflow.exif import embed
 from hugin_abflow.images import COMPRESSIONS, ENDINGS, read_layer
@@ -224,12 +222,9 @@ class _Maker:
         layers = [read_layer(files[name]) for name in step.inputs]
         check_layers(plan.canvas, layers)
         final = plan.output if step.final else None
-        # few programs read TIFF with half floats; enblend writes floats, too
-        wide = layers[0].dtype == np.float16 and target.suffix == ".tif"
         write_panorama(
             target, layers, plan.canvas, self.settings, projection=plan.projection,
             guides=partial(guides_of, plan, step.images, self.settings),
-            depth=np.float32 if wide else None,
             compression=final.compression if final else None,
             jpeg_quality=final.jpeg_quality if final else None,
             metadata=self.metadata if step.wanted else None,

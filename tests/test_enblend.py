@@ -9,13 +9,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 import tifffile
-from conftest import ICC, names_in
+from conftest import ICC, names_in, whole
 from layer_files import FULL_WIDTH, X_POSITION, Y_POSITION, write_layer
 from pictures import one_device, texture
 
 from hugin_abflow import cli
 from hugin_abflow.dropin import enblend as stand_in
-from hugin_abflow.images import read_layer
+from hugin_abflow.images import read_layer, write_image
 from hugin_abflow.layer import full_scale
 
 __all__ = ["one_device"]
@@ -193,6 +193,27 @@ def test_quality_of_jpeg_and_compression_of_others(layers: list[str]) -> None:
     assert run("-o", "out.exr", "-d", "r32", "--compression=LZW", *layers) == 0
 
 
+@pytest.mark.parametrize("line", ["-o out.exr {layers}", "-o out.exr -d 16 {layers}", "-o out.tif half.exr"])
+def test_samples_that_the_type_of_file_has_not(
+    enblend: str, layers: list[str], line: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Floats; that integers become floats is warned of. (In EXR enblend itself writes halves, always.)"""
+    write_image(Path("half.exr"), (picture() / 255).astype(np.float16))
+    arguments = spread(line, layers)
+    assert run(*arguments) == 0
+    assert ("EXR holds no uint" in capsys.readouterr().err) == ("out.exr" in line)
+    ours = read_layer(arguments[1])
+    subprocess.run([enblend, *arguments], check=True, capture_output=True)
+    theirs = read_layer(arguments[1])
+    assert ours.dtype == np.float32
+    assert ours.box == theirs.box
+    alpha, expected = whole(ours)[..., 3], whole(theirs)
+    np.testing.assert_array_equal(alpha, expected[..., 3])
+    if len(arguments) == 3:  # one layer is copied
+        np.testing.assert_array_equal(whole(ours), expected)
+    assert whole(ours)[..., :3].max() == pytest.approx(expected[..., :3].max(), abs=0.02)
+
+
 def test_icc_profile_is_kept(layers: list[str]) -> None:
     tifffile.imwrite("icc.tif", picture(), photometric="rgb", extrasamples=["unassalpha"], iccprofile=ICC)
     assert run("icc.tif") == 0
@@ -207,7 +228,7 @@ def test_canvas_is_said_with_v(layers: list[str], capsys: pytest.CaptureFixture[
     assert run("-v", "-w", "-f180x90", *layers) == 0
     assert "canvas: 180 x 90, taken as equirectangular, 360 degrees" in capsys.readouterr().err
     assert run("-v", *layers) == 0
-    assert "canvas: 180 x 90, taken as flat" in capsys.readouterr().err
+    assert "canvas: 180 x 90, taken as flat; crop: " in capsys.readouterr().err
     assert FULL_WIDTH in tifffile.TiffFile(layers[0]).pages[0].tags
 
 

@@ -8,6 +8,9 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
 
+import numpy as np
+import numpy.typing as npt
+
 from hugin_abflow import memory
 from hugin_abflow.dropin.request import HELP, Request, read_command_line
 from hugin_abflow.dropin.weights import MaskedMerge
@@ -97,7 +100,7 @@ def blend(request: Request, progress: Progress) -> None:
     write_panorama(
         request.output, layers, canvas, Settings(), projection=projection, guides=guides,
         method=MaskedMerge(request.save_masks, request.load_masks, request.output),
-        depth=request.depth, jpeg_quality=request.jpeg_quality,
+        depth=_depth(request, layers[0]), jpeg_quality=request.jpeg_quality,
         # what the others call compression is not what enblend's option means
         compression=request.compression if request.output.suffix.lower() in (".tif", ".tiff") else None,
         metadata=metadata, progress=progress,
@@ -118,6 +121,15 @@ def _read(request: Request) -> list[Layer]:
     if len(layers) == 1:
         _log.warning("only one layer: there is nothing to blend, the output is the layer")
     return layers
+
+
+def _depth(request: Request, layer: Layer) -> npt.DTypeLike | None:
+    """Samples of the output; None: the layers'. Of integers EXR gets floats, as enblend has it."""
+    depth = np.dtype(layer.dtype if request.depth is None else request.depth)
+    if request.output.suffix.lower() != ".exr" or depth.kind == "f":
+        return request.depth
+    _log.warning("%s: EXR holds no %s samples; they are written as float", request.output, depth)
+    return np.float32
 
 
 def _canvas(layers: Sequence[Layer], crop: Box | None, wraps: bool) -> Canvas:
