@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 import OpenImageIO as oiio  # noqa: N813
 
-from hugin_abflow import tifftags, trace
+from hugin_abflow import tiffreader, tifftags, trace
 from hugin_abflow.errors import ImageReadError
 from hugin_abflow.imagewriter import COMPRESSIONS, ENDINGS, ImageWriter, named_in_unicode, write_image
 from hugin_abflow.layer import Box, Layer, full_scale
@@ -33,7 +33,7 @@ Pixels = npt.NDArray[Any]
 
 _DTYPES = {"uint8": np.uint8, "uint16": np.uint16, "half": np.float16, "float": np.float32}
 _UNASSOCIATED = "oiio:UnassociatedAlpha"
-_SEPARATED, _PALETTE = 5, 3  # TIFF PhotometricInterpretation
+_MIN_IS_BLACK, _RGB, _PALETTE, _SEPARATED = 1, 2, 3, 5  # TIFF PhotometricInterpretation
 _MAX_CHUNK = 32 << 20  # a strip above this size (bytes) is not decoded whole to get a few rows of it
 _MAX_KEPT = 4 << 20  # bytes of already decoded rows that a layer keeps for its next read
 
@@ -147,6 +147,17 @@ def _refuse_unusable(path: Path, spec: Any) -> None:
         )
 
 
+def _is_for_tifffile(spec: Any) -> bool:
+    """Whether `tiffreader` has to decode it, and can: strips of whole samples, black is 0."""
+    return bool(
+        spec.get_int_attribute("tiff:Compression") in tiffreader.COMPRESSIONS
+        and spec.tile_width == 0
+        and spec.get_int_attribute("tiff:PlanarConfiguration", 1) == 1
+        and spec.get_int_attribute("tiff:PhotometricInterpretation") in (_MIN_IS_BLACK, _RGB)
+        and spec.get_int_attribute("oiio:BitsPerSample") == 8 * spec.format.basesize()
+    )
+
+
 class _Rows:
     """Rows of one stored image, decoded when asked for; the `read` of a `Layer`.
 
@@ -161,6 +172,7 @@ class _Rows:
         self.samples: int = spec.nchannels
         self.dtype = np.dtype(_DTYPES[str(spec.format)])
         self.tiled = spec.tile_width > 0
+        self.by_tifffile = _is_for_tifffile(spec)
         names = list(spec.channelnames)
         alpha = spec.alpha_channel
         if alpha < 0 and self.samples in (2, 4):
@@ -179,7 +191,7 @@ class _Rows:
     def _chunk_rows(self, spec: Any) -> int:
         """Rows that are decoded together; 1 where decoding is strictly sequential."""
         rows = spec.tile_height if self.tiled else spec.get_int_attribute("oiio:RowsPerChunk", 1)
-        too_large = not self.tiled and rows * spec.scanline_bytes(True) > _MAX_CHUNK
+        too_large = not self.tiled and not self.by_tifffile and rows * spec.scanline_bytes(True) > _MAX_CHUNK
         return 1 if too_large else max(1, int(rows))
 
     def read(self, top: int, bottom: int) -> Pixels:
@@ -218,6 +230,8 @@ class _Rows:
         self._kept = rows
 
     def _decode(self, first: int, last: int) -> Pixels:
+        if self.by_tifffile:
+            return self._normalise(tiffreader.read_strips(self.path, self.page, first, last))
         if self._source is None:
             self._source = _open(self.path, self.page)
         whole = self.height - self.height % self.chunk

@@ -1,4 +1,4 @@
-"""TIFF files, whose strips are encoded on several cores and written by a thread of their own.
+"""Write TIFF files, whose strips are encoded on several cores and written by a thread of their own.
 
 With tifffile and imagecodecs: OpenImageIO encodes one strip after the other, and turns JPEG and zstd into
 deflate.

@@ -21,6 +21,8 @@ USERS = {
     "distributed": {"batch"},
     "OpenImageIO": {"images", "imagewriter"},
     "pyopencl": {"opencl"},
+    "tifffile": {"tiffreader", "tiffwriter"},
+    "imagecodecs": {"tiffwriter"},
 }
 
 
