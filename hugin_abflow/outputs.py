@@ -5,6 +5,7 @@ As Hugin's own stitcher has it (``hugin_executor -s -d`` prints its commands); b
 
 from __future__ import annotations
 
+import logging
 import shlex
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -17,6 +18,8 @@ from hugin_abflow.nona import layer_name
 from hugin_abflow.programs import missing
 from hugin_abflow.project import Plan, read_output
 from hugin_abflow.stacks import exposure_layers, stacks
+
+_log = logging.getLogger(__name__)
 
 ENFUSE, HDRMERGE, BLEND = "enfuse", "hugin_hdrmerge", PROGRAM
 
@@ -213,6 +216,15 @@ def impossible(kinds: Sequence[Kind]) -> dict[Kind, str]:
     """Which outputs cannot be made here, and what to do about it."""
     reasons = {kind: [missing(program) for program in _NEEDS.get(kind, ())] for kind in kinds}
     return {kind: next(filter(None, why)) for kind, why in reasons.items() if any(why)}
+
+
+def possible_outputs(plan: Plan) -> list[Kind]:
+    """What is checked and can be made here; warns of what cannot."""
+    kinds = checked_outputs(plan)
+    reasons = impossible(kinds)
+    for kind, reason in reasons.items():
+        _log.warning("%s: left out: %s (%s)", plan.file, WORDS[kind], reason)
+    return [kind for kind in kinds if kind not in reasons]
 
 
 def branches(plan: Plan, kinds: Sequence[Kind]) -> list[Branch]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 import shlex
 from collections.abc import Sequence
 from dataclasses import replace
@@ -18,15 +17,23 @@ from hugin_abflow.layer import Layer, check_layers
 from hugin_abflow.merge import OpenDevice, guides_of, merge_project, refuse_input, write_panorama
 from hugin_abflow.metadata import describe
 from hugin_abflow.nona import Remap, find_layers, open_layers, remapping
-from hugin_abflow.outputs import BLEND, WORDS, Branch, Kind, Step, branches, checked_outputs, impossible
+from hugin_abflow.outputs import (
+    BLEND,
+    WORDS,
+    Branch,
+    Kind,
+    Step,
+    branches,
+    checked_outputs,
+    impossible,
+    possible_outputs,
+)
 from hugin_abflow.pano_trafo import images_of
 from hugin_abflow.programs import move_whole, run
 from hugin_abflow.progress import Progress, silent
 from hugin_abflow.project import Plan, read_plan
 from hugin_abflow.scratch import work_folder
 from hugin_abflow.settings import Settings
-
-_log = logging.getLogger(__name__)
 
 
 def stitch_project(
@@ -117,13 +124,10 @@ def show_project(
 
 def _branches(plan: Plan) -> list[Branch]:
     """What can be made of what is checked; says what cannot."""
-    kinds = checked_outputs(plan)
-    reasons = impossible(kinds)
-    for kind, reason in reasons.items():
-        _log.warning("%s: left out: %s (%s)", plan.file, WORDS[kind], reason)
-    possible = [kind for kind in kinds if kind not in reasons]
+    possible = possible_outputs(plan)
     if not possible:
-        raise ProgramMissingError(f"{plan.file}: nothing can be made: {next(iter(reasons.values()))}")
+        reason = next(iter(impossible(checked_outputs(plan)).values()))
+        raise ProgramMissingError(f"{plan.file}: nothing can be made: {reason}")
     return branches(plan, possible)
 
 

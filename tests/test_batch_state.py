@@ -15,9 +15,11 @@ import tifffile
 from conftest import age, names_in
 from shoots import HEIGHT, WIDTH, write_project
 
+from hugin_abflow import outputs
 from hugin_abflow.batch import state, task
 from hugin_abflow.batch.record import Record
 from hugin_abflow.batch.task import Task, perform
+from hugin_abflow.imagewriter import ImageWriter
 from hugin_abflow.settings import Settings
 
 Make = Callable[..., Record]
@@ -180,6 +182,39 @@ def test_panorama_that_is_gone_or_damaged_is_made_again(make: Make, shoot: Path)
         assert len((shoot / "tiny.tif").read_bytes()) == len(whole)
 
 
+@pytest.mark.parametrize("ending", [".jpg", ".png", ".exr"])
+def test_damage_is_seen_in_every_format(tmp_path: Path, ending: str) -> None:
+    """Of JPEG as well, in place of which decoders paint grey."""
+    path, rows = tmp_path / f"a{ending}", np.random.default_rng(1).integers(0, 255, (90, 120, 4), np.uint8)
+    pixels = rows if ending != ".exr" else (rows / 255).astype(np.float32)
+    with ImageWriter(path, 120, 90, 3, pixels.dtype) as writer:
+        writer.write_rows(pixels)
+    content = path.read_bytes()
+    assert state._decodes(path)
+    half = len(content) // 2
+    for damaged in (content[:half], content[:half] + bytes(len(content) - half), content[:9], b""):
+        path.write_bytes(damaged)
+        assert not state._decodes(path)
+    if ending == ".jpg":
+        path.write_bytes(content + b"appended by a camera")
+        assert state._decodes(path)
+
+
+def test_output_that_lacked_its_program_is_made_once_that_is_there(
+    make: Make, shoot: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with (shoot / "tiny.pto").open("a") as file:
+        file.write("#hugin_outputLDRBlended true\n#hugin_outputLDRExposureBlended true\n")
+    monkeypatch.setattr(outputs, "missing", lambda program: "install it" if program == "enfuse" else None)
+    make()
+    record = make()
+    assert record.result == "skipped" and "fused from stacks (install it)" in record.warnings[0]
+    monkeypatch.setattr(outputs, "missing", lambda program: None)
+    assert make().result == "made"
+    monkeypatch.setattr(outputs, "missing", lambda program: "install it" if program == "enfuse" else None)
+    assert make().result == "skipped"
+
+
 def test_panorama_that_was_retouched_is_left_as_it_is(make: Make, shoot: Path) -> None:
     make()
     tifffile.imwrite(shoot / "tiny.tif", PHOTO)
@@ -189,7 +224,18 @@ def test_panorama_that_was_retouched_is_left_as_it_is(make: Make, shoot: Path) -
 
 
 @pytest.mark.parametrize(
-    "text", ["", "[]", "{", '{"schema": 1}', '{"schema": 1, "hash": 3, "inputs": [1], "outputs": "x"}']
+    "text",
+    [
+        "",
+        "[]",
+        "{",
+        "[" * 100_000,
+        '{"schema": 1}',
+        '{"inputs": 3}',
+        '{"inputs": [{"file": []}]}',
+        '{"schema": 1, "hash": 3, "inputs": [1], "outputs": "x"}',
+    ],
+    ids=lambda text: text[:30],
 )
 def test_state_of_somebody_else_is_none(make: Make, shoot: Path, text: str) -> None:
     make()

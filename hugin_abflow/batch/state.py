@@ -21,6 +21,7 @@ from hugin_abflow.errors import AbflowError
 from hugin_abflow.images import read_layers
 from hugin_abflow.metadata import version
 from hugin_abflow.nona import layers_there
+from hugin_abflow.outputs import checked_outputs, impossible, possible_outputs
 from hugin_abflow.project import read_plan
 
 _log = logging.getLogger(__name__)
@@ -30,6 +31,8 @@ FOLDER = ".abflow"
 # Options that do not change the panorama, but how and where it is made.
 RESOURCES = frozenset({"device", "band_rows", "remap", "threads", "max_memory"})
 _ROWS = 256  # that are decoded at a time
+# Marks of JPEG (ITU-T T.81, B.1): how a file begins; of a scan, whose data has no other; of the end.
+_JPEG, _SCAN, _END = b"\xff\xd8", b"\xff\xda", b"\xff\xd9"
 
 Entry = dict[str, Any]
 
@@ -75,10 +78,14 @@ class State:
             same = known["schema"] == SCHEMA and known["hash"] == self._hash()
             if not same or not known["outputs"] or not all(map(self._is_whole, known["outputs"])):
                 return False
+            if set(known.get("left_out", [])) - set(self._left_out()):
+                return False  # its program has been installed
             record.outputs = self._plain(known["outputs"])
             record.device, record.overlaps = known["device"], known["overlaps"]
         except (KeyError, TypeError, ValueError):  # written by somebody else
             return False
+        if self._left_out():
+            possible_outputs(self._plan)  # warns of them
         record.result = "skipped"
         return True
 
@@ -86,8 +93,8 @@ class State:
         """Remember what was made. A folder that takes no memory is worth a warning."""
         kept = {entry["file"] for entry in self._inputs}
         new = [file for file in self.inputs() if self._name(file) not in kept]
-        self._inputs += self._entries(new, [])  # layers that were made and kept
         try:
+            self._inputs += self._entries(new, [])  # layers that were made and kept
             for file in record.files:
                 _flush(file)
             self.file.parent.mkdir(exist_ok=True)
@@ -100,6 +107,7 @@ class State:
                 "settings": self._settings,
                 "inputs": self._inputs,
                 "outputs": self._entries(record.files, []),
+                "left_out": self._left_out(),
                 "overlaps": record.overlaps,
             }
             write_json(self.file, values)
@@ -108,11 +116,17 @@ class State:
                 "%s cannot be written (%s): %s will be made again", self.file, error, self._plan.file
             )
 
+    def _left_out(self) -> list[str]:
+        """Outputs that are checked in the project, but lack a program here."""
+        if any(self._options.get(name) for name in ("output", "prefix", "layers")):
+            return []
+        return sorted(impossible(checked_outputs(self._plan)))
+
     def _load(self) -> dict[str, Any]:
         """What was remembered; nothing if it is unreadable."""
-        with suppress(OSError, ValueError):
+        with suppress(OSError, ValueError, RecursionError):
             known = json.loads(self.file.read_text("utf-8"))
-            if isinstance(known, dict):
+            if isinstance(known, dict) and isinstance(known.get("inputs"), list):
                 return known
         return {}
 
@@ -131,7 +145,7 @@ class State:
 
     def _entries(self, files: Iterable[Path], known: Iterable[Entry]) -> list[Entry]:
         """Names, sizes, times and hashes of files. What is unchanged by size and time is not read again."""
-        before = {entry.get("file"): entry for entry in known if isinstance(entry, dict)}
+        before = {str(entry.get("file")): entry for entry in known if isinstance(entry, dict)}
         entries = []
         for file in files:
             status, name = file.stat(), self._name(file)
@@ -178,7 +192,9 @@ def _flush(file: Path) -> None:
 
 
 def _decodes(file: Path) -> bool:
-    """Whether an image can be decoded to its end."""
+    """Whether an image can be decoded to its end. Raises OSError."""
+    if not _jpeg_ends(file):
+        return False
     try:
         for layer in read_layers(file):
             for top in range(0, layer.box.height, _ROWS):
@@ -186,3 +202,11 @@ def _decodes(file: Path) -> bool:
     except AbflowError:
         return False
     return True
+
+
+def _jpeg_ends(file: Path) -> bool:
+    """Whether a JPEG file has the mark of its end after its last scan; true for other files. Decoders paint
+    grey what is missing, and are content. Raises OSError.
+    """
+    data = file.read_bytes()
+    return not data.startswith(_JPEG) or data.find(_END, data.rfind(_SCAN)) >= 0
