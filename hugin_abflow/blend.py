@@ -110,9 +110,10 @@ def _band_height(
         height = max(_LEAST_ROWS, height // 2)
     _log.info("memory: %s of %s for bands of %d rows", memory.size(needed), memory.size(limit), height)
     if needed > limit:
+        given, remedy = memory.shortage(settings.max_memory, needed)
         _log.warning(
-            "%s of memory are too little for this panorama, which takes about %s; going on with that",
-            memory.size(limit), memory.size(needed),
+            "%s is too little for this panorama, which takes about %s; going on with that (better: %s)",
+            given, memory.size(needed), remedy,
         )  # fmt: skip
     return height
 

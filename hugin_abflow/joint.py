@@ -320,15 +320,11 @@ def _check_memory(
     _log.info("memory: about %s of %s at working resolution", memory.size(needed), memory.size(limit))
     if needed <= limit:
         return
+    given, remedy = memory.shortage(settings.max_memory, needed)
+    said = f"{given} is too little for these layers, whose flow takes about {memory.size(needed)}"
     if settings.max_memory:
-        raise SettingsError(
-            f"--max-memory {memory.size(limit)} is too little for these layers, whose flow takes about "
-            f"{memory.size(needed)}; give that much, or choose --flow-quality fast"
-        )
-    _log.warning(
-        "these layers take about %s of memory, more than half of the machine's (%s)",
-        memory.size(needed), memory.size(limit),
-    )  # fmt: skip
+        raise SettingsError(f"{said}; {remedy}, or choose --flow-quality fast")
+    _log.warning("%s; going on with that", said)
 
 
 def _flows(

@@ -65,6 +65,18 @@ def limit(max_memory: int) -> int:
     return (max_memory or machine() // 2) // _sharers
 
 
+def shortage(max_memory: int, needed: int) -> tuple[str, str]:
+    """For messages where `limit` is less than `needed`: whose limit that is, and what to do."""
+    whole = size(limit(max_memory) * _sharers)
+    given = f"--max-memory {whole}" if max_memory else f"half of the machine's memory, {whole}"
+    if _sharers == 1:
+        return given, f"give {size(needed)}"
+    return (
+        f"{given}, for each of {_sharers} --jobs {size(limit(max_memory))},",
+        f"give {size(needed * _sharers)}, or fewer --jobs",
+    )
+
+
 def resident() -> int:
     """Bytes of this process that are in memory."""
     return int(psutil.Process().memory_info().rss)

@@ -12,6 +12,7 @@ from typing import Any
 import pytest
 from shoots import write_project
 
+from hugin_abflow import cli
 from hugin_abflow.batch import pool, worker
 from hugin_abflow.batch.pool import ATTEMPTS, Pool
 from hugin_abflow.batch.record import Record
@@ -124,6 +125,17 @@ def test_process_that_died_once_is_forgiven(tmp_path: Path, monkeypatch: pytest.
     records, watch = perform(tasks_in(tmp_path, "a", remap="always"), 1)
     assert records["a"].exit_code == ExitCode.NONA and records["a"].attempts == 2
     assert watch.begun == ["a", "a"] and watch.done == ["a"]
+
+
+def test_memory_is_shared_among_no_more_than_there_are(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Else --jobs 64 would leave each of two projects a 64th."""
+    projects = [str(task.project) for task in tasks_in(tmp_path, "a", "b")]
+    assert cli.main([*projects, "--jobs", "64", "--max-memory", "1G"]) == 0
+    assert "too little" not in capsys.readouterr().err
+    assert cli.main([*projects, "--force", "--max-memory", "30M", "--jobs", "2"]) == ExitCode.ALL_FAILED
+    assert "--max-memory 30.0 MiB, for each of 2 --jobs 15.0 MiB, is too" in capsys.readouterr().err
 
 
 def test_pool_can_be_used_again(tmp_path: Path) -> None:

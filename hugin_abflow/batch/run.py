@@ -71,7 +71,7 @@ def run(tasks: Iterable[Task | None], how: Run, lone: bool = False) -> ExitCode:
                     order = {task.project.absolute(): place for place, task in enumerate(filter(None, tasks))}
                 else:
                     tasks = _announced(tasks, running, display)
-                with _performers(how, lone, display) as performers:
+                with _performers(how, len(order), lone, display) as performers:
                     for record in performers.run(tasks):
                         records.append(record)
                         running.discard(record.project)
@@ -87,13 +87,15 @@ def run(tasks: Iterable[Task | None], how: Run, lone: bool = False) -> ExitCode:
     return combine([record.exit_code for record in records])
 
 
-def _performers(how: Run, lone: bool, display: Display) -> Alone | Pool | Cluster:
-    """Who performs the tasks."""
+def _performers(how: Run, count: int, lone: bool, display: Display) -> Alone | Pool | Cluster:
+    """Who performs the tasks; count: how many there are, 0 if nobody knows."""
     # figures of overlaps are told as messages
     level = logging.INFO if how.verbose or how.log or how.report or not lone else logging.WARNING
     if how.scheduler:
         return Cluster(how.scheduler, level, display)
-    return (Alone if lone else Pool)(how.jobs or default_jobs(), level, display)
+    jobs = how.jobs or default_jobs()
+    # processes share the memory: there must be no more than have something to do
+    return (Alone if lone else Pool)(min(jobs, count) if count else jobs, level, display)
 
 
 def _announced(tasks: Iterable[Task | None], running: set[Path], display: Display) -> Iterator[Task | None]:
