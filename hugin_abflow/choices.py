@@ -22,6 +22,11 @@ OF_THE_RUN = frozenset(
     }
 )  # fmt: skip
 
+# Parameters that say what is made of which files; `stitch.show_project` puts them into its commands.
+_OF_FILES = frozenset(
+    {"output", "prefix", "layers", "remap", "keep_layers", "compression", "jpeg_quality"}
+)  # fmt: skip
+
 
 def choose(
     command: click.Command, arguments: Sequence[str], file: Path | None, alone: bool = True
@@ -57,6 +62,17 @@ def for_several(values: Mapping[str, Any], why: str) -> None:
     for name, option in (("output", "-o"), ("layers", "--layers")):
         if values[name]:
             raise click.UsageError(f"{option} is for one project, but {why}")
+
+
+def words(command: click.Command, values: Mapping[str, Any]) -> list[str]:
+    """What one would type for `values` that are not the defaults, but for those of the run and of files."""
+    context = click.Context(command)
+    said: list[str] = []
+    for name, option in long_names(command).items():
+        value = values[str(option.name)]
+        if option.name not in OF_THE_RUN | _OF_FILES and value not in (None, option.get_default(context)):
+            said += [f"--{name}"] if option.is_flag else [f"--{name}", str(value)]
+    return said
 
 
 def _known(command: click.Command) -> tuple[dict[str, str], list[str]]:

@@ -15,7 +15,7 @@ from hugin_abflow.batch.queue import find_projects, refuse_same_output
 from hugin_abflow.batch.run import Run, default_jobs, run, show
 from hugin_abflow.batch.task import Task
 from hugin_abflow.batch.watch import watch
-from hugin_abflow.choices import OF_THE_RUN, choose, config_text, for_several
+from hugin_abflow.choices import OF_THE_RUN, choose, config_text, for_several, words
 from hugin_abflow.errors import AbflowError, ExitCode
 from hugin_abflow.images import COMPRESSIONS
 from hugin_abflow.metadata import PROGRAM, version
@@ -319,7 +319,8 @@ def command(projects: tuple[Path, ...], **given: Any) -> ExitCode:
             for_several(its_options, f"there are {len(found)}")
         refuse_same_output({project: its_options["prefix"] for project, its_options in tasks.items()})
     if given["dry_run"]:
-        return show(tasks)
+        spoken = {project: words(command, values) for project, (_, values) in chosen.items()}
+        return show({project: {**tasks[project], "options": spoken[project]} for project in tasks})
     remember = resume or force or len(found) > 1 or any(place.is_dir() for place in projects)
     return run(
         [Task(project, options, remember and not force, remember) for project, options in tasks.items()],

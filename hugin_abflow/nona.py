@@ -228,10 +228,7 @@ def _find_or_make(plan: Plan, folder: Path, remap: Remap, keep: bool, progress: 
     found = None if remap == "always" else _find(plan)
     if remap == "never":
         if found is None:
-            raise LayersMissingError(
-                f"no layers {plan.stem}0000.tif ... or {plan.hugin_prefix}0000.tif ... beside {plan.file}; "
-                "name them with --prefix or --layers, or let nona make them (--remap auto)"
-            )
+            raise _none_there(plan)
         _report_used(plan, found)
         return found
     stale = found.stale(plan) if found else []
@@ -247,10 +244,22 @@ def _find_or_make(plan: Plan, folder: Path, remap: Remap, keep: bool, progress: 
 
 
 def find_layers(plan: Plan, remap: Remap) -> str | None:
-    """The prefix of layers that `open_layers` takes without making any; None if there are none."""
+    """The prefix of layers that `open_layers` takes without making any; None if there are none.
+
+    Raises `LayersMissingError` as it does.
+    """
     found = None if remap == "always" else _find(plan)
+    if found is None and remap == "never":
+        raise _none_there(plan)
     usable = found and (remap == "never" or not (found.missing(plan) or found.stale(plan)))
     return Path(found.prefix).name if found and usable else None
+
+
+def _none_there(plan: Plan) -> LayersMissingError:
+    return LayersMissingError(
+        f"no layers {plan.stem}0000.tif ... or {plan.hugin_prefix}0000.tif ... beside {plan.file}; "
+        "name them with --prefix or --layers, or let nona make them (--remap auto)"
+    )
 
 
 def _report_used(plan: Plan, found: _Found) -> None:

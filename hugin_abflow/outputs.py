@@ -16,7 +16,7 @@ from hugin_abflow import pto
 from hugin_abflow.metadata import PROGRAM
 from hugin_abflow.nona import layer_name
 from hugin_abflow.programs import missing
-from hugin_abflow.project import Plan, read_output
+from hugin_abflow.project import TIFF_COMPRESSIONS, Plan, read_output
 from hugin_abflow.stacks import exposure_layers, stacks
 
 _log = logging.getLogger(__name__)
@@ -91,10 +91,10 @@ class Step:
     wanted: bool
     final: bool = False
 
-    def command(self, project: str) -> list[str]:
-        """What one would type."""
+    def command(self, project: str, blending: Sequence[str]) -> list[str]:
+        """What one would type; blending: options of our own."""
         if self.program == BLEND:
-            return [BLEND, "-o", self.result, project, "--layers", *self.inputs]
+            return [BLEND, *blending, "-o", self.result, project, "--layers", *self.inputs]
         return [self.program, *self.options, "-o", self.result, "--", *self.inputs]
 
 
@@ -197,7 +197,11 @@ class Branch:
             compression = []
         else:
             layers = project.option("outputLayersCompression", "LZW").strip()
-            compression = [f"--compression={(output.compression if final else layers) or 'LZW'}"]
+            name = (output.compression if final else layers) or "LZW"
+            if name.lower() not in TIFF_COMPRESSIONS:
+                _log.warning("%s: enfuse knows no compression %s; its files get LZW", self.plan.file, name)
+                name = "LZW"
+            compression = [f"--compression={name}"]
         own = _words(project.option("enfuseOptions", ""))
         return (*own, *(["-w"] if wraps else []), size, *compression)
 

@@ -29,7 +29,7 @@ _PROJECTIONS = (
 )  # fmt: skip
 
 _ENDINGS = {"tif": ".tif", "tiff": ".tif", "jpg": ".jpg", "jpeg": ".jpg", "png": ".png", "exr": ".exr"}
-_COMPRESSIONS = ("none", "lzw", "packbits", "deflate")
+TIFF_COMPRESSIONS = ("none", "lzw", "packbits", "deflate")  # of Hugin, enblend and enfuse
 _JPEG_QUALITY = 90  # Hugin's default
 
 
@@ -211,7 +211,7 @@ def read_output(project: pto.Project, hdr: bool) -> Output:
     return Output(
         ending=ending,
         # Hugin's GUI writes TIFF's compression beside any type, LZW for EXR too
-        compression=compression if ending == ".tif" and compression in _COMPRESSIONS else None,
+        compression=compression if ending == ".tif" and compression in TIFF_COMPRESSIONS else None,
         jpeg_quality=min(100, max(1, int(quality))) if quality.isdecimal() else _JPEG_QUALITY,
     )
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import shlex
 from collections.abc import Sequence
 from dataclasses import replace
@@ -16,7 +17,7 @@ from hugin_abflow.images import COMPRESSIONS, ENDINGS, read_layer
 from hugin_abflow.layer import Layer, check_layers
 from hugin_abflow.merge import OpenDevice, guides_of, merge_project, refuse_input, write_panorama
 from hugin_abflow.metadata import describe
-from hugin_abflow.nona import Remap, find_layers, open_layers, remapping
+from hugin_abflow.nona import Remap, find_layers, layers_there, open_layers, remapping
 from hugin_abflow.outputs import (
     BLEND,
     WORDS,
@@ -89,9 +90,14 @@ def show_project(
     prefix: str | Path | None = None,
     layers: Sequence[str | Path] | None = None,
     remap: Remap = "auto",
+    compression: str | None = None,
+    jpeg_quality: int | None = None,
+    options: Sequence[str] = (),
     **others: Any,
 ) -> list[str]:
     """What `stitch_project` would do, as lines of a shell script: a comment on the plan, then the commands.
+
+    options     of our own command line that say how to blend; the other arguments are `stitch_project`'s.
 
     Photos that miss the crop, which nona tells later, are taken for part of the panorama. Raises as
     `stitch_project` does for what the project can get wrong.
@@ -103,23 +109,44 @@ def show_project(
         f"{canvas.crop.width} x {canvas.crop.height} of {canvas.width} x {canvas.height}",
         shlex.join(["cd", str(plan.folder)]),
     ]
+    stored = _storing(compression, jpeg_quality)
     if output or prefix or layers:
         target = str(Path(output).absolute()) if output else plan.default_output().name
         named = ["--layers", *(str(Path(layer).absolute()) for layer in layers)] if layers else []
-        named = ["--prefix", str(prefix)] if prefix else named
+        named = ["--prefix", _from_anywhere(plan, prefix)] if prefix else named
         remapped = [] if named else _remapping(plan, remap)
         named = named or ["--prefix", _layers_prefix(plan, remap)]
-        return [*head, *remapped, shlex.join([BLEND, "-o", target, name, *named])]
+        return [*head, *remapped, shlex.join([BLEND, *options, *stored, "-o", target, name, *named])]
     lines: list[str] = []
     for branch in _branches(plan):
         lines += [f"# {WORDS[kind]}" for kind in Kind if kind in branch.kinds]
         lines += _remapping(branch.plan, _remap(branch.plan, remap))
         if Kind.PANORAMA in branch.kinds:
             found = _layers_prefix(branch.plan, remap)
-            lines.append(shlex.join([BLEND, "-o", plan.default_output().name, name, "--prefix", found]))
-        steps = branch.steps([image.index for image in plan.images])
-        lines += [shlex.join(step.command(name)) for step in steps]
+            target = plan.default_output().name
+            lines.append(shlex.join([BLEND, *options, *stored, "-o", target, name, "--prefix", found]))
+        own, asked = branch.plan.output, _stored(branch.plan, compression, jpeg_quality)
+        differs = _storing(
+            asked.output.compression if asked.output.compression != own.compression else None,
+            asked.output.jpeg_quality if asked.output.jpeg_quality != own.jpeg_quality else None,
+        )
+        steps = replace(branch, plan=asked).steps([image.index for image in plan.images])
+        lines += [
+            shlex.join(step.command(name, [*options, *(differs if step.final else [])])) for step in steps
+        ]
     return [*head, *lines]
+
+
+def _storing(compression: str | None, jpeg_quality: int | None) -> list[str]:
+    """Options of our command line for how a panorama is stored."""
+    by_name = {"--compression": compression, "--jpeg-quality": jpeg_quality}
+    return [word for name, value in by_name.items() if value for word in (name, str(value))]
+
+
+def _from_anywhere(plan: Plan, prefix: str | Path) -> str:
+    """A prefix of layers that lie in the current folder, in full: the commands run in the project's."""
+    here = os.path.join(Path.cwd(), prefix)  # noqa: PTH118 - pathlib drops a slash at the end
+    return here if layers_there(plan, here, None, "auto") else str(prefix)
 
 
 def _branches(plan: Plan) -> list[Branch]:

@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import OpenImageIO as oiio
 import pytest
+import tifffile
 from conftest import ProjectMaker, names_in, require_program
 from pictures import one_device
 from test_exif import shown
@@ -18,10 +19,11 @@ from test_hugin import CANVAS, NAME, stacked
 from test_metadata import shot
 
 from hugin_abflow import cli
-from hugin_abflow.errors import ExitCode, OutputError, ProgramFailedError
+from hugin_abflow.errors import ExitCode, LayersMissingError, OutputError, ProgramFailedError
 from hugin_abflow.images import read_layer
 from hugin_abflow.merge import merge_project
 from hugin_abflow.outputs import Kind
+from hugin_abflow.settings import Settings
 from hugin_abflow.stitch import show_project, stitch_project
 
 __all__ = ["one_device"]
@@ -210,6 +212,15 @@ def test_program_that_fails_leaves_nothing(
     assert names_in(project.parent) == before
 
 
+def test_compression_that_enfuse_does_not_know(make_project: ProjectMaker, caplog) -> None:
+    require_program("enfuse")
+    project = stacked(make_project(panorama=CANVAS), asked(Kind.FUSED_LAYERS, Kind.FUSED_STACKS))
+    by_enfuse, by_us = stitch_project(project, Settings(flow=False), compression="zstd")
+    assert tifffile.TiffFile(by_enfuse).pages[0].compression.name == "LZW"
+    assert tifffile.TiffFile(by_us).pages[0].compression.name == "ZSTD"
+    assert caplog.text.count("enfuse knows no compression zstd; its files get LZW") == 1
+
+
 def test_photo_is_never_replaced(make_project: ProjectMaker) -> None:
     project = make_project(panorama=CANVAS, photo="pano_stack_ldr_{:04d}.tif".replace("{:04d}", "000{}"))
     project.write_text(project.read_text() + asked(Kind.STACKS))
@@ -276,6 +287,37 @@ def test_dry_run_of_one_panorama(
     assert len(lines) == len(expected)
     for line, begin in zip(lines, expected, strict=True):
         assert line.startswith(begin.format(here=tmp_path))
+
+
+def test_dry_run_says_how_to_blend(make_project: ProjectMaker, capsys: pytest.CaptureFixture[str]) -> None:
+    """By the command line or a file of settings; storing is said of outputs alone."""
+    project = stacked(
+        make_project(panorama=CANVAS), asked(Kind.PANORAMA, Kind.EXPOSURE_LAYERS, Kind.FUSED_STACKS)
+    )
+    project.with_name("abflow.toml").write_text("flow-magnitude = 50\n")
+    chosen = ["--no-flow", "--max-memory", "1G", "--seam=auto", "--compression", "zstd"]
+    assert cli.main(["--dry-run", "-v", *chosen, str(project)]) == 0
+    lines = [shlex.split(line) for line in capsys.readouterr().out.splitlines()]
+    ours = [line[1 : line.index("-o")] for line in lines if line[0] == "hugin-abflow"]
+    how = ["--flow-magnitude", "50.0", "--no-flow", "--max-memory", "1073741824"]
+    stored = ["--compression", "zstd"]
+    assert ours == [[*how, *stored], how, how, [*how, *stored]]
+    for words in ours:
+        assert cli.main(["--dry-run", *words, str(project)]) == 0
+
+
+def test_dry_run_finds_layers_as_the_run_does(
+    make_project: ProjectMaker, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    project = make_project(panorama=CANVAS)
+    for run in (show_project, stitch_project):
+        with pytest.raises(LayersMissingError, match=r"no layers pano0000\.tif .* let nona make them"):
+            run(project, remap="never")
+    (tmp_path / "layers").mkdir()
+    (tmp_path / "layers" / "l0000.tif").touch()
+    monkeypatch.chdir(tmp_path)
+    line = shlex.split(show_project(project, prefix="layers/l")[-1])
+    assert line[-2:] == ["--prefix", str(tmp_path / "layers" / "l")]
 
 
 def test_dry_run_takes_layers_that_are_there(make_project: ProjectMaker) -> None:
