@@ -33,6 +33,7 @@ _SIZES = {kind: size for size, kinds in _KINDS.items() for kind in kinds}
 _SWAPPED = _SIZES | {5: 4, 10: 4}
 _LONGEST = 1 << 15  # bytes; JPEG's segments, in which EXIF must fit, end at twice of it
 _MAX_PAGES = 65536  # a chain of directories that is longer runs in a circle
+_MAX_ENTRIES = 65535  # of a directory; BigTIFF's count has room for more, but tags have two bytes
 
 
 @dataclass(frozen=True)
@@ -98,7 +99,7 @@ def read_places(path: Path) -> list[Place]:
         with path.open("rb") as file:
             layout, first = _read_header(file)
             return [_place(_numbers(file, layout, start)) for start in _directories(file, layout, first)]
-    except (OSError, struct.error, OverflowError, ZeroDivisionError) as error:
+    except (OSError, struct.error, OverflowError, ValueError) as error:
         raise ImageReadError(f"{path} is not a readable TIFF file ({error}); make the layer again") from None
 
 
@@ -218,6 +219,8 @@ def _entries(file: BinaryIO, layout: _Layout, start: int) -> tuple[dict[int, byt
     """The entries of one directory by tag, as they are, and the offset of the next page's directory."""
     file.seek(start)
     (count,) = struct.unpack(layout.count, file.read(struct.calcsize(layout.count)))
+    if count > _MAX_ENTRIES:
+        raise struct.error(f"a directory of {count} tags")
     table = file.read(count * layout.entry)
     following = file.read(struct.calcsize(layout.offset))
     entries = (table[at : at + layout.entry] for at in range(0, len(table), layout.entry))

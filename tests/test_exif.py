@@ -207,6 +207,7 @@ def test_photos_of_other_programs(exiftool: str, tmp_path: Path, ending: str, by
         b"\xff\xd8\xff\xe1\x00\x0eExif\0\0II*\0",
         b"\xff\xd8\xff\xe1\x00\x14Exif\0\0II*\0\xff\xff\xff\x7f",
         b"II*\0\x08\0\0\0\xff\xff",
+        b"II+\0\x08\0\0\0\x10\0\0\0\0\0\0\0" + (1 << 40).to_bytes(8, "little"),  # more tags than memory holds
         b"\x89PNG\r\n\x1a\n\0\0\0\rIHDR",
         b"\x89PNG\r\n\x1a\n\0\0\0\x04eXIfMM\0*",
         b"nothing of the kind",

@@ -51,8 +51,7 @@ def test_uninstall_restores_every_byte(hugin: Places, tmp_path: Path, content: b
     setup.install(hugin)  # a second time is not one too many
     assert files(tmp_path) == installed != before
     setup.uninstall(hugin)
-    after = files(tmp_path)
-    assert after == {name: data for name, data in before.items() if data or not name.endswith(".conf")}
+    assert files(tmp_path) == before
 
 
 def test_preferences_name_the_program_and_keep_the_rest(hugin: Places, programs: Path) -> None:
@@ -115,6 +114,17 @@ def test_link_to_the_preferences_stays_one(hugin: Places, tmp_path: Path) -> Non
     assert real.stat().st_mode & 0o777 == 0o600
     setup.uninstall(hugin)
     assert preferences.is_symlink() and real.read_bytes() == CONFIG
+
+
+def test_link_to_no_preferences_stays_one(hugin: Places, tmp_path: Path) -> None:
+    real = tmp_path / "dotfiles.conf"
+    preferences = Path(hugin.preferences)
+    preferences.parent.mkdir()
+    preferences.symlink_to(real)
+    setup.install(hugin)
+    assert b"abflow-enblend" in real.read_bytes()
+    setup.uninstall(hugin)
+    assert preferences.is_symlink() and not real.exists()
 
 
 def test_programs_that_are_not_installed(

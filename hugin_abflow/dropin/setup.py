@@ -111,8 +111,8 @@ def _restore_preferences(places: Places, dry_run: bool) -> list[str]:
     if now is None or not _is_ours(now):
         return [f"{path}: another blender is set, or none; left as it is"]
     only_ours = wxconfig.changed(before or "", _GROUP, _values(now)) == now
-    restored = (before or "") if only_ours else wxconfig.changed(now, _GROUP, _values(before or ""))
-    done = _write(path, restored, dry_run) if restored else _remove(path, dry_run)
+    restored = before if only_ours else wxconfig.changed(now, _GROUP, _values(before or ""))
+    done = _remove(path, dry_run) if restored is None else _write(path, restored, dry_run)
     return done if before is None else [*done, *_remove(_backup(path), dry_run)]
 
 
@@ -161,7 +161,7 @@ def _write(path: Path, content: str, dry_run: bool) -> list[str]:
 def _remove(path: Path, dry_run: bool) -> list[str]:
     if not dry_run:
         try:
-            path.unlink()
+            path.resolve().unlink()  # through a link, as it was written
         except OSError as error:
             raise SetupError(f"{path} cannot be removed: {error.strerror}") from None
     return [f"removed {path}"]
