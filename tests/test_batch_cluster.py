@@ -24,12 +24,24 @@ pytest.importorskip("distributed")
 
 
 @pytest.fixture
-def cluster(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[int], str]]:
+def processes() -> Iterator[list[subprocess.Popen[bytes]]]:
+    """A scheduler and its workers, which are ended with the test."""
+    running: list[subprocess.Popen[bytes]] = []
+    yield running
+    for process in running:
+        process.kill()
+    for process in running:
+        process.wait()
+
+
+@pytest.fixture
+def cluster(
+    processes: list[subprocess.Popen[bytes]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> Callable[[int], str]:
     """Starts a scheduler with so many workers, and gives its address."""
     scratch = tmp_path / "dask"
     scratch.mkdir()
     monkeypatch.setenv("DASK_DISTRIBUTED__SCHEDULER__ALLOWED_FAILURES", "2")
-    processes: list[subprocess.Popen[bytes]] = []
     file = scratch / "scheduler.json"
 
     def start(module: str, *arguments: object) -> None:
@@ -47,11 +59,7 @@ def cluster(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Callabl
             start("dask_worker", *local, "--no-nanny", "--nthreads", 1)
         return str(json.loads(file.read_text())["address"])
 
-    yield started
-    for process in processes:
-        process.kill()
-    for process in processes:
-        process.wait()
+    return started
 
 
 @posix
@@ -123,6 +131,18 @@ def test_failures_come_back_as_on_one_machine(
     assert output.out == f"{tmp_path / 'b.tif'}\n"
     assert "a0000.tif cannot be read" in output.err and "b.pto: blend: " in output.err
     assert "b.pto: canvas: 250 x 125" in output.err
+
+
+def test_scheduler_without_workers_is_told_and_may_go(cluster: Callable[[int], str], tmp_path: Path) -> None:
+    projects = [write_project(tmp_path / f"{name}.pto") for name in "ab"]
+    command = [sys.executable, "-m", "hugin_abflow", *projects, "--scheduler", cluster(0)]
+    child = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    assert child.stderr is not None
+    assert "the scheduler has no workers; projects wait" in child.stderr.readline()
+    processes[0].kill()
+    _, said = child.communicate(timeout=60)
+    assert child.returncode == ExitCode.ALL_FAILED and "Traceback" not in said, said
+    assert said.count("error: ") == 2 and "a.pto: the scheduler is gone" in said
 
 
 def test_scheduler_that_does_not_answer(

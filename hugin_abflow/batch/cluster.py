@@ -7,6 +7,7 @@ uses its own device, and tells of progress through the scheduler's events. The o
 from __future__ import annotations
 
 import glob
+import logging
 import os
 import queue
 import secrets
@@ -23,9 +24,13 @@ from hugin_abflow.batch.record import Record
 from hugin_abflow.batch.task import Listener, Task, perform
 from hugin_abflow.errors import ClusterError, ExitCode
 from hugin_abflow.metadata import PROGRAM, version
+from hugin_abflow.terminal import label, say
 
 _TIMEOUT = "10s"  # for the scheduler's first answer
+_SILENCE = 10.0  # seconds after which it is asked whether there are workers
 _EVERY = 0.5  # seconds between two messages about how far a phase is
+# Loggers that print tracebacks of a lost connection, of which futures tell.
+_CHATTERS = ("distributed", "distributed.client", "tornado.application", "asyncio")
 # Messages, the device and the measure of memory are a process's own: one project at a time in each.
 _one_at_a_time = threading.Lock()
 
@@ -91,6 +96,8 @@ class Cluster:
             raise ClusterError(
                 f"--scheduler needs Dask; install it with: pip install '{PROGRAM}[cluster]'"
             ) from None
+        for name in _CHATTERS:
+            logging.getLogger(name).setLevel(logging.CRITICAL)
         try:
             self._client = Client(scheduler, timeout=_TIMEOUT, set_as_default=False)
         except (OSError, TimeoutError, ValueError) as error:
@@ -103,9 +110,11 @@ class Cluster:
         self._tasks: dict[str, Task] = {}
         self._listeners: dict[str, Listener] = {}
         self._attempts: dict[str, int] = {}
+        self._deserted = False
 
     def __enter__(self) -> Cluster:
         self._client.subscribe_topic(self._topic, lambda event: self._heard.put(event[1]))
+        self._look_for_workers()
         return self
 
     def __exit__(self, *reason: object) -> None:
@@ -118,7 +127,21 @@ class Cluster:
                 self._submit(task)
             yield from self._hear_for(PAUSE if task is None else 0.0)
         while self._tasks:
-            yield from self._take_in(self._heard.get())
+            try:
+                heard = self._heard.get(timeout=_SILENCE)
+            except queue.Empty:
+                self._look_for_workers()
+            else:
+                yield from self._take_in(heard)
+
+    def _look_for_workers(self) -> None:
+        """Warn once when there are none any more: their tasks wait."""
+        with suppress(OSError):  # of a scheduler that is gone futures tell
+            deserted = not self._client.nthreads()
+            if deserted and not self._deserted:
+                warning = f"{label(logging.WARNING)}the scheduler has no workers; projects wait until it has"
+                say(f"{warning} (docs/cluster.md says how to start one)")
+            self._deserted = deserted
 
     def _submit(self, task: Task) -> None:
         """Have one of the workers stitch a project."""
@@ -163,10 +186,15 @@ class Cluster:
             record: Record = future.result()
             return record
         record = Record(task.project.absolute(), exit_code=ExitCode.CLUSTER)
-        why = "cancelled" if future.status == "cancelled" else repr(future.exception())
+        if future.status in ("cancelled", "lost"):
+            record.message = (
+                f"{task.project}: the scheduler is gone, or withdrew it; start it again, and run the same "
+                "command, which goes on where this one was"
+            )
+            return record
         record.message = (
-            f"{task.project}: the cluster gave it up ({why}); are {PROGRAM} and the shared folder on "
-            "all machines, and is there memory enough?"
+            f"{task.project}: the cluster gave it up ({future.exception()!r}); are {PROGRAM} and the shared "
+            "folder on all machines, and is there memory enough?"
         )
         return record
 
