@@ -144,6 +144,14 @@ def test_preferences_that_cannot_be_written(hugin: Places, tmp_path: Path) -> No
         setup.install(hugin)
 
 
+def test_failure_leaves_the_preferences_as_they_were(hugin: Places, tmp_path: Path) -> None:
+    (tmp_path / "data").write_text("a file where a folder should be")
+    before = files(tmp_path)
+    with pytest.raises(SetupError, match=r"\.executor cannot be written: .*; allow writing there"):
+        setup.install(hugin)
+    assert files(tmp_path) == before
+
+
 # Places
 
 

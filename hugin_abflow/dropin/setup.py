@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import shutil
 from collections.abc import Sequence
+from contextlib import suppress
 from importlib import resources
 from pathlib import Path, PureWindowsPath
 
@@ -57,12 +58,13 @@ def install(places: Places, dry_run: bool = False) -> list[str]:
     Raises `SetupError` where our programs are not installed, or files cannot be read or written.
     """
     paths = {name: program(name) for name in _PROGRAMS}
-    done = _set_preferences(places, paths[_BLENDER], dry_run)
+    done: list[str] = []
     for name, content in sequences().items():
         for one, path in paths.items():
             content = content.replace(f"Program={one}\n", f"Program={wxconfig.quoted(path)}\n")
         done += _write(Path(places.data, name), content, dry_run)
-    return [*done, _AFTERWARDS]
+    # last: where something fails, Hugin's button does what it did
+    return [*done, *_set_preferences(places, paths[_BLENDER], dry_run), _AFTERWARDS]
 
 
 def uninstall(places: Places, dry_run: bool = False) -> list[str]:
@@ -151,9 +153,10 @@ def _write(path: Path, content: str, dry_run: bool) -> list[str]:
                 shutil.copymode(final, part)
             part.replace(final)
         except OSError as error:
-            part.unlink(missing_ok=True)
+            with suppress(OSError):
+                part.unlink()
             raise SetupError(
-                f"{path} cannot be written: {error.strerror}; free its folder, then try again"
+                f"{path} cannot be written: {error.strerror}; allow writing there, then try again"
             ) from None
     return [f"wrote {path}"]
 
