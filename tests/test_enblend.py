@@ -295,6 +295,23 @@ def test_control_points_are_asked_for(layers: list[str], pano_trafo: str, capsys
     assert "1 control points between the layers" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize(
+    ("said", "threads"),
+    [(None, 0), ("1", 1), ("3", 3), (" 2,4", 2), ("0", 0), ("", 0), ("all", 0), ("-2", 0), ("9999999", 0)],
+)
+def test_as_many_cores_as_hugin_says(
+    layers: list[str], said: str | None, threads: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """hugin_executor's --threads and the preference of that name reach enblend as OMP_NUM_THREADS."""
+    monkeypatch.delenv("OMP_NUM_THREADS", raising=False)
+    if said is not None:
+        monkeypatch.setenv("OMP_NUM_THREADS", said)
+    found: list[int] = []
+    monkeypatch.setattr(stand_in, "write_panorama", lambda *given, **named: found.append(given[3].threads))
+    assert run(*layers) == 0
+    assert found == [threads]
+
+
 # What is said
 
 

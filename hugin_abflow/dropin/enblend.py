@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import logging
+import os
+import re
 import sys
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -86,19 +88,20 @@ def blend(request: Request, progress: Progress) -> None:
         _log.warning("options of enblend that change nothing here: %s", ", ".join(request.ignored))
     layers = _read(request)
     refuse_input(request.output, request.inputs)
+    settings = Settings(threads=_threads(os.environ.get("OMP_NUM_THREADS", "")))
     guides: Callable[[], Sequence[Guide]] = tuple
     metadata = None
     if request.project:
         plan = read_plan(request.project)
         canvas = replace(plan.canvas, crop=request.crop or bounding_box(layers))
-        projection, guides = plan.projection, partial(guides_between, plan, layers, Settings())
+        projection, guides = plan.projection, partial(guides_between, plan, layers, settings)
         metadata = describe(replace(plan, canvas=canvas))
     else:
         canvas = _canvas(layers, request.crop, request.wraps)
         projection = "taken as equirectangular" if canvas.spherical else "taken as flat"
     check_layers(canvas, layers)
     write_panorama(
-        request.output, layers, canvas, Settings(), projection=projection, guides=guides,
+        request.output, layers, canvas, settings, projection=projection, guides=guides,
         method=MaskedMerge(request.save_masks, request.load_masks, request.output),
         depth=_depth(request, layers[0]), jpeg_quality=request.jpeg_quality,
         # what the others call compression is not what enblend's option means
@@ -121,6 +124,12 @@ def _read(request: Request) -> list[Layer]:
     if len(layers) == 1:
         _log.warning("only one layer: there is nothing to blend, the output is the layer")
     return layers
+
+
+def _threads(said: str) -> int:
+    """Cores to use, as OpenMP's variable says, which Hugin sets for enblend; 0: all."""
+    first = said.partition(",")[0].strip()  # of a list, for nested loops
+    return int(first) if re.fullmatch(r"0*[1-9]\d{0,2}", first) else 0
 
 
 def _depth(request: Request, layer: Layer) -> npt.DTypeLike | None:
