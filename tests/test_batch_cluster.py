@@ -97,6 +97,7 @@ def test_project_of_a_dead_worker_is_stitched_by_another(
     deadline = time.monotonic() + 60
     while not begun.exists() and child.poll() is None and time.monotonic() < deadline:
         time.sleep(0.01)
+    time.sleep(0.3)  # for the event that tells of it to leave the worker; nona takes a second
     dead = int(begun.read_text().split()[0])
     os.kill(dead, signal.SIGKILL)  # in the middle of its first project
     out, said = child.communicate(timeout=120)
