@@ -74,7 +74,7 @@ class ImageWriter:
     compression     TIFF: none, lzw (default), packbits, deflate, zstd, jpeg (or jpeg:85; 8-bit RGB, else
                     deflate, with a warning; it blurs alpha, too). EXR: none, rle, zips, zip (default),
                     piz. JPEG and PNG: not used.
-    jpeg_quality    1..100, default 90 as Hugin's.
+    jpeg_quality    1..100, default 90.
     threads         cores that encode TIFF; default: all.
     icc             profile, carried as it is; PNG leaves a broken one out, with a warning.
     metadata        EXIF and XMP; of EXR what OpenImageIO carries, as its attributes.

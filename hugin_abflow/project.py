@@ -30,7 +30,7 @@ _PROJECTIONS = (
 
 _ENDINGS = {"tif": ".tif", "tiff": ".tif", "jpg": ".jpg", "jpeg": ".jpg", "png": ".png", "exr": ".exr"}
 TIFF_COMPRESSIONS = ("none", "lzw", "packbits", "deflate")  # of Hugin, enblend and enfuse
-_JPEG_QUALITY = 90  # Hugin's default
+_JPEG_QUALITY = 100  # what hugin_executor takes where a project says nothing
 
 
 @dataclass(frozen=True)

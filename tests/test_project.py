@@ -123,6 +123,7 @@ def test_odd_widths_are_rounded_as_hugin_does(make_project, nona, projection, wi
         ("f2 w802 h401 v359", ""),
         ("f0 w801 h401 v90", "#hugin_outputImageType png\n"),
         ("f2 w802 h401 v360", "#hugin_outputImageType jpg\n#hugin_outputJPEGQuality 83\n"),
+        ("f2 w802 h401 v360", "#hugin_outputImageType jpg\n"),
         ("f2 w802 h401 v360", "#hugin_outputImageTypeCompression PACKBITS\n"),
         ("f2 w802 h401 v360 R1", ""),
         ("f2 w802 h401 v360 R1", "#hugin_outputLDRBlended false\n#hugin_outputHDRBlended true\n"),
@@ -160,17 +161,17 @@ def test_plan_agrees_with_hugins_own_commands(make_project, panorama, extra):
 @pytest.mark.parametrize(
     "n, ending, compression, quality",
     [
-        ("TIFF_m c:LZW r:CROP", ".tif", "lzw", 90),
-        ("TIFF c:NONE", ".tif", "none", 90),
-        ("TIFF_m c:DEFLATE", ".tif", "deflate", 90),
-        ("tiff", ".tif", None, 90),
+        ("TIFF_m c:LZW r:CROP", ".tif", "lzw", 100),
+        ("TIFF c:NONE", ".tif", "none", 100),
+        ("TIFF_m c:DEFLATE", ".tif", "deflate", 100),
+        ("tiff", ".tif", None, 100),
         ("JPEG g0 q95", ".jpg", None, 95),
-        ("JPEG_m", ".jpg", None, 90),
+        ("JPEG_m", ".jpg", None, 100),
         ("JPEG q900", ".jpg", None, 100),
-        ("PNG", ".png", None, 90),
-        ("EXR", ".exr", None, 90),
-        ("PSD_mask", ".tif", None, 90),
-        ("TIFF c:WHAT", ".tif", None, 90),
+        ("PNG", ".png", None, 100),
+        ("EXR", ".exr", None, 100),
+        ("PSD_mask", ".tif", None, 100),
+        ("TIFF c:WHAT", ".tif", None, 100),
     ],
 )
 def test_older_scripts_name_the_output_in_the_p_line(make_project, n, ending, compression, quality):
@@ -181,7 +182,7 @@ def test_older_scripts_name_the_output_in_the_p_line(make_project, n, ending, co
 def test_hugin_lines_win_and_nonsense_keeps_the_default(make_project):
     extra = "#hugin_outputImageType jpg\n#hugin_outputJPEGQuality none\n#hugin_outputImageTypeCompression\n"
     output = read_plan(make_project(panorama='f2 w802 h401 v360 n"PNG"', extra=extra)).output
-    assert (output.ending, output.compression, output.jpeg_quality) == (".jpg", None, 90)
+    assert (output.ending, output.compression, output.jpeg_quality) == (".jpg", None, 100)
 
 
 @pytest.mark.parametrize(("kind", "compression"), [("tif", "lzw"), ("exr", None)])
