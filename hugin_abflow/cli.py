@@ -32,7 +32,7 @@ EXIT_CODES = {
     ExitCode.PROJECT: "the project cannot be read, or makes no panorama",
     ExitCode.LAYERS_MISSING: "layers or photos are missing",
     ExitCode.LAYERS_MISMATCH: "the layers do not belong together (size, depth or channels)",
-    ExitCode.IMAGE_READ: "a layer cannot be decoded",
+    ExitCode.IMAGE_READ: "a layer or photo cannot be decoded",
     ExitCode.OUTPUT: "the panorama cannot be written",
     ExitCode.NONA: "nona is missing, or failed",
     ExitCode.DEVICE: "no usable OpenCL device",

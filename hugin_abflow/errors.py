@@ -73,7 +73,7 @@ class LayersMismatchError(AbflowError):
 
 
 class ImageReadError(AbflowError):
-    """A layer cannot be opened or decoded."""
+    """A layer or photo cannot be opened or decoded."""
 
     exit_code = ExitCode.IMAGE_READ
 

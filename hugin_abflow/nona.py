@@ -39,6 +39,10 @@ Remap = Literal["auto", "always", "never"]
 _STALE_SECONDS = 2.0  # file times closer than this say nothing (FAT counts in steps of 2 s)
 _LAST_LINES = 8  # of nona's output, in the message of a failure
 _STEPS = ("remapping ", "saving ")  # what nona -v says at the end of a photo's loading and remapping
+_LOADING = "loading "  # and at its beginning
+# What libtiff and libjpeg say of a photo that nona remaps as if it were whole: pixels are missing; or may
+# be missing: some cameras leave out no more than the mark of the end.
+_LOSS, _DOUBTS = ": Read error on ", ("Premature end of JPEG file", "Corrupt JPEG data")
 _INSTALL = (
     "nona is not in PATH; install Hugin (Debian, Ubuntu: apt install hugin-tools; Fedora: dnf install hugin; "
     "macOS, Windows: put the folder of Hugin's programs into PATH)"
@@ -341,7 +345,10 @@ def _require_photo(image: PlannedImage) -> None:
 def _run(
     plan: Plan, folder: Path, options: list[str], advance: Callable[[int], None]
 ) -> tuple[int, list[str]]:
-    """Run nona as Hugin does; its exit code and last lines. It does not outlive an exception."""
+    """Run nona as Hugin does; its exit code and last lines. It does not outlive an exception.
+
+    Raises `ImageReadError` for a photo of which pixels are missing.
+    """
     target, project = folder / plan.layer_prefix(plan.stem), _project_for_nona(plan, folder)
     command = remapping(plan, options, str(target), str(project))
     log.info("%s", " ".join(command))
@@ -358,6 +365,7 @@ def _run(
     except FileNotFoundError:
         raise NonaMissingError(f"{_INSTALL}; or name layers that exist with --prefix or --layers") from None
     lines: deque[str] = deque(maxlen=_LAST_LINES)
+    photo, doubtful = plan.file, set[Path]()
     with process:  # closes the pipe and waits
         try:
             assert process.stdout is not None
@@ -367,6 +375,15 @@ def _run(
                     log.debug("nona: %s", line.strip())
                 if line.startswith(_STEPS):
                     advance(1)
+                elif line.startswith(_LOADING):
+                    photo = plan.folder / line.removeprefix(_LOADING).strip()
+                elif _LOSS in line:
+                    raise ImageReadError(
+                        f"{photo} is damaged ({line.strip()}); copy it from the camera again"
+                    )
+                elif photo not in doubtful and any(mark in line for mark in _DOUBTS):
+                    doubtful.add(photo)
+                    log.warning("%s may be damaged (%s); look at the panorama", photo, line.strip())
         except BaseException:
             stop(process)
             raise

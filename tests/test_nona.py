@@ -10,10 +10,11 @@ import time
 from contextlib import contextmanager
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 import tifffile
-from conftest import ICC, names_of, pixels_of, remap, same
+from conftest import ICC, names_of, photo_pixels, pixels_of, remap, same
 
 from hugin_abflow import nona as program
 from hugin_abflow.errors import (
@@ -199,6 +200,27 @@ def test_photo_missing(make_project, nona):
         open_layers(plan),
     ):
         pass
+
+
+def test_photo_that_was_cut_is_told(make_project, nona, caplog):
+    """nona itself ends with success: what is missing is black, of JPEG grey."""
+    project = make_project()
+    photo = project.with_name("photo 1.tif")
+    photo.write_bytes(photo.read_bytes()[:40_000])
+    with (
+        pytest.raises(ImageReadError, match=r"photo 1\.tif is damaged \(.*Read error"),
+        open_layers(read_plan(project)),
+    ):
+        pass
+    project = make_project("of jpeg", photo="photo{}.jpg")
+    for number in range(3):
+        cv2.imwrite(str(project.with_name(f"photo{number}.jpg")), photo_pixels(number))
+    with open_layers(read_plan(project)):
+        assert caplog.text == ""
+    photo = project.with_name("photo1.jpg")
+    photo.write_bytes(photo.read_bytes()[:-800])
+    with open_layers(read_plan(project)):
+        assert caplog.text.count("photo1.jpg may be damaged (Premature end of JPEG file)") == 1
 
 
 def test_photo_of_a_missing_layer_missing(make_project, nona):
