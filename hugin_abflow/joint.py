@@ -25,6 +25,7 @@ from hugin_abflow import (
     flow,
     geometry,
     guidance,
+    highlights,
     memory,
     quality,
     seam,
@@ -179,8 +180,10 @@ def _align(
     regions: npt.NDArray[np.bool_] | None = None
     whole: npt.NDArray[np.bool_] | None = None
     coefficients = coefficient.coefficients(device, layers, masks, grid, settings)
-    transition.narrow(device, layers, coefficients, flows, grid, settings)
+    clipped = highlights.excess(device, layers, masks, grid, settings)
+    transition.narrow(device, layers, coefficients, flows, grid, settings, clipped.max(0))
     fields = geometry.fields(device, layers, coefficients, flows, grid, settings)
+    highlights.give_way(device, layers, fields, clipped, grid)
     flows.clear()  # these are as large as the layers, and not needed again
     del coefficients
     device.give_back()

@@ -30,6 +30,7 @@ class Settings:
     large_motion        search for motion of up to a tenth of the canvas's width, for very near things; what
                         repeats (grids, tiles) may mislead it.
     exposure            match exposure and colour of the layers where they overlap, and spread it smoothly.
+    highlights          take what one layer shows clipped from another that does not.
     seam                take from one layer, whole, what flow cannot explain (people who moved, occlusions).
     transition_strain   how much changing over from one layer's geometry to the next may stretch it, where
                         the overlap is wider than that takes; 0..1, 0: the whole overlap, as published.
@@ -56,6 +57,7 @@ class Settings:
     flow_quality: FlowQuality = "normal"
     large_motion: bool = False
     exposure: bool = True
+    highlights: bool = True
     seam: bool = True
     transition_strain: float = 0.085
     guides: bool = True
@@ -97,7 +99,7 @@ class Settings:
             if not isinstance(value, str) or value not in choices:
                 expected = " or ".join(map(repr, choices))
                 raise SettingsError(f"{name} is {value!r}; choose {expected}")
-        for name in ("flow", "large_motion", "exposure", "seam", "guides"):
+        for name in ("flow", "large_motion", "exposure", "highlights", "seam", "guides"):
             if not isinstance(getattr(self, name), bool):
                 raise SettingsError(f"{name} is {getattr(self, name)!r}; choose True or False")
         if self.device is not None and not isinstance(self.device, str):

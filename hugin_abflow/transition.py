@@ -8,6 +8,7 @@ shown between its places in the photos, as sharp as the flow is right. So the co
     w_k <- w_k^n / sum_j w_j^n,    n = wanted strain / strain, from 1 to a limit
 
 with a smooth n: most of an overlap comes from one photo as it is, and no transition is steeper than wanted.
+Where layers cannot be brought to one brightness, n stays 1.
 """
 
 from __future__ import annotations
@@ -35,6 +36,11 @@ _SIGMA = 3.0
 _STEEPEST = 12.0
 
 
+def transition_grid(grid: Grid) -> Grid:
+    """The coarse grid over the region of the working grid."""
+    return grid.coarser(_CELL)
+
+
 def narrow(
     device: Device,
     layers: Sequence[WorkingLayer],
@@ -42,11 +48,15 @@ def narrow(
     flows: Sequence[PairFlow],
     grid: Grid,
     settings: Settings,
+    unlike: npt.NDArray[np.float32],
 ) -> None:
-    """Make coefficients as steep as `settings.transition_strain` allows, in place; 0 changes nothing."""
+    """Make coefficients as steep as `settings.transition_strain` allows, in place; 0 changes nothing.
+
+    unlike: (height, width) on the transition grid, from 0 to 1, where the published coefficients stay.
+    """
     if settings.transition_strain == 0 or not flows:
         return
-    cells = grid.coarser(_CELL)
+    cells = transition_grid(grid)
     strain = device.zeros((*cells.shape, 2))
     displacements = geometry.displacements(device, layers, coefficients, flows, grid, settings, _EVERY)
     for layer, coefficient, displacement in zip(layers, coefficients, displacements, strict=True):
@@ -54,7 +64,8 @@ def narrow(
             "transition", "transition_strain", cells.border[:2], displacement, coefficient.blend,
             layer.pixels, layer.box, grid.border, grid.lens, _EVERY, cells.border, strain,
         )  # fmt: skip
-    power = device.upload(exponent(strain.get().astype(np.float64), settings.transition_strain, cells.wraps))
+    sums = strain.get().astype(np.float64)
+    power = device.upload(exponent(sums, settings.transition_strain, cells.wraps, unlike))
     total = device.zeros(grid.shape)
     for layer, coefficient in zip(layers, coefficients, strict=True):
         device.run(
@@ -67,11 +78,13 @@ def narrow(
         )
 
 
-def exponent(strain: npt.NDArray[np.float64], wanted: float, wraps: bool) -> npt.NDArray[np.float32]:
+def exponent(
+    strain: npt.NDArray[np.float64], wanted: float, wraps: bool, unlike: npt.NDArray[np.float32]
+) -> npt.NDArray[np.float32]:
     """n on the transition grid, (height, width), from sums (height, width, 2) of transition_strain."""
     smooth = _smooth(strain, wraps)
     mean = (smooth[..., 0] / np.maximum(smooth[..., 1], 1e-6)) ** 0.25
-    power = np.clip(wanted / np.maximum(mean, 1e-6), 1, _STEEPEST)
+    power = 1 + (1 - unlike) * (np.clip(wanted / np.maximum(mean, 1e-6), 1, _STEEPEST) - 1)
     weighed = _smooth(np.dstack([power, np.ones_like(power)]), wraps)
     return np.ascontiguousarray(weighed[..., 0] / weighed[..., 1], np.float32)
 

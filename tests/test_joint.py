@@ -239,8 +239,8 @@ def test_pixels_of_one_layer_are_copied_where_the_correction_is_zero(monkeypatch
 
 # How much a shifted canvas's result may differ, in levels of 8 bit: largest, mean. Its layers come in another
 # order, so that sums round otherwise. On the sphere charts have their pixels elsewhere, so that flow differs
-# by hundredths of a pixel and colours by the texture's slope times that. Cells of the colour grid, of 16 px,
-# lie elsewhere, so that gains are blurred over other pixels.
+# by hundredths of a pixel and colours by the texture's slope times that. Cells of exposure and of
+# highlights, of 16 px, lie elsewhere, so that gains and weights are blurred over other pixels.
 SHIFTED = {
     ("cylinder", False): (1, 0.001),
     ("cylinder", True): (8, 0.8),
@@ -254,14 +254,15 @@ def test_shifted_canvas_gives_the_shifted_result(name, exposure):
     canvas = CANVASES[name]
     layers = moving(canvas)
     covered = masks_of(layers, canvas)
-    original = merged(layers, canvas, exposure=exposure).astype(int)
+    cells = {"exposure": exposure, "highlights": exposure}
+    original = merged(layers, canvas, **cells).astype(int)
     for shift in (1, 64, 237):
         shifted = []
         for layer, mask in zip(layers, covered, strict=True):
             box, pixels = layer.box, np.zeros((*mask.shape, 4), np.uint8)
             pixels[box.top : box.bottom, box.left : box.right] = layer.read(0, box.height)
             shifted.append(masked(np.roll(pixels, shift, 1), np.roll(mask, shift, 1), layer.name))
-        result = merged(shifted, canvas, exposure=exposure)
+        result = merged(shifted, canvas, **cells)
         difference = np.abs(np.roll(original, shift, 1) - result)
         largest, mean = SHIFTED[name, exposure]
         assert difference.max() <= largest and difference.mean() <= mean

@@ -21,6 +21,7 @@ AS_PUBLISHED = {
     "interpolation": "nearest",
     "exposure": False,
     "border_feather": 0.0,
+    "highlights": False,
     "fixed_point_steps": 0,
 }
 

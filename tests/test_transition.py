@@ -17,6 +17,8 @@ from hugin_abflow.opencl import Device
 from hugin_abflow.settings import Settings
 
 BOX = (9, 1, 60, 37)
+# On the transition grid of GRIDS["plane"]: layers are as bright as each other.
+ALIKE = np.zeros(transition.transition_grid(GRIDS["plane"]).shape, np.float32)
 
 
 def smooth(seed: int, width: int, height: int) -> np.ndarray:
@@ -89,7 +91,9 @@ def test_sharpening_equals_its_twins(device: Device, name: str) -> None:
 def test_exponent_brings_the_strain_to_what_is_wanted(flow: float, power: float) -> None:
     strain = flow / 50
     sums = np.tile(np.array([0.2 * strain**4, 0.2]), (9, 20, 1))
-    assert transition.exponent(sums, 0.06, True) == pytest.approx(power, rel=1e-3)
+    alike, unlike = np.zeros((9, 20), np.float32), np.ones((9, 20), np.float32)
+    assert transition.exponent(sums, 0.06, True, alike) == pytest.approx(power, rel=1e-3)
+    assert transition.exponent(sums, 0.06, True, unlike) == pytest.approx(1, rel=1e-6)
 
 
 def two_layers(device: Device, flow: float) -> tuple[list, list[Coefficients], list[PairFlow]]:
@@ -116,7 +120,7 @@ def test_narrowed_coefficients(device: Device, flow: float) -> None:
     grid = GRIDS["plane"]
     layers, coefficients, flows = two_layers(device, flow)
     before = coefficients[1].blend.get()
-    transition.narrow(device, layers, coefficients, flows, grid, Settings())
+    transition.narrow(device, layers, coefficients, flows, grid, Settings(), ALIKE)
     after = coefficients[1].blend.get()
     assert np.allclose(coefficients[0].blend.get() + after, 1, atol=1e-6)
     assert (np.diff(after, axis=1) >= -1e-6).all()
@@ -131,7 +135,7 @@ def test_off_and_without_flow_coefficients_stay(device: Device) -> None:
     grid = GRIDS["plane"]
     layers, coefficients, flows = two_layers(device, 1.0)
     before = [one.blend.get() for one in coefficients]
-    transition.narrow(device, layers, coefficients, flows, grid, Settings(transition_strain=0))
-    transition.narrow(device, layers, coefficients, [], grid, Settings())
+    transition.narrow(device, layers, coefficients, flows, grid, Settings(transition_strain=0), ALIKE)
+    transition.narrow(device, layers, coefficients, [], grid, Settings(), ALIKE)
     for one, blend in zip(coefficients, before, strict=True):
         assert np.array_equal(one.blend.get(), blend)

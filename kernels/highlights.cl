@@ -1,0 +1,43 @@
+/* What a layer shows clipped counts less beside a layer that shows more of it. */
+
+/* How much of a layer's pixels in a cell is clipped, 0..1; each counts from nothing at `nearly` to all at `surely`,
+   of full scale. 0 where the layer is not. */
+__kernel void highlights_share(__global const float4 *layer, /* (box.w, box.z) r, g, b, valid */
+                               int4 box,                     /* place on the working grid */
+                               int4 border, int4 cells,      /* working grid; transition grid, run size */
+                               float nearly, float surely,   /* of the brightest channel */
+                               __global float *share)        /* (cells.y, cells.x) */
+{
+    const int cx = get_global_id(0), cy = get_global_id(1);
+    if (cx >= cells.x || cy >= cells.y)
+        return;
+    const int left = GREATEST(cx * border.x / cells.x - box.x, 0);
+    const int right = LEAST((cx + 1) * border.x / cells.x - box.x, box.z);
+    const int top = GREATEST(cy * border.y / cells.y - box.y, 0);
+    const int bottom = LEAST((cy + 1) * border.y / cells.y - box.y, box.w);
+    float sum = 0.0f, n = 0.0f;
+    for (int y = top; y < bottom; ++y)
+        for (int x = left; x < right; ++x) {
+            const float4 c = layer[y * box.z + x];
+            const float brightest = GREATEST(c.x, GREATEST(c.y, c.z));
+            const float valid = c.w > 0.0f ? 1.0f : 0.0f;
+            sum += valid * LIMITED((brightest - nearly) / (surely - nearly), 0.0f, 1.0f);
+            n += valid;
+        }
+    share[cy * cells.x + cx] = n > 0.0f ? sum / n : 0.0f;
+}
+
+/* Divide a layer's colour weight by exp(strength) where all is clipped, by less where less is. */
+__kernel void highlights_yield(__global float4 *field,       /* (box.w, box.z) of the working grid; w is scaled */
+                               int4 box, int4 border,        /* place on the working grid, run size; that grid */
+                               __global const float *clipped, /* (cells.y, cells.x), 0..1 */
+                               int4 cells,                   /* transition grid, over the same region */
+                               float strength)
+{
+    const int x = get_global_id(0), y = get_global_id(1);
+    if (x >= box.z || y >= box.w)
+        return;
+    const float2 ratio = (float2)((float)cells.x / border.x, (float)cells.y / border.y);
+    const float share = bilinear_scalar(clipped, (float2)(x + box.x + 0.5f, y + box.y + 0.5f) * ratio, cells);
+    field[y * box.z + x].w *= exponential1(-strength * share);
+}

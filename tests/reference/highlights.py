@@ -1,0 +1,50 @@
+"""Twins of kernels/highlights.cl."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from reference.common import Array, bilinear, pixels
+
+
+def highlights_share(
+    layer: Array,
+    box: Sequence[int],
+    border: Sequence[int],
+    cells: Sequence[int],
+    nearly: float,
+    surely: float,
+) -> Array:
+    """Mean over each cell's valid pixels of how surely they are clipped; 0 where none is valid."""
+    whole = np.zeros((border[1], border[0], 4))
+    whole[box[1] : box[1] + box[3], box[0] : box[0] + box[2]] = layer
+    sure = np.clip((whole[..., :3].max(-1) - nearly) / (surely - nearly), 0, 1)
+    result = np.zeros((cells[1], cells[0]))
+    for y in range(cells[1]):
+        for x in range(cells[0]):
+            rows = slice(y * border[1] // cells[1], (y + 1) * border[1] // cells[1])
+            columns = slice(x * border[0] // cells[0], (x + 1) * border[0] // cells[0])
+            valid = whole[rows, columns, 3] > 0
+            if valid.any():
+                result[y, x] = sure[rows, columns][valid].mean()
+    return result
+
+
+def highlights_yield(
+    field: Array,
+    box: Sequence[int],
+    border: Sequence[int],
+    clipped: Array,
+    cells: Sequence[int],
+    strength: float,
+) -> Array:
+    """The weight times exp(-strength * share), between the cells' centres."""
+    x, y = pixels(box[2], box[3], box[0], box[1])
+    total, share = bilinear(
+        clipped, cells, (x + 0.5) * cells[0] / border[0], (y + 0.5) * cells[1] / border[1]
+    )
+    result = field.astype(np.float64)
+    result[..., 3] *= np.exp(-strength * total / share)
+    return result

@@ -1,0 +1,127 @@
+"""Less weight where only one layer is clipped: kernels against twins, which cells, and the panorama."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from grids import GRIDS, on_device, patches, random_layer
+from pictures import merged, one_device
+from reference.highlights import highlights_share, highlights_yield
+from scipy import ndimage
+from tolerances import SUM, assert_close
+
+from hugin_abflow import coefficient, highlights
+from hugin_abflow.layer import Canvas, Layer
+from hugin_abflow.opencl import Device
+from hugin_abflow.settings import Settings
+
+__all__ = ["one_device"]
+
+# The kernels
+
+
+@pytest.mark.parametrize("name", list(GRIDS))
+def test_share_equals_its_twin(device: Device, name: str) -> None:
+    """On cells that divide nothing, for a box that begins and ends inside cells."""
+    grid = GRIDS[name]
+    cells = grid.resized(10, 7).border
+    box = (9, 1, grid.width - 12, grid.height - 3)
+    layer = random_layer(1, box[2], box[3], 0.7)
+    layer[..., :3] *= patches(2, box[2], box[3], 0.4, 9)[..., None]
+    share = device.empty((7, 10))
+    device.run(
+        "highlights", "highlights_share", (10, 7), device.upload(layer), box, grid.border, cells, 0.6, 0.9,
+        share,
+    )  # fmt: skip
+    expected = highlights_share(layer, box, grid.border, cells, 0.6, 0.9)
+    assert (expected > 0).mean() > 0.3
+    assert (expected < 1).all()
+    assert_close(share.get(), expected, 10 * SUM)
+
+
+@pytest.mark.parametrize("name", list(GRIDS))
+def test_yield_equals_its_twin(device: Device, name: str) -> None:
+    grid = GRIDS[name]
+    cells = grid.resized(10, 7).border
+    box = (5, 0, grid.width - 5, grid.height - 2)
+    clipped = (patches(2, 10, 7, 0.5, 2) * np.random.default_rng(3).random((7, 10))).astype(np.float32)
+    field = np.random.default_rng(4).normal(size=(box[3], box[2], 4)).astype(np.float32)
+    out = device.upload(field)
+    device.run(
+        "highlights", "highlights_yield", box[2:], out, box, grid.border, device.upload(clipped), cells, 7.0
+    )
+    expected = highlights_yield(field, box, grid.border, clipped, cells, 7.0)
+    assert_close(out.get(), expected, 100 * SUM)
+    assert np.array_equal(out.get()[..., :3], field[..., :3])
+    assert (expected[..., 3] != field[..., 3]).any()
+
+
+# Which cells
+
+
+def white_and_grey(device: Device) -> tuple[list, coefficient.Masks]:
+    """Two layers of a plane: one from column 16 on, white there; one up to column 48, grey, with a white
+    corner."""
+    grid = GRIDS["plane"]
+    grey, white = (np.zeros((53, 77, 4), np.float32) for _ in range(2))
+    grey[:, :48] = (0.5, 0.5, 0.5, 1)
+    grey[:17, 16:48, 0] = 1
+    white[:, 16:] = 1
+    layers = [on_device(device, grey), on_device(device, white)]
+    return layers, coefficient.masks(device, layers, grid)
+
+
+def test_only_what_another_layer_shows_better_gives_way(device: Device) -> None:
+    layers, masks = white_and_grey(device)
+    grid = GRIDS["plane"]
+    found = highlights.excess(device, layers, masks, grid, Settings())
+    assert found.shape == (2, 3, 5)  # cells of 15.4 x 17.7 px
+    assert not found[0].any()
+    assert (found[1, 1:, 2] == 1).all()  # both, one of them white
+    assert not found[1, 0, 2]  # both white: one channel is enough
+    assert not found[1, :, 4].any()  # alone
+
+
+def test_not_of_floats_and_not_when_off(device: Device) -> None:
+    layers, masks = white_and_grey(device)
+    grid = GRIDS["plane"]
+    assert not highlights.excess(device, layers, masks, grid, Settings(highlights=False)).any()
+    floats = [replace(one, layer=replace(one.layer, dtype=np.dtype(np.float32))) for one in layers]
+    assert not highlights.excess(device, floats, masks, grid, Settings()).any()
+
+
+# The panorama
+
+WIDTH, HEIGHT = 301, 91
+
+
+def shot(scene: np.ndarray, light: float, left: int, right: int) -> Layer:
+    pixels = np.full((HEIGHT, right - left, 4), 255, np.uint8)
+    pixels[..., :3] = np.rint(np.minimum(255, 255 * light * scene[:, left:right, None]))
+    return Layer.from_array(f"light {light}", pixels, left)
+
+
+@pytest.mark.usefixtures(one_device.__name__)
+def test_what_is_blown_out_comes_from_the_darker_photo() -> None:
+    """A bright wall with stains; the photo of twice the light shows it white. Stains are seen nearly up to
+    the darker photo's border, which is no visible edge."""
+    noise = ndimage.gaussian_filter(np.random.default_rng(5).normal(size=(HEIGHT, WIDTH)), 3)
+    scene = np.clip(0.65 + 0.1 * noise / noise.std(), 0.55, 0.8)
+    layers = [shot(scene, 1.0, 0, 200), shot(scene, 2.0, 100, WIDTH)]
+    canvas = Canvas.plane(WIDTH, HEIGHT)
+
+    def stains(values: np.ndarray) -> np.ndarray:
+        return (values - values.mean(0)).ravel()
+
+    def likeness(result: np.ndarray, left: int, right: int) -> float:
+        seen = result[:, left:right, 1].astype(float)
+        return float(np.corrcoef(stains(seen), stains(scene[:, left:right]))[0, 1])
+
+    result, without = (merged(layers, canvas, highlights=on) for on in (True, False))
+    assert likeness(result, 100, 190) > 0.9
+    assert likeness(without, 150, 190) < 0.5
+    assert (result[:, 210:, :3] == 255).all()
+    means = result[..., 1].mean(0)
+    assert np.abs(np.diff(ndimage.uniform_filter1d(means, 5))).max() < 12
