@@ -15,8 +15,9 @@ import shutil
 import sys
 import tempfile
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
+from functools import partial
 from pathlib import Path
 
 _HOST = hashlib.blake2b(platform.node().encode(), digest_size=4).hexdigest()
@@ -65,18 +66,32 @@ def work_folder() -> Iterator[Path]:
     named = os.environ.get("TMPDIR", "")
     root = Path(named if named and Path(named).is_dir() else tempfile.gettempdir())
     sweep(root)
-    while True:
-        folder = Path(tempfile.mkdtemp(prefix=f"hugin-abflow-{_HOST}-", dir=root))
-        descriptor = os.open(folder / _LOCK, os.O_CREAT | os.O_WRONLY, 0o600)
-        _lock(descriptor)
-        if (folder / _LOCK).exists():
-            break
-        os.close(descriptor)  # swept before it was locked
+    folder: Path | None = None
+    descriptor: int | None = None
     try:
+        while True:
+            folder = Path(tempfile.mkdtemp(prefix=f"hugin-abflow-{_HOST}-", dir=root))
+            descriptor = os.open(folder / _LOCK, os.O_CREAT | os.O_WRONLY, 0o600)
+            _lock(descriptor)
+            if (folder / _LOCK).exists():
+                break
+            os.close(descriptor)  # swept before it was locked
+            descriptor = None
         yield folder
     finally:
-        os.close(descriptor)
+        if descriptor is not None:
+            os.close(descriptor)
+        if folder is not None:
+            _remove_folder(folder)
+
+
+def _remove_folder(folder: Path) -> None:
+    """Remove a folder, also where Ctrl-C comes meanwhile."""
+    try:
         shutil.rmtree(folder, ignore_errors=True)
+    except KeyboardInterrupt:
+        shutil.rmtree(folder, ignore_errors=True)
+        raise
 
 
 def sweep(folder: Path) -> None:
@@ -84,30 +99,32 @@ def sweep(folder: Path) -> None:
     with suppress(OSError), os.scandir(folder) as entries:
         for entry in entries:
             if (found := _PART.fullmatch(entry.name)) and entry.is_file(follow_symlinks=False):
-                if _abandoned(Path(entry.path), found[1]):
-                    Path(entry.path).unlink(missing_ok=True)
+                part = Path(entry.path)
+                _remove_abandoned(part, found[1], partial(part.unlink, missing_ok=True))
             elif (found := _FOLDER.fullmatch(entry.name)) and entry.is_dir(follow_symlinks=False):
-                lock = Path(entry.path) / _LOCK
                 # without its lock a folder was made just now, or is being removed
-                if lock.is_file() and _abandoned(lock, found[1]):
-                    shutil.rmtree(entry.path, ignore_errors=True)
+                _remove_abandoned(
+                    Path(entry.path) / _LOCK, found[1], partial(_remove_folder, Path(entry.path))
+                )
 
 
-def _abandoned(path: Path, host: str) -> bool:
-    """Whether nobody holds the lock of a file."""
-    try:
-        if host != _HOST and time.time() - path.stat().st_mtime < _WEEK:
-            return False
+def _remove_abandoned(lock: Path, host: str, remove: Callable[[], None]) -> None:
+    """Call `remove` if nobody holds a lock. It is held meanwhile: who has made the file just now, and waits
+    for its lock, finds that it is gone.
+    """
+    with suppress(OSError):
+        if host != _HOST and time.time() - lock.stat().st_mtime < _WEEK:
+            return
         if sys.platform == "win32":
-            path.unlink()  # refused while it is open
-            return True
-        descriptor = os.open(path, os.O_RDWR)
-    except OSError:
-        return False
-    try:
-        return _lock(descriptor, wait=False)
-    finally:
-        os.close(descriptor)
+            lock.unlink()  # refused while it is open
+            remove()
+            return
+        descriptor = os.open(lock, os.O_RDWR)
+        try:
+            if _lock(descriptor, wait=False):
+                remove()
+        finally:
+            os.close(descriptor)
 
 
 def _lock(descriptor: int, wait: bool = True) -> bool:

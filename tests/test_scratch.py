@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -103,6 +104,40 @@ def test_what_is_not_ours_stays(root: Path) -> None:
     before = names_in(root)
     sweep(root)
     assert names_in(root) == before
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="another mechanism there")
+def test_what_is_swept_is_locked_until_it_is_gone(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Else it could go when somebody who has made it just now holds its lock."""
+    left = root / f".abflow-{scratch._HOST}-0123456789ab.tif"
+    left.touch()
+    locked: list[bool] = []
+    unlink = Path.unlink
+
+    def look_and_unlink(path: Path, missing_ok: bool = False) -> None:
+        descriptor = os.open(path, os.O_RDWR)
+        locked.append(not scratch._lock(descriptor, wait=False))
+        os.close(descriptor)
+        unlink(path, missing_ok)
+
+    monkeypatch.setattr(Path, "unlink", look_and_unlink)
+    sweep(root)
+    assert locked == [True] and not left.exists()
+
+
+def test_control_c_while_a_folder_is_removed(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    remove, calls = shutil.rmtree, []
+
+    def interrupted(folder: Path, ignore_errors: bool) -> None:
+        calls.append(folder)
+        if len(calls) == 1:
+            raise KeyboardInterrupt
+        remove(folder, ignore_errors)
+
+    monkeypatch.setattr(shutil, "rmtree", interrupted)
+    with pytest.raises(KeyboardInterrupt), work_folder():
+        pass
+    assert names_in(root) == [] and len(calls) == 2
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="another mechanism there")
