@@ -73,26 +73,26 @@ def _grouped(images: Sequence[int], belongs: Callable[[int, int], bool]) -> list
 
 
 class _Frame:
-    """The part of a photo that is used: a rectangle, or a circle in one."""
+    """The part of a photo that is used: a rectangle, or a circle in one; both may reach beyond the photo."""
 
     def __init__(self, image: pto.Image) -> None:
         whole = (0, 0, image.width, image.height)
         self.left, self.top, self.right, self.bottom = image.crop or whole
+        self.photo = image.width, image.height
         self.circle = image.crop is not None and image.projection in _CIRCULAR
 
     def places(self) -> list[tuple[float, float]]:
-        """Places in px, spread evenly, that are used."""
-        width, height = self.right - self.left, self.bottom - self.top
+        """Places in px, spread evenly over what is in the photo, that are used."""
+        left, top = max(self.left, 0), max(self.top, 0)
+        width, height = min(self.right, self.photo[0]) - left, min(self.bottom, self.photo[1]) - top
         count = max(2, min(_STEPS, width, height))
         every = [
-            (x / count * width + self.left, y / count * height + self.top)
-            for x in range(count)
-            for y in range(count)
+            (x / count * width + left, y / count * height + top) for x in range(count) for y in range(count)
         ]
         return [place for place in every if self.shows(*place)]
 
     def shows(self, x: float, y: float) -> bool:
-        """Whether a place is used; Hugin takes whole pixels."""
+        """Whether a place is used; Hugin takes whole pixels, and beyond the photo a rectangle's, too."""
         if not (math.isfinite(x) and math.isfinite(y)):
             return False
         x, y = math.trunc(x), math.trunc(y)
@@ -100,7 +100,8 @@ class _Frame:
             return False
         radius = min(self.right - self.left, self.bottom - self.top) / 2
         centre_x, centre_y = (self.left + self.right) / 2, (self.top + self.bottom) / 2
-        return not self.circle or math.hypot(x - centre_x, y - centre_y) < radius
+        within = 0 <= x < self.photo[0] and 0 <= y < self.photo[1]
+        return not self.circle or (within and math.hypot(x - centre_x, y - centre_y) < radius)
 
 
 def _number(text: str, default: float) -> float:

@@ -66,6 +66,24 @@ def test_cropped_photos(make_project: ProjectMaker, pano_trafo: str) -> None:
     assert stacks(read_plan(project), range(4)) == hugins(project, "LDRStacks")
 
 
+@pytest.mark.parametrize(
+    ("lens", "yaws", "crop"),
+    [
+        (" f2 v170 ", (60, 90, 0, 20), "S-20,223,-46,197"),
+        (" f2 v170 ", (0, 90, 40, 45), "S20,183,-66,217"),
+        (" f0 v80 ", (15, 20, 5, 30), "S0,290,0,230"),
+        (" f0 v80 ", (40, 20, 0, 15), "S50,300,-60,151"),
+    ],
+)
+def test_crops_that_reach_beyond_the_photo(
+    make_project: ProjectMaker, pano_trafo: str, lens: str, yaws: tuple, crop: str
+) -> None:
+    """As of a circular fisheye that is larger than the sensor."""
+    project = make_project(panorama=CANVAS, yaws=yaws)
+    project.write_text(project.read_text().replace(" f0 v80 ", lens).replace(" Vm5 ", f" Vm5 {crop} "))
+    assert stacks(read_plan(project), range(4)) == hugins(project, "LDRStacks")
+
+
 @pytest.mark.parametrize("difference", ["", "0.9", "1.1", "3"])
 def test_exposure_layers_are_hugins(make_project: ProjectMaker, difference: str) -> None:
     project = stacked(make_project(panorama=CANVAS), f"#hugin_outputLayersExposureDiff {difference}")
