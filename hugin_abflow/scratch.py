@@ -6,6 +6,7 @@ need not show, are taken for such only after a week.
 
 from __future__ import annotations
 
+import atexit
 import hashlib
 import os
 import platform
@@ -25,6 +26,19 @@ _PART = re.compile(r"\.abflow-([0-9a-f]{8})-[0-9a-f]{12}(\.\w+)?")
 _FOLDER = re.compile(r"hugin-abflow-([0-9a-f]{8})-\w+")
 _LOCK = "in use"
 _WEEK = 7 * 24 * 3600.0
+_ours: set[Path] = set()  # what this process may have made and not yet removed
+
+
+@atexit.register
+def tidy() -> None:
+    """Remove what this process left where Ctrl-C came between making and using, or while it was removed."""
+    while _ours:
+        path = _ours.pop()
+        if path.is_dir():
+            shutil.rmtree(path, ignore_errors=True)
+        else:
+            with suppress(OSError):
+                path.unlink(missing_ok=True)
 
 
 @contextmanager
@@ -41,6 +55,7 @@ def part_beside(final: Path, suffix: str | None = None) -> Iterator[Path]:
         yield part
     finally:
         part.unlink(missing_ok=True)
+        _ours.discard(part)
         if descriptor is not None:
             os.close(descriptor)
 
@@ -49,6 +64,7 @@ def _create(final: Path, suffix: str) -> tuple[Path, int | None]:
     """A file that is in use until the descriptor is closed; Windows needs none."""
     while True:
         part = final.with_name(f".abflow-{_HOST}-{secrets.token_hex(6)}{suffix}")
+        _ours.add(part)
         descriptor = os.open(part, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o666)  # never somebody else's file
         if sys.platform == "win32":
             os.close(descriptor)  # else it could not be renamed; what is written there cannot be removed
@@ -70,7 +86,9 @@ def work_folder() -> Iterator[Path]:
     descriptor: int | None = None
     try:
         while True:
-            folder = Path(tempfile.mkdtemp(prefix=f"hugin-abflow-{_HOST}-", dir=root))
+            folder = root / f"hugin-abflow-{_HOST}-{secrets.token_hex(6)}"
+            _ours.add(folder)
+            folder.mkdir(0o700)
             descriptor = os.open(folder / _LOCK, os.O_CREAT | os.O_WRONLY, 0o600)
             _lock(descriptor)
             if (folder / _LOCK).exists():
@@ -82,16 +100,8 @@ def work_folder() -> Iterator[Path]:
         if descriptor is not None:
             os.close(descriptor)
         if folder is not None:
-            _remove_folder(folder)
-
-
-def _remove_folder(folder: Path) -> None:
-    """Remove a folder, also where Ctrl-C comes meanwhile."""
-    try:
-        shutil.rmtree(folder, ignore_errors=True)
-    except KeyboardInterrupt:
-        shutil.rmtree(folder, ignore_errors=True)
-        raise
+            shutil.rmtree(folder, ignore_errors=True)
+            _ours.discard(folder)
 
 
 def sweep(folder: Path) -> None:
@@ -103,9 +113,8 @@ def sweep(folder: Path) -> None:
                 _remove_abandoned(part, found[1], partial(part.unlink, missing_ok=True))
             elif (found := _FOLDER.fullmatch(entry.name)) and entry.is_dir(follow_symlinks=False):
                 # without its lock a folder was made just now, or is being removed
-                _remove_abandoned(
-                    Path(entry.path) / _LOCK, found[1], partial(_remove_folder, Path(entry.path))
-                )
+                remove = partial(shutil.rmtree, entry.path, ignore_errors=True)
+                _remove_abandoned(Path(entry.path) / _LOCK, found[1], remove)
 
 
 def _remove_abandoned(lock: Path, host: str, remove: Callable[[], None]) -> None:

@@ -125,19 +125,33 @@ def test_what_is_swept_is_locked_until_it_is_gone(root: Path, monkeypatch: pytes
     assert locked == [True] and not left.exists()
 
 
-def test_control_c_while_a_folder_is_removed(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    remove, calls = shutil.rmtree, []
+def test_control_c_before_a_file_is_used(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """It is there, but nobody knows of it but the process."""
 
-    def interrupted(folder: Path, ignore_errors: bool) -> None:
-        calls.append(folder)
-        if len(calls) == 1:
-            raise KeyboardInterrupt
-        remove(folder, ignore_errors)
+    def interrupted(descriptor: int, wait: bool = True) -> bool:
+        raise KeyboardInterrupt
 
-    monkeypatch.setattr(shutil, "rmtree", interrupted)
+    monkeypatch.setattr(scratch, "_lock", interrupted)
+    with pytest.raises(KeyboardInterrupt), part_beside(root / "pano.tif"):
+        pass
     with pytest.raises(KeyboardInterrupt), work_folder():
         pass
-    assert names_in(root) == [] and len(calls) == 2
+    assert len(names_in(root)) == 1
+    scratch.tidy()  # when the process ends
+    assert names_in(root) == []
+
+
+def test_control_c_while_a_folder_is_removed(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def interrupted(folder: Path, ignore_errors: bool) -> None:
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(shutil, "rmtree", interrupted)
+        with pytest.raises(KeyboardInterrupt), work_folder():
+            pass
+    assert len(names_in(root)) == 1
+    scratch.tidy()
+    assert names_in(root) == []
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="another mechanism there")
