@@ -113,6 +113,8 @@ def test_process_that_dies_costs_an_attempt_and_no_other_project(
     assert records["a"].result == records["b"].result == "made"
     assert records["doomed"].exit_code == ExitCode.FAILED and records["doomed"].attempts == ATTEMPTS
     assert "was ended by SIGKILL" in records["doomed"].message and "memory" in records["doomed"].message
+    assert records["doomed"].settings["remap"] == "always"
+    assert records["doomed"].started and records["doomed"].seconds > 0
     assert (tmp_path / "count").read_text() == "x\n" * ATTEMPTS
 
 

@@ -21,7 +21,7 @@ from typing import Any
 
 from hugin_abflow.batch.pool import PAUSE, Watcher
 from hugin_abflow.batch.record import Record
-from hugin_abflow.batch.task import Listener, Task, perform
+from hugin_abflow.batch.task import Listener, Task, perform, settings_of
 from hugin_abflow.errors import ClusterError, ExitCode
 from hugin_abflow.metadata import PROGRAM, version
 from hugin_abflow.terminal import label, say
@@ -186,6 +186,7 @@ class Cluster:
             record: Record = future.result()
             return record
         record = Record(task.project.absolute(), exit_code=ExitCode.CLUSTER)
+        record.settings = settings_of(task)
         if future.status in ("cancelled", "lost"):
             record.message = (
                 f"{task.project}: the scheduler is gone, or withdrew it; start it again, and run the same "

@@ -13,6 +13,7 @@ import time
 from collections import deque
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
+from datetime import UTC, datetime
 from multiprocessing.connection import wait
 from multiprocessing.context import SpawnProcess
 from types import TracebackType
@@ -20,7 +21,7 @@ from typing import Any, Protocol
 
 from hugin_abflow import trace
 from hugin_abflow.batch.record import Record
-from hugin_abflow.batch.task import Listener, Task, perform
+from hugin_abflow.batch.task import Listener, Task, perform, settings_of
 from hugin_abflow.batch.worker import GO, work
 from hugin_abflow.errors import ExitCode
 
@@ -56,13 +57,14 @@ class _Worker:
         other.close()
         self.task: Task | None = None
         self._listener: Listener | None = None
-        self._attempt = 0
+        self._attempt, self._started = 0, datetime.now(UTC)
         self.turn_wanted: float | None = None  # since when it waits for the device
         self.has_turn = False
 
     def begin(self, task: Task, attempt: int, listener: Listener) -> None:
         """Have it stitch a project, for the first or second time."""
         self.task, self._attempt, self._listener = task, attempt, listener
+        self._started = datetime.now(UTC)
         with suppress(OSError):  # dead already: the pipe says so when it is read
             self.pipe.send(task)
 
@@ -84,6 +86,9 @@ class _Worker:
             name, *values = self.pipe.recv()
         except (EOFError, OSError):
             record = Record(self.task.project.absolute(), exit_code=ExitCode.FAILED)
+            record.settings = settings_of(self.task)
+            record.started = self._started.isoformat(timespec="seconds")
+            record.seconds = round((datetime.now(UTC) - self._started).total_seconds(), 3)
             record.message = (
                 f"{self.task.project}: the process that stitched it {self._why_dead()}; "
                 "run it alone with -v, and with fewer --jobs"
