@@ -218,7 +218,7 @@ _information = partial(click.option, cls=Option, group="Information")
     metavar="N",
     type=click.IntRange(1, 64),
     help="Projects at a time, 1 to 64: while one computes, layers of the next are made. "
-    f"[default: {default_jobs()}, or as many as there are processor cores]",
+    f"[default: {default_jobs()} on this machine]",
 )
 @_batch(
     "--scheduler",

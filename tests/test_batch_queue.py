@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
+from typing import Any
 
 import pytest
 from shoots import write_project
@@ -80,6 +81,22 @@ def test_two_projects_with_one_panorama_are_refused(shoot: Path) -> None:
     with pytest.raises(SameOutputError, match=r"n_fused\.tif"):
         refuse_same_output({one: None, fused: None})
     refuse_same_output({one: "layer", fused: None})
+
+
+def test_folder_that_cannot_be_listed_is_told(
+    shoot: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    listed = os.scandir
+
+    def scandir(folder: str) -> Any:
+        if Path(folder).name == "late":
+            raise PermissionError(13, "Permission denied", folder)
+        return listed(folder)
+
+    monkeypatch.setattr(os, "scandir", scandir)
+    assert found(".", recursive=True) == ["a.PTO", "b.pto", "day 1/c.pto"]
+    said = capsys.readouterr().err
+    assert "warning: " in said and "late cannot be listed (Permission denied)" in said
 
 
 def test_name_with_a_star_is_a_name_if_there_is_such_a_file(shoot: Path) -> None:

@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import glob
+import logging
 import os
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import suppress
 from pathlib import Path
 
 from hugin_abflow.errors import ProjectError, SameOutputError
 from hugin_abflow.outputs import panoramas
 from hugin_abflow.project import read_plan
+from hugin_abflow.terminal import label, say
 
 
 def find_projects(places: Iterable[Path], recursive: bool = False) -> list[Path]:
@@ -56,7 +58,7 @@ def refuse_same_output(projects: Mapping[Path, str | None]) -> None:
 
 def _projects(place: Path, recursive: bool) -> list[Path]:
     if place.is_dir():
-        projects = projects_in(place, recursive)
+        projects = projects_in(place, recursive, _warn)
         if not projects:
             remedy = "" if recursive else ", or add --recursive to look into its folders"
             raise ProjectError(f"{place}: there is no project (.pto) in this folder; name another{remedy}")
@@ -80,13 +82,19 @@ def _matches(pattern: Path) -> Iterator[Path]:
             yield match
 
 
-def projects_in(folder: Path, recursive: bool) -> list[Path]:
-    """Projects of a folder, and of the folders in it, by name; what cannot be listed is passed over."""
-    return sorted(_walk(folder, recursive))
+def _warn(error: OSError) -> None:
+    """Say which folder cannot be listed."""
+    what = f"{error.filename} cannot be listed ({error.strerror}); its projects are left out"
+    say(f"{label(logging.WARNING)}{what}")
 
 
-def _walk(folder: Path, recursive: bool) -> Iterator[Path]:
-    for parent, folders, files in os.walk(folder):
+def projects_in(folder: Path, recursive: bool, tell: Callable[[OSError], None] | None = None) -> list[Path]:
+    """Projects of a folder, and of the folders in it, by name; `tell` is called for what cannot be listed."""
+    return sorted(_walk(folder, recursive, tell))
+
+
+def _walk(folder: Path, recursive: bool, tell: Callable[[OSError], None] | None) -> Iterator[Path]:
+    for parent, folders, files in os.walk(folder, onerror=tell):
         folders[:] = sorted(name for name in folders if recursive and not name.startswith("."))
         for name in files:
             if name.lower().endswith(".pto") and not name.startswith("."):
