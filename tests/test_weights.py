@@ -83,7 +83,7 @@ def test_masks_decide_which_layer_is_seen(layers: list[str], crop: str, samples:
 def test_masks_of_a_smaller_working_canvas(layers: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
     """Reduced and enlarged again, up to the crop's border, which no working pixel lies on."""
     settings = enblend.Settings
-    monkeypatch.setattr(enblend, "Settings", lambda: settings(working_pixels=3000))
+    monkeypatch.setattr(enblend, "Settings", lambda **chosen: settings(working_pixels=3000, **chosen))
     for number, white in ((1, 255), (2, 0)):
         tifffile.imwrite(f"mask-{number}.tif", np.full((81, 177), white, np.uint8))
     assert run("-f177x81+9+11", "--load-masks", "--save-masks=s%n.tif", *layers) == 0
