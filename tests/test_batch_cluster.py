@@ -134,7 +134,9 @@ def test_failures_come_back_as_on_one_machine(
     assert "b.pto: canvas: 250 x 125" in output.err
 
 
-def test_scheduler_without_workers_is_told_and_may_go(cluster: Callable[[int], str], tmp_path: Path) -> None:
+def test_scheduler_without_workers_is_told_and_may_go(
+    cluster: Callable[[int], str], processes: list[subprocess.Popen[bytes]], tmp_path: Path
+) -> None:
     projects = [write_project(tmp_path / f"{name}.pto") for name in "ab"]
     command = [sys.executable, "-m", "hugin_abflow", *projects, "--scheduler", cluster(0)]
     child = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
