@@ -22,7 +22,7 @@ from hugin_abflow.metadata import PROGRAM, version
 from hugin_abflow.nona import Remap
 from hugin_abflow.opencl import list_devices
 from hugin_abflow.options import ARGUMENTS, Command, NewFile, Option, Size
-from hugin_abflow.settings import FlowQuality, MergeMode, Settings
+from hugin_abflow.settings import FlowQuality, LargeMotion, MergeMode, Settings
 from hugin_abflow.terminal import complain, interruptible, say
 
 EXIT_CODES = {
@@ -150,9 +150,10 @@ _information = partial(click.option, cls=Option, group="Information")
 )
 @_blending(
     "--large-motion",
-    type=click.Choice(["on", "off"]),
-    default="on" if _DEFAULTS.large_motion else "off",
-    help="Search for motion of up to a tenth of the canvas's width: very near things; grids may mislead it.",
+    type=click.Choice(get_args(LargeMotion)),
+    default=_DEFAULTS.large_motion,
+    help="Search for motion of up to a tenth of the canvas's width (very near things). auto: keep what makes "
+    "photos clearly more alike; on: all that is found, by which grids may mislead.",
 )
 @_blending(
     "--seam",
@@ -386,7 +387,7 @@ def _options(
     merge: MergeMode,
     exposure: str,
     guides: str,
-    large_motion: str,
+    large_motion: LargeMotion,
     seam: str,
     softmax_sharpness: float,
     flow_magnitude: float,
@@ -409,7 +410,7 @@ def _options(
         exposure=exposure == "auto",
         guides=guides == "auto",
         seam=seam == "auto",
-        large_motion=large_motion == "on",
+        large_motion=large_motion,
         device=device,
         max_memory=max_memory or 0,
         threads=threads or 0,

@@ -37,6 +37,8 @@ class FlowParameters:
     reach: float = 0.16  # of the longer side: how large a motion is searched where the caller does not say
     overlap: float = 0.5  # of the root of the common mask's area: no larger motion is searched
     choose_from: int = 2  # finest level (0: full) on which pixels take over flow from beside them
+    decide_on: int = 1  # level on which flow with and flow without what was searched are compared at last
+    misfit: float = 0.2  # the largest misfit of a pixel, as a difference of the gradients of h
     search: SearchParameters = field(default_factory=SearchParameters)
 
 
@@ -192,6 +194,25 @@ def _choose(
     )
 
 
+def _better(
+    device: Device, features: Buffer, flows: list[Buffer], grid: Grid, level: int, parameters: FlowParameters
+) -> list[Buffer]:
+    """Of flows without and with what was searched, those that are left after a level: in the end one."""
+    plain, found = (_misfit(device, features, one, grid, parameters) for one in flows)
+    last = level <= parameters.decide_on
+    if found > (parameters.search.gain if last else parameters.search.hope) * plain:
+        return flows[:1]
+    return flows[1:] if last else flows
+
+
+def _misfit(device: Device, features: Buffer, flows: Buffer, grid: Grid, parameters: FlowParameters) -> float:
+    """Mean of what flows both ways leave unexplained, where both images show something; 0 if nowhere."""
+    misfit = device.empty((2, grid[1], grid[0]))
+    device.run("flow", "flow_misfit", (*grid[:2], 2), features, flows, grid, parameters.misfit, misfit)
+    values = misfit.get()
+    return float(values[values >= 0].mean()) if (values >= 0).any() else 0.0
+
+
 def _apart(device: Device, stacked: Buffer) -> list[Buffer]:
     """Copies of the arrays that lie one behind the other in a buffer."""
     shape = stacked.shape[1:]
@@ -224,6 +245,9 @@ def pair_flow(
     motion that is searched, px, 0: none; if it is None, `parameters.reach` of the longer side. It is less
     where the masks overlap little: in a small corner of a floor of tiles every tile fits. Raises
     `DeviceError` if the device fails.
+
+    What is found beyond warping's reach is kept if the images are clearly more alike by it: where patterns
+    repeat, much fits a little.
     """
     parameters = parameters or FlowParameters()
     count = start.level + 1 if start else levels(a, parameters)
@@ -233,24 +257,24 @@ def pair_flow(
         reach = min(reach, parameters.overlap * math.sqrt(common))
         searched = search.level(reach, count, parameters.search) if reach > 0 else -1
     pyramids = [pyramid.build(device, image, count + 1) for image in (a, b)]
-    flows: Buffer | None = None
+    flows: list[Buffer] = []  # without what a search found, and with it, until one of them is taken
     for level in reversed(range(count)):
         features = _features(device, [(p[level], p[level + 1]) for p in pyramids], parameters)
         grid = pyramids[0][level].grid
-        if flows is None and start:
-            flows = _together(device, start.flows)
-        elif flows is None:
-            flows = device.zeros((2, grid[1], grid[0], 2))
+        if flows:
+            flows = [_expand(device, one, grid) for one in flows]
         else:
-            flows = _expand(device, flows, grid)
+            flows = [_together(device, start.flows) if start else device.zeros((2, grid[1], grid[0], 2))]
         # a search on a level finer than choose_from (of a small image) is followed by no other choice
-        if min(searched, parameters.choose_from) <= level <= searched:
-            flows = _choose(device, features, flows, grid, level, level == searched, reach, parameters)
-        flows = _refine(
-            device, features, flows, grid, level, parameters, start.pulls if start else (None, None)
-        )
-    assert flows is not None
-    forward, backward = _apart(device, flows)
+        wanted = level == searched or len(flows) > 1
+        if wanted and min(searched, parameters.choose_from) <= level <= searched:
+            chosen = _choose(device, features, flows[-1], grid, level, level == searched, reach, parameters)
+            flows = [flows[0], chosen]
+        pulls = start.pulls if start else (None, None)
+        flows = [_refine(device, features, one, grid, level, parameters, pulls) for one in flows]
+        if len(flows) > 1:
+            flows = _better(device, features, flows, grid, level, parameters)
+    forward, backward = _apart(device, flows[0])
     return forward, backward
 
 

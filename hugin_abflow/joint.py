@@ -346,10 +346,10 @@ def _flows(
     overlaps    the pairs, and where they overlap on the grid of `masks`.
     guides      of each two layers, by their numbers; numbers: what guides call each of `layers`.
     """
-    parameters = quality.flow_parameters(settings.flow_quality)
+    parameters = quality.flow_parameters(settings.flow_quality, settings.large_motion)
     coarse = quality.coarseness(settings.flow_quality, grid.width * grid.height)
     largest = _REACH * (grid.canvas_width or grid.region.width) * grid.width / grid.region.width
-    reach = largest / coarse if settings.large_motion else 0.0
+    reach = largest / coarse if settings.large_motion != "off" else 0.0
     result, shifts = [], []
     with progress("flow", len(overlaps)) as advance:
         for pair, overlap in overlaps:

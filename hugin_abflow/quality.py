@@ -12,7 +12,7 @@ from dataclasses import replace
 from typing import Any
 
 from hugin_abflow import flow
-from hugin_abflow.settings import FlowQuality
+from hugin_abflow.settings import FlowQuality, LargeMotion
 
 _CHANGES: dict[FlowQuality, dict[str, Any]] = {
     # small overlaps cost by steps, not by pixels
@@ -32,6 +32,9 @@ def coarseness(quality: FlowQuality, pixels: int) -> int:
     return 2 if pixels >= 4 * _LEAST_PIXELS[quality] else 1
 
 
-def flow_parameters(quality: FlowQuality) -> flow.FlowParameters:
-    """The solver's parameters for a setting of `Settings.flow_quality`."""
-    return replace(flow.FlowParameters(), **_CHANGES[quality])
+def flow_parameters(quality: FlowQuality, large_motion: LargeMotion) -> flow.FlowParameters:
+    """The solver's parameters for `Settings.flow_quality` and `Settings.large_motion`."""
+    parameters = replace(flow.FlowParameters(), **_CHANGES[quality])
+    if large_motion == "on":
+        return replace(parameters, search=replace(parameters.search, hope=math.inf, gain=math.inf))
+    return parameters

@@ -33,6 +33,10 @@ class SearchParameters:
     patience: float = 0.06  # by how much a flow from elsewhere must fit better
     radius: int = 2  # px: of the window in which two flows are compared
     focus: float = 4.0  # e-folds by which a pixel counts less there, for a difference of 1 from the middle
+    # what a search found is dropped on a level where more than this share of the misfit without it remains,
+    # and kept if no more than this remains at last; inf: kept always
+    hope: float = 0.95
+    gain: float = 0.9
     steps: tuple[int, ...] = (16, 8, 4, 2, 1)  # px from which flow is taken over, in turns
 
 

@@ -12,6 +12,7 @@ from hugin_abflow.errors import SettingsError
 MergeMode = Literal["joint", "sequential"]
 Interpolation = Literal["bicubic", "nearest"]
 FlowQuality = Literal["fast", "normal", "best"]
+LargeMotion = Literal["auto", "on", "off"]
 
 _WORKING_PIXELS: dict[FlowQuality, int] = {"fast": 500_000, "normal": 2_100_000, "best": 6_300_000}
 _LEAST_WORKING_PIXELS = 1024
@@ -27,8 +28,9 @@ class Settings:
     flow                bring the layers together by optical flow; else they stay where they are, and every
                         overlap is cut along the seam that shows least.
     flow_quality        how much time the flow may take: "fast", "normal" or "best".
-    large_motion        search for motion of up to a tenth of the canvas's width, for very near things; what
-                        repeats (grids, tiles) may mislead it.
+    large_motion        search for motion of up to a tenth of the canvas's width, for very near things: "auto"
+                        keeps what makes the layers clearly more alike, "on" all that is found; what repeats
+                        (grids, tiles) may mislead it. "off": no search.
     exposure            match exposure and colour of the layers where they overlap, and spread it smoothly.
     highlights          take what one layer shows clipped from another that does not.
     seam                take from one layer, whole, what flow cannot explain (people who moved, occlusions).
@@ -55,7 +57,7 @@ class Settings:
     flow_magnitude: float = 100.0
     flow: bool = True
     flow_quality: FlowQuality = "normal"
-    large_motion: bool = False
+    large_motion: LargeMotion = "auto"
     exposure: bool = True
     highlights: bool = True
     seam: bool = True
@@ -94,12 +96,13 @@ class Settings:
             ("merge", MergeMode),
             ("interpolation", Interpolation),
             ("flow_quality", FlowQuality),
+            ("large_motion", LargeMotion),
         ):
             value, choices = getattr(self, name), get_args(kinds)
             if not isinstance(value, str) or value not in choices:
                 expected = " or ".join(map(repr, choices))
                 raise SettingsError(f"{name} is {value!r}; choose {expected}")
-        for name in ("flow", "large_motion", "exposure", "highlights", "seam", "guides"):
+        for name in ("flow", "exposure", "highlights", "seam", "guides"):
             if not isinstance(getattr(self, name), bool):
                 raise SettingsError(f"{name} is {getattr(self, name)!r}; choose True or False")
         if self.device is not None and not isinstance(self.device, str):

@@ -93,6 +93,29 @@ __kernel void flow_warp(__global const float4 *features, /* (2, grid.y, grid.x) 
     p[BOARD_WARPED * pitch] = f.w;
 }
 
+/* What a flow leaves unexplained: per pixel that both images show, by how much the gradients of h differ where it
+   leads, `most` at most and where it leads outside; -1 elsewhere. */
+__kernel void flow_misfit(__global const float4 *features, /* (2, grid.y, grid.x) */
+                          __global const float2 *flows,    /* (2, grid.y, grid.x) px */
+                          int4 grid,                       /* run size: grid.x, grid.y, 2 */
+                          float most,
+                          __global float *misfit)          /* (2, grid.y, grid.x) */
+{
+    const int x = get_global_id(0), y = get_global_id(1), way = get_global_id(2);
+    if (x >= grid.x || y >= grid.y)
+        return;
+    const int pixel = y * grid.x + x, at = way * grid.y * grid.x + pixel;
+    __global const float4 *other = features + (1 - way) * grid.y * grid.x;
+    const float4 own = features[at];
+    if (own.w == 0.0f || other[pixel].w == 0.0f) {
+        misfit[at] = -1.0f;
+        return;
+    }
+    const float4 there = feature_sample(other, x, y, flows[at], grid);
+    const float off = ROOT(square2(own.yz - there.yz));
+    misfit[at] = there.w > 0.0f ? LEAST(off, most) : most;
+}
+
 /* Most charts do not wrap, and compilers for CPUs take many pixels at a time only if they know. */
 #ifndef WRAPS
 #define WRAPS grid.z

@@ -158,6 +158,22 @@ def test_board_and_warp_equal_their_twins(device: Device, name: str, ways: int) 
         assert np.array_equal(back.get()[first : first + ways], flows[first : first + ways])
 
 
+@pytest.mark.parametrize("name", list(GRIDS))
+def test_misfit_equals_its_twin(device: Device, name: str) -> None:
+    grid = GRIDS[name]
+    features = [make_feature(seed, grid) for seed in (24, 64)]
+    flows = [9 * smooth_noise(seed, grid, 2, 4) for seed in (25, 65)]
+    misfit = device.empty((2, grid[1], grid[0]))
+    sent = [device.upload(np.stack(both)) for both in (features, flows)]
+    device.run("flow", "flow_misfit", (*grid[:2], 2), *sent, grid, 0.1, misfit)
+    for way, values in enumerate(misfit.get()):
+        expected = twin.flow_misfit(features[way], features[1 - way], flows[way], grid, 0.1)
+        assert (expected < 0).any()
+        assert (expected == 0.1).any()
+        assert ((expected > 0) & (expected < 0.1)).any()
+        assert_close(values, expected, 1e-5, DECISIONS)
+
+
 def test_twin_of_warp_is_scipys() -> None:
     grid = GRIDS["plane"]
     feature, moved = make_feature(20, grid, 1.0), 3 * smooth_noise(21, grid, 2, 4)

@@ -246,7 +246,7 @@ def test_layers_that_do_not_belong_together(other, message):
         {"seam": "auto"},
         {"flow": "off"},
         {"guides": "off"},
-        {"large_motion": 0},
+        {"large_motion": True},
         {"exposure": "auto"},
         {"device": 0},
     ],

@@ -28,7 +28,8 @@ def layers(canvas: Canvas) -> list[Layer]:
 
 def test_normal_is_what_the_solver_does_by_itself() -> None:
     assert Settings().flow_quality == "normal"
-    assert quality.flow_parameters("normal") == flow.FlowParameters()
+    assert Settings().large_motion == "auto"
+    assert quality.flow_parameters("normal", "auto") == flow.FlowParameters()
 
 
 def test_quality_chooses_the_working_canvas() -> None:

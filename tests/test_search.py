@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import pytest
 from grids import patches
@@ -11,7 +13,7 @@ from scipy import ndimage
 from tolerances import DECISIONS, SUM, TRIGONOMETRY, assert_close
 
 from hugin_abflow import flow, search
-from hugin_abflow.opencl import Device
+from hugin_abflow.opencl import Buffer, Device
 from hugin_abflow.pyramid import Level
 
 GRIDS = {"plane": (37, 23, 0, 0), "cylinder": (38, 23, 1, 0), "odd cylinder": (37, 23, 1, 0)}
@@ -208,6 +210,24 @@ def test_motion_of_a_tenth_of_the_width_is_found(device: Device, by: tuple[int, 
         error = np.linalg.norm(field.get() - np.array(way), axis=-1)[inside]
         assert np.median(error) < 0.05
         assert (error < 1).mean() > 0.97
+
+
+@pytest.mark.parametrize(("hope", "gain", "found"), [(0.95, 0.9, False), (math.inf, math.inf, True)])
+def test_what_makes_images_no_more_alike_is_dropped(
+    device: Device, monkeypatch: pytest.MonkeyPatch, hope: float, gain: float, found: bool
+) -> None:
+    """A search that offers nonsense: only where it is always believed the flow is not what it is without."""
+    a, whole = texture(36, 371, 217), np.ones((217, 371))
+    images = [on_device(device, image, whole) for image in (a, np.roll(a, 2, 1))]
+    without = flow.pair_flow(device, *images, reach=0.0)
+
+    def nonsense(_: Device, __: Buffer, stacked: Buffer, *___: object) -> Buffer:
+        return device.upload(stacked.get() + np.float32(9))
+
+    monkeypatch.setattr(flow, "_choose", nonsense)
+    parameters = flow.FlowParameters(search=search.SearchParameters(hope=hope, gain=gain))
+    flows = flow.pair_flow(device, *images, parameters)
+    assert all(np.array_equal(f.get(), w.get()) for f, w in zip(flows, without, strict=True)) != found
 
 
 def test_a_small_thing_that_moves_far_is_found(device: Device) -> None:

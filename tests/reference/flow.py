@@ -49,6 +49,14 @@ def flow_warp(feature: Array, flow: Array, grid: Sequence[int]) -> Array:
     return np.where(whole, total / np.where(whole, total[..., 3:], 1), 0.0)
 
 
+def flow_misfit(own: Array, other: Array, flow: Array, grid: Sequence[int], most: float) -> Array:
+    """How far gradients differ where the flow leads; -1 where not both images are."""
+    there = flow_warp(other, flow, grid)
+    off = np.hypot(*(own[..., i].astype(np.float64) - there[..., i] for i in (1, 2)))
+    off = np.where(there[..., 3] > 0, np.minimum(off, most), most)
+    return np.where((own[..., 3] > 0) & (other[..., 3] > 0), off, -1.0)
+
+
 def constraints(
     feature: Array, warped: Array, grid: Sequence[int], brightness: float, gradient: float, noise: float
 ) -> list[tuple[Array, Array, Array]]:
