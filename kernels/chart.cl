@@ -1,5 +1,7 @@
 /* Layers seen on a pair's chart. */
 
+#define CHART_SLOPE -0.5f /* Catmull-Rom: parabolas stay, and flow with them */
+
 static inline float4 chart_tap(__global const float4 *layer, int4 box, int2 p, int4 border) {
     if (!grid_border(&p, border))
         return (float4)(0.0f);
@@ -15,7 +17,7 @@ static inline float4 chart_row(__global const float4 *row, float4 weights, float
 /* Weights of four taps around fraction t: to read between pixels, or for every second one. The latter are a tent
    two pixels wide to each side, so that texture finer than the chart is averaged, not taken for something else. */
 static inline float4 chart_weights(float t, int coarse) {
-    return coarse == 1 ? catmull_rom(t) : 0.25f * (float4)(1.0f - t, 2.0f - t, 1.0f + t, t);
+    return coarse == 1 ? cubic_taps(t, CHART_SLOPE) : 0.25f * (float4)(1.0f - t, 2.0f - t, 1.0f + t, t);
 }
 
 /* Log brightness of a layer on a chart, by these weights where all taps are valid, bilinear at the rim of the

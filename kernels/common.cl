@@ -324,9 +324,10 @@ static inline float3 exposure_shift(float3 c, float3 gain, float shoulder) {
     return exposure_raise(c, exponential(gain.xyzz).xyz - 1.0f, 1.0f, shoulder);
 }
 
-/* Catmull-Rom weights of the four taps around fraction t: exactly (0, 1, 0, 0) at t = 0. */
-static inline float4 catmull_rom(float t) {
+/* Weights of the four taps around fraction t by cubic convolution (Keys, "Cubic convolution interpolation for
+   digital image processing", 1981): exactly (0, 1, 0, 0) at t = 0. a: slope at the kernel's first zero. */
+static inline float4 cubic_taps(float t, float a) {
     const float t2 = t * t, t3 = t2 * t;
-    return (float4)(-0.5f * t + t2 - 0.5f * t3, 1.0f - 2.5f * t2 + 1.5f * t3, 0.5f * t + 2.0f * t2 - 1.5f * t3,
-                    -0.5f * t2 + 0.5f * t3);
+    return (float4)(a * (t3 - 2.0f * t2 + t), (a + 2.0f) * t3 - (a + 3.0f) * t2 + 1.0f,
+                    -(a + 2.0f) * t3 + (2.0f * a + 3.0f) * t2 - a * t, a * (t2 - t3));
 }

@@ -190,13 +190,15 @@ def test_twin_of_sample_is_bicubic() -> None:
         assert image[j, i] == pytest.approx(math.log(brightness + FLOOR), abs=1e-9)
 
 
-def test_catmull_rom_is_exact_on_parabolas_and_on_pixels() -> None:
+@pytest.mark.parametrize("a", [-0.5, -2 / 3])
+def test_cubic_is_exact_on_constants_and_on_pixels_and_near_it_on_parabolas(a: float) -> None:
+    """With a slope of -1/2, Catmull and Rom's, on parabolas as well."""
     t = np.linspace(0, 1, 17)
-    taps = common.catmull_rom(t)
+    taps = common.cubic_taps(t, a)
     assert np.allclose(taps.sum(0), 1)
-    for power in (1, 2):
-        assert np.allclose(np.arange(-1, 3) ** power @ taps, t**power)
-    assert np.array_equal(common.catmull_rom(np.array([0.0]))[:, 0], [0, 1, 0, 0])
+    for power, off in ((1, 0.2), (2, 0.6)):
+        assert np.allclose(np.arange(-1, 3) ** power @ taps, t**power, atol=off * abs(a + 0.5) + 1e-9)
+    assert np.array_equal(common.cubic_taps(np.array([0.0]), a)[:, 0], [0, 1, 0, 0])
 
 
 def test_tent_averages_what_is_finer_than_every_second_pixel() -> None:

@@ -11,13 +11,16 @@ from reference.common import (
     Numbers,
     canvas_point,
     canvas_position,
-    catmull_rom,
+    cubic_taps,
     exposure_shift,
     four_taps,
     grid_border,
     pixels,
     take,
 )
+
+# Of the cubic that layers are sampled with.
+SLOPE = -2 / 3
 
 
 def opaque(rows: Array, white: float) -> Array:
@@ -36,7 +39,7 @@ def sample(
         column, row, inside = grid_border(np.floor(x).astype(int), np.floor(y).astype(int), border)
         return take(pixels_, box, column, row, inside)
     left, top = np.floor(x - 0.5).astype(int), np.floor(y - 0.5).astype(int)
-    across, down = catmull_rom(x - 0.5 - left), catmull_rom(y - 0.5 - top)
+    across, down = cubic_taps(x - 0.5 - left, SLOPE), cubic_taps(y - 0.5 - top, SLOPE)
     cubic, valid = 0.0, True
     for j in range(4):
         for i in range(4):

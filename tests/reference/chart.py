@@ -10,8 +10,8 @@ from reference.common import (
     Array,
     Numbers,
     canvas_position,
-    catmull_rom,
     chart_point,
+    cubic_taps,
     grid_border,
     pixels,
     take,
@@ -46,7 +46,7 @@ def chart_sample(
         position = np.where(np.abs(position - nearest) < SNAP, nearest, position)
         whole.append(np.floor(position).astype(int))
         fraction.append(position - np.floor(position))
-    cubic = [catmull_rom(t) if coarse == 1 else tent(t) for t in fraction]
+    cubic = [cubic_taps(t, -0.5) if coarse == 1 else tent(t) for t in fraction]
     linear = [np.stack([0 * t, 1 - t, t, 0 * t]) for t in fraction]
     sums = {"cubic": 0.0, "linear": 0.0}
     complete = {name: np.ones(x.shape, bool) for name in sums}

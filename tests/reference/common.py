@@ -62,11 +62,11 @@ def bilinear(values: Array, grid: Sequence[int], x: Array, y: Array) -> tuple[Ar
     return np.asarray(total), np.asarray(share)
 
 
-def catmull_rom(t: Array) -> Array:
-    """Weights (4, ...) of taps -1, 0, 1, 2: Keys' cubic with a = -1/2, as a function of tap distance."""
+def cubic_taps(t: Array, a: float) -> Array:
+    """Weights (4, ...) of taps -1, 0, 1, 2: Keys' cubic, as a function of tap distance."""
     distance = np.abs(np.asarray(t) - np.arange(-1, 3).reshape(4, *[1] * np.ndim(t)))
-    near = 1.5 * distance**3 - 2.5 * distance**2 + 1
-    far = -0.5 * distance**3 + 2.5 * distance**2 - 4 * distance + 2
+    near = (a + 2) * distance**3 - (a + 3) * distance**2 + 1
+    far = a * (distance**3 - 5 * distance**2 + 8 * distance - 4)
     return np.where(distance <= 1, near, np.where(distance < 2, far, 0.0))
 
 
