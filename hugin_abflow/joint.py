@@ -183,10 +183,10 @@ def _align(
     clipped = highlights.excess(device, layers, masks, grid, settings)
     transition.narrow(device, layers, coefficients, flows, grid, settings, clipped.max(0))
     fields = geometry.fields(device, layers, coefficients, flows, grid, settings)
-    highlights.give_way(device, layers, fields, clipped, grid)
     flows.clear()  # these are as large as the layers, and not needed again
     del coefficients
     device.give_back()
+    highlights.give_way(device, layers, fields, clipped, grid)
     measured = colour.measure(device, layers, fields, pairs, grid, masks.host)
     correct = partial(colour.correction, device, measured)
     # exposure explains a difference whether it is corrected or not
