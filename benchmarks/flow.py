@@ -25,6 +25,7 @@ from benchmarks.flow_pairs import Floats, Pair, Pixels, public_pairs, synthetic_
 from hugin_abflow import flow
 from hugin_abflow.opencl import Device
 from hugin_abflow.pyramid import Level
+from hugin_abflow.quality import flow_parameters
 
 ROOT = Path(__file__).resolve().parent.parent
 
@@ -67,7 +68,7 @@ def ours(device: Device) -> Solver:
             levels.append(
                 Level(device.upload(np.log(grey + np.float32(0.05))), device.empty(grey.shape).fill(1), False)
             )
-        forward, backward = flow.pair_flow(device, *levels)
+        forward, backward = flow.pair_flow(device, *levels, flow_parameters("normal", "on"))
         return forward.get(), backward.get()
 
     return solve

@@ -198,11 +198,21 @@ def _better(
     device: Device, features: Buffer, flows: list[Buffer], grid: Grid, level: int, parameters: FlowParameters
 ) -> list[Buffer]:
     """Of flows without and with what was searched, those that are left after a level: in the end one."""
+    how = parameters.search
     plain, found = (_misfit(device, features, one, grid, parameters) for one in flows)
     last = level <= parameters.decide_on
-    if found > (parameters.search.gain if last else parameters.search.hope) * plain:
+    if found > (how.gain if last else how.hope) * plain:
         return flows[:1]
-    return flows[1:] if last else flows
+    if not last:
+        return flows
+    return flows[1:] if _share_apart(features, flows, how.apart) >= how.widely else flows[:1]
+
+
+def _share_apart(features: Buffer, flows: list[Buffer], apart: float) -> float:
+    """Of the pixels that both images show, the share in which two flows lead more than `apart` px apart."""
+    common = (features.get()[..., 3] > 0).all(0)
+    first, second = (one.get()[:, common] for one in flows)
+    return float((((first - second) ** 2).sum(-1) > apart**2).mean()) if common.any() else 0.0
 
 
 def _misfit(device: Device, features: Buffer, flows: Buffer, grid: Grid, parameters: FlowParameters) -> float:
@@ -246,8 +256,9 @@ def pair_flow(
     where the masks overlap little: in a small corner of a floor of tiles every tile fits. Raises
     `DeviceError` if the device fails.
 
-    What is found beyond warping's reach is kept if the images are clearly more alike by it: where patterns
-    repeat, much fits a little.
+    What is found beyond warping's reach is kept if the images are clearly more alike by it, since where
+    patterns repeat much fits a little, and if it is most of what they show: a small thing that moves far by
+    itself is somebody who walked, who would be torn from what is behind.
     """
     parameters = parameters or FlowParameters()
     count = start.level + 1 if start else levels(a, parameters)

@@ -36,5 +36,5 @@ def flow_parameters(quality: FlowQuality, large_motion: LargeMotion) -> flow.Flo
     """The solver's parameters for `Settings.flow_quality` and `Settings.large_motion`."""
     parameters = replace(flow.FlowParameters(), **_CHANGES[quality])
     if large_motion == "on":
-        return replace(parameters, search=replace(parameters.search, hope=math.inf, gain=math.inf))
+        return replace(parameters, search=replace(parameters.search, hope=math.inf, gain=math.inf, widely=0))
     return parameters

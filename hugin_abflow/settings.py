@@ -28,9 +28,10 @@ class Settings:
     flow                bring the layers together by optical flow; else they stay where they are, and every
                         overlap is cut along the seam that shows least.
     flow_quality        how much time the flow may take: "fast", "normal" or "best".
-    large_motion        search for motion of up to a tenth of the canvas's width, for very near things: "auto"
-                        keeps what makes the layers clearly more alike, "on" all that is found; what repeats
-                        (grids, tiles) may mislead it. "off": no search.
+    large_motion        search for motion of up to a tenth of the canvas's width, for very near things:
+                        "auto" keeps what makes at least a quarter of an overlap clearly more alike,
+                        "on" all that is found; what repeats (grids, tiles) and who walks may mislead
+                        it. "off": no search.
     exposure            match exposure and colour of the layers where they overlap, and spread it smoothly.
     highlights          take what one layer shows clipped from another that does not.
     seam                take from one layer, whole, what flow cannot explain (people who moved, occlusions).

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 import pytest
 from grids import patches
@@ -12,9 +10,10 @@ from reference import search as twin
 from scipy import ndimage
 from tolerances import DECISIONS, SUM, TRIGONOMETRY, assert_close
 
-from hugin_abflow import flow, search
+from hugin_abflow import flow, quality, search
 from hugin_abflow.opencl import Buffer, Device
 from hugin_abflow.pyramid import Level
+from hugin_abflow.settings import LargeMotion
 
 GRIDS = {"plane": (37, 23, 0, 0), "cylinder": (38, 23, 1, 0), "odd cylinder": (37, 23, 1, 0)}
 REACH = (4, 3)
@@ -212,9 +211,9 @@ def test_motion_of_a_tenth_of_the_width_is_found(device: Device, by: tuple[int, 
         assert (error < 1).mean() > 0.97
 
 
-@pytest.mark.parametrize(("hope", "gain", "found"), [(0.95, 0.9, False), (math.inf, math.inf, True)])
+@pytest.mark.parametrize(("always", "found"), [(False, False), (True, True)])
 def test_what_makes_images_no_more_alike_is_dropped(
-    device: Device, monkeypatch: pytest.MonkeyPatch, hope: float, gain: float, found: bool
+    device: Device, monkeypatch: pytest.MonkeyPatch, always: bool, found: bool
 ) -> None:
     """A search that offers nonsense: only where it is always believed the flow is not what it is without."""
     a, whole = texture(36, 371, 217), np.ones((217, 371))
@@ -225,13 +224,15 @@ def test_what_makes_images_no_more_alike_is_dropped(
         return device.upload(stacked.get() + np.float32(9))
 
     monkeypatch.setattr(flow, "_choose", nonsense)
-    parameters = flow.FlowParameters(search=search.SearchParameters(hope=hope, gain=gain))
+    parameters = quality.flow_parameters("normal", "on" if always else "auto")
     flows = flow.pair_flow(device, *images, parameters)
     assert all(np.array_equal(f.get(), w.get()) for f, w in zip(flows, without, strict=True)) != found
 
 
-def test_a_small_thing_that_moves_far_is_found(device: Device) -> None:
-    """A board of 40 x 60 px moves by 33 px in front of a wall that stands."""
+@pytest.mark.parametrize("large_motion", ["auto", "on"])
+def test_a_small_thing_that_moves_far_is_found_if_wanted(device: Device, large_motion: LargeMotion) -> None:
+    """A board of 40 x 60 px moves by 33 px in front of a wall that stands. It might be somebody who walked,
+    for whom no flow is right."""
     wall, board = texture(37, 371, 217), 1.05 - texture(38, 371, 217)
     y, x = np.mgrid[0:217, 0:371]
 
@@ -241,9 +242,11 @@ def test_a_small_thing_that_moves_far_is_found(device: Device) -> None:
 
     (a, in_a), (b, _) = view(0), view(33)
     whole = np.ones(a.shape)
-    forward, _ = flow.pair_flow(device, on_device(device, a, whole), on_device(device, b, whole))
+    parameters = quality.flow_parameters("normal", large_motion)
+    forward, _ = flow.pair_flow(device, on_device(device, a, whole), on_device(device, b, whole), parameters)
     error = np.linalg.norm(forward.get() - np.where(in_a[..., None], (33, 0), (0, 0)), axis=-1)
-    assert (error[ndimage.binary_erosion(in_a, iterations=6)] < 1).mean() > 0.9
+    right = (error[ndimage.binary_erosion(in_a, iterations=6)] < 1).mean()
+    assert right > 0.9 if large_motion == "on" else right < 0.1
     still = ~ndimage.binary_dilation(in_a, iterations=6) & ~ndimage.binary_dilation(
         np.roll(in_a, 33, 1), iterations=6
     )
