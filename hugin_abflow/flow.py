@@ -257,7 +257,7 @@ def pair_flow(
     `DeviceError` if the device fails.
 
     What is found beyond warping's reach is kept if the images are clearly more alike by it, since where
-    patterns repeat much fits a little, and if it is most of what they show: a small thing that moves far by
+    patterns repeat much fits a little, and if it is a large part of what they show: what moves far all by
     itself is somebody who walked, who would be torn from what is behind.
     """
     parameters = parameters or FlowParameters()
