@@ -125,7 +125,8 @@ class Keys:
         longest_first = sorted(self._accepts, key=len, reverse=True)
         self._known = re.compile(b"|".join(longest_first) or _NEVER)
         plain = b"|".join(key + types[key.decode()].plain for key in longest_first) or _NEVER
-        self._plain_line = re.compile(rb"(?:\s++(?:%b)(?!\S))*+\s*+" % plain)
+        # no possessive quantifiers: up to Python 3.11.2 these match what they should not
+        self._plain_line = re.compile(rb"(?:\s+(?:%b)(?!\S))*\s*" % plain)
         self._plain_field = re.compile(rb"(%b)(%b|[^\s\"]*)" % (self._known.pattern, _PLAIN_TEXT))
 
     def read_plain(self, text: bytes, start: int) -> dict[str, bytes] | None:
@@ -224,6 +225,6 @@ MASK = Keys({"i": INDEX, "t": MASK_TYPE, "p": POINTS}, required=("i", "p"))
 
 # A control point as Hugin writes it, with the numbers of its images.
 PLAIN_CONTROL_POINT = re.compile(
-    rb"c n(\d{1,9}) N(\d{1,9}) x%b y%b X%b Y%b t\d{1,9}\s*+" % ((_PLAIN_NUMBER,) * 4)
+    rb"c n(\d{1,9}) N(\d{1,9}) x%b y%b X%b Y%b t\d{1,9}\s*" % ((_PLAIN_NUMBER,) * 4)
 )
 VARIABLE_ENTRY = re.compile(b"(%b|[A-Za-z]+)(\\d{1,9})" % "|".join(sorted(VARIABLES, key=len)[::-1]).encode())
