@@ -268,7 +268,7 @@ def pair_flow(
         reach = min(reach, parameters.overlap * math.sqrt(common))
         searched = search.level(reach, count, parameters.search) if reach > 0 else -1
     pyramids = [pyramid.build(device, image, count + 1) for image in (a, b)]
-    flows: list[Buffer] = []  # without what a search found, and with it, until one of them is taken
+    flows: list[Buffer] = []  # without what a search found, and with it, as long as both may be taken
     for level in reversed(range(count)):
         features = _features(device, [(p[level], p[level + 1]) for p in pyramids], parameters)
         grid = pyramids[0][level].grid
@@ -277,10 +277,10 @@ def pair_flow(
         else:
             flows = [_together(device, start.flows) if start else device.zeros((2, grid[1], grid[0], 2))]
         # a search on a level finer than choose_from (of a small image) is followed by no other choice
-        wanted = level == searched or len(flows) > 1
-        if wanted and min(searched, parameters.choose_from) <= level <= searched:
+        followed = level == searched or parameters.search.always or len(flows) > 1
+        if followed and min(searched, parameters.choose_from) <= level <= searched:
             chosen = _choose(device, features, flows[-1], grid, level, level == searched, reach, parameters)
-            flows = [flows[0], chosen]
+            flows = [chosen] if parameters.search.always else [flows[0], chosen]
         pulls = start.pulls if start else (None, None)
         flows = [_refine(device, features, one, grid, level, parameters, pulls) for one in flows]
         if len(flows) > 1:

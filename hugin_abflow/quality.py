@@ -35,6 +35,4 @@ def coarseness(quality: FlowQuality, pixels: int) -> int:
 def flow_parameters(quality: FlowQuality, large_motion: LargeMotion) -> flow.FlowParameters:
     """The solver's parameters for `Settings.flow_quality` and `Settings.large_motion`."""
     parameters = replace(flow.FlowParameters(), **_CHANGES[quality])
-    if large_motion == "on":
-        return replace(parameters, search=replace(parameters.search, hope=math.inf, gain=math.inf, widely=0))
-    return parameters
+    return replace(parameters, search=replace(parameters.search, always=large_motion == "on"))

@@ -40,6 +40,7 @@ class SearchParameters:
     gain: float = 0.9
     apart: float = 1.5
     widely: float = 0.25
+    always: bool = False  # keep what is found, whatever becomes of it
     steps: tuple[int, ...] = (16, 8, 4, 2, 1)  # px from which flow is taken over, in turns
 
 

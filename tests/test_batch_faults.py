@@ -122,6 +122,7 @@ def mounted(shoot: Path, size: str, script: str, *arguments: object) -> subproce
         text=True,
         timeout=120,
     )
+    # systems but Linux have no unshare(1), and some containers forbid it; a disk cannot be filled otherwise
     if "unshare" in done.stderr or "mount:" in done.stderr:
         pytest.skip(f"no disk of its own can be mounted here: {done.stderr.strip()}")
     assert "Traceback" not in done.stderr
