@@ -42,10 +42,21 @@ class Chart:
         """The width of the canvas of `grid` in px of the chart."""
         return grid.circumference * float(self.transform[9])
 
+    def bearings(self, places: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+        """Unit vectors (n, 3) in which positions (n, 2) on a sphere's chart are seen, in its own axes."""
+        t = self.transform.astype(np.float64)
+        lon, lat = (places[:, 0] - t[11]) / t[9], (t[12] - places[:, 1]) / t[10]
+        return np.stack([np.cos(lat) * np.sin(lon), np.cos(lat) * np.cos(lon), np.sin(lat)], 1)
+
+    @property
+    def spherical(self) -> bool:
+        """Whether it is of a sphere."""
+        return bool(self.transform[13])
+
     def positions(self, points: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
         """Chart positions (n, 2) of points (n, 3) in the scene; on the host what kernels do on the device."""
         t = self.transform.astype(np.float64)
-        if t[13]:
+        if self.spherical:
             x, y, z = t[:9].reshape(3, 3) @ points.T
             return np.stack(
                 [np.arctan2(x, y) * t[9] + t[11], t[12] - np.arctan2(z, np.hypot(x, y)) * t[10]], 1

@@ -13,8 +13,9 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
+import numpy.typing as npt
 
-from hugin_abflow import pyramid, search
+from hugin_abflow import epipolar, pyramid, search
 from hugin_abflow.opencl import Buffer, Device
 from hugin_abflow.pyramid import Level
 from hugin_abflow.search import Grid, SearchParameters
@@ -94,6 +95,9 @@ class Board:
         device.run("flow", "flow_solution", size, self.planes, self.grid, self.pitch, first, flows)
         return flows
 
+
+# Unit vectors (n, 3) in which places (n, 2) are seen: px of the finest grid, pixels' centres at .5.
+Bearings = Callable[[npt.NDArray[np.float64]], npt.NDArray[np.float64]]
 
 # Changes a level's linear system before it is solved: level, board, which of its ways.
 Pull = Callable[[int, Board, int], None]
@@ -195,32 +199,60 @@ def _choose(
 
 
 def _better(
-    device: Device, features: Buffer, flows: list[Buffer], grid: Grid, level: int, parameters: FlowParameters
+    device: Device,
+    features: Buffer,
+    flows: list[Buffer],
+    grid: Grid,
+    level: int,
+    bearings: Bearings | None,
+    parameters: FlowParameters,
 ) -> list[Buffer]:
     """Of flows without and with what was searched, those that are left after a level: in the end one."""
-    how = parameters.search
+    how, last = parameters.search, level <= parameters.decide_on
     plain, found = (_misfit(device, features, one, grid, parameters) for one in flows)
-    last = level <= parameters.decide_on
-    if found > (how.gain if last else how.hope) * plain:
+    common = plain >= 0
+    ways = [one.get() for one in flows]
+    distance = how.apart * 2.0 ** (parameters.decide_on - level)
+    apart = common & (((ways[1] - ways[0]) ** 2).sum(-1) > distance**2)
+    if not apart.any():
         return flows[:1]
-    if not last:
-        return flows
-    return flows[1:] if _share_apart(features, flows, how.apart) >= how.widely else flows[:1]
+    kept = flows[1:] if last else flows
+    gained = found[common].mean() <= (how.gain if last else how.hope) * plain[common].mean()
+    if gained and (not last or apart.sum() >= how.widely * common.sum()):
+        return kept
+    if bearings and found[apart].mean() <= how.gain_apart * plain[apart].mean():
+        textured = (features.get()[..., 1:3] ** 2).sum(-1) > how.textured**2
+        known = _seen(bearings, ways[0], common & ~apart & textured, level)
+        if epipolar.parallax(known, _seen(bearings, ways[1], apart, level)):
+            return kept
+    return flows[:1]
 
 
-def _share_apart(features: Buffer, flows: list[Buffer], apart: float) -> float:
-    """Of the pixels that both images show, the share in which two flows lead more than `apart` px apart."""
-    common = (features.get()[..., 3] > 0).all(0)
-    first, second = (one.get()[:, common] for one in flows)
-    return float((((first - second) ** 2).sum(-1) > apart**2).mean()) if common.any() else 0.0
+def _seen(
+    bearings: Bearings, flows: npt.NDArray[np.float32], where: npt.NDArray[np.bool_], level: int
+) -> tuple[epipolar.Points, epipolar.Points]:
+    """Where the first and where the second image show what flows both ways match at some pixels of a level:
+    unit vectors (n, 3).
+    """
+    ends: list[list[epipolar.Points]] = [[], []]
+    for way in (0, 1):
+        rows, columns = np.nonzero(where[way])
+        places = np.stack([columns, rows], 1).astype(np.float64) + 0.5
+        ends[way].append(bearings(places * 2.0**level))
+        ends[1 - way].append(bearings((places + flows[way, rows, columns]) * 2.0**level))
+    first, second = (np.concatenate(points) for points in ends)
+    return first, second
 
 
-def _misfit(device: Device, features: Buffer, flows: Buffer, grid: Grid, parameters: FlowParameters) -> float:
-    """Mean of what flows both ways leave unexplained, where both images show something; 0 if nowhere."""
+def _misfit(
+    device: Device, features: Buffer, flows: Buffer, grid: Grid, parameters: FlowParameters
+) -> npt.NDArray[np.float32]:
+    """What flows both ways leave unexplained, (2, height, width), where both images show something; else
+    -1.
+    """
     misfit = device.empty((2, grid[1], grid[0]))
     device.run("flow", "flow_misfit", (*grid[:2], 2), features, flows, grid, parameters.misfit, misfit)
-    values = misfit.get()
-    return float(values[values >= 0].mean()) if (values >= 0).any() else 0.0
+    return misfit.get()
 
 
 def _apart(device: Device, stacked: Buffer) -> list[Buffer]:
@@ -248,17 +280,19 @@ def pair_flow(
     parameters: FlowParameters | None = None,
     start: Start | None = None,
     reach: float | None = None,
+    bearings: Bearings | None = None,
 ) -> tuple[Buffer, Buffer]:
     """Flow from a to b and from b to a: two float32 (height, width, 2) in px of the grid.
 
     a, b: log brightness with masks, 0 outside them. start: nothing else is searched. reach: the largest
     motion that is searched, px, 0: none; if it is None, `parameters.reach` of the longer side. It is less
-    where the masks overlap little: in a small corner of a floor of tiles every tile fits. Raises
-    `DeviceError` if the device fails.
+    where the masks overlap little: in a small corner of a floor of tiles every tile fits. bearings: what
+    direction a place on the grid is seen in, on a sphere. Raises `DeviceError` if the device fails.
 
     What is found beyond warping's reach is kept if the images are clearly more alike by it, since where
-    patterns repeat much fits a little, and if it is a large part of what they show: what moves far all by
-    itself is somebody who walked, who would be torn from what is behind.
+    patterns repeat much fits a little, and if it is no thing that moved by itself: somebody who walked would
+    be torn from what is behind. It is none if it is a large part of what they show, or if it moves as what
+    stands still does, seen by a camera that moved (epipolar.py).
     """
     parameters = parameters or FlowParameters()
     count = start.level + 1 if start else levels(a, parameters)
@@ -284,7 +318,7 @@ def pair_flow(
         pulls = start.pulls if start else (None, None)
         flows = [_refine(device, features, one, grid, level, parameters, pulls) for one in flows]
         if len(flows) > 1:
-            flows = _better(device, features, flows, grid, level, parameters)
+            flows = _better(device, features, flows, grid, level, bearings, parameters)
     forward, backward = _apart(device, flows[0])
     return forward, backward
 

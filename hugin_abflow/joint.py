@@ -356,7 +356,8 @@ def _flows(
             its_layers = (layers[pair.a], layers[pair.b])
             its_chart = chart.pair_chart(overlap, masks.grid, grid, coarse)
             image_a, image_b = (chart.sample(device, layer, grid, its_chart) for layer in its_layers)
-            found = flow.pair_flow(device, image_a, image_b, parameters, reach=reach)
+            bearings = its_chart.bearings if its_chart.spherical else None
+            found = flow.pair_flow(device, image_a, image_b, parameters, reach=reach, bearings=bearings)
             first, second = numbers[pair.a], numbers[pair.b]
             its_guides = guides.get((min(first, second), max(first, second)))
             if its_guides:

@@ -34,12 +34,16 @@ class SearchParameters:
     radius: int = 2  # px: of the window in which two flows are compared
     focus: float = 4.0  # e-folds by which a pixel counts less there, for a difference of 1 from the middle
     # what a search found is dropped on a level where more than this share of the misfit without it remains,
-    # and kept if no more than this remains at last, and it leads elsewhere by so many px in so large a share
-    # of the pixels that both images show
+    # and kept if no more than this remains at last, and it leads elsewhere by so many px (of the level on
+    # which that is decided) in so large a share of the pixels that both images show
     hope: float = 0.95
     gain: float = 0.9
     apart: float = 1.5
     widely: float = 0.25
+    # or if no more than this remains where it leads elsewhere, and motion there is that of what stands still,
+    # as gradients of h of at least this tell
+    gain_apart: float = 0.75
+    textured: float = 0.02
     always: bool = False  # keep what is found, whatever becomes of it
     steps: tuple[int, ...] = (16, 8, 4, 2, 1)  # px from which flow is taken over, in turns
 

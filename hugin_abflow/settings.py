@@ -30,8 +30,9 @@ class Settings:
     flow_quality        how much time the flow may take: "fast", "normal" or "best".
     large_motion        search for motion of up to a tenth of the canvas's width, for very near things:
                         "auto" keeps what makes at least a quarter of an overlap clearly more alike,
-                        "on" all that is found; what repeats (grids, tiles) and who walks may mislead
-                        it. "off": no search.
+                        or what moves as things do that stand still when the camera moves; "on" all
+                        that is found; what repeats (grids, tiles) and who walks may mislead it. "off":
+                        no search.
     exposure            match exposure and colour of the layers where they overlap, and spread it smoothly.
     highlights          take what one layer shows clipped from another that does not.
     seam                take from one layer, whole, what flow cannot explain (people who moved, occlusions).

@@ -135,6 +135,18 @@ def test_a_chart_of_a_patch_does_not_wrap(name: str) -> None:
     assert not pair_chart(mask, grid, grid).wraps
 
 
+@pytest.mark.parametrize("name", [name for name in OVERLAPS if name.startswith("sphere")])
+def test_bearings_are_what_positions_are_of(name: str) -> None:
+    """In the chart's own axes."""
+    grid, mask = OVERLAPS[name]
+    found = pair_chart(mask, grid, grid)
+    rng = np.random.default_rng(5)
+    places = rng.uniform((1, 1), (found.width - 1, found.height - 1), (50, 2))
+    points = found.bearings(places) @ found.transform[:9].reshape(3, 3).astype(np.float64)
+    assert np.allclose(np.linalg.norm(points, axis=1), 1)
+    assert np.allclose(found.positions(points), places, atol=1e-3)
+
+
 def test_a_wrapped_plane_has_one_copy_of_each_point() -> None:
     """On a cylinder positions one turn apart are the same chart position, and within the first period."""
     grid, mask = OVERLAPS["cylinder border"]

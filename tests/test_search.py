@@ -253,6 +253,28 @@ def test_a_small_thing_that_moves_far_is_found_if_wanted(device: Device, large_m
     assert (error[still] < 0.5).mean() > 0.97
 
 
+@pytest.mark.parametrize(("by", "kept"), [(33, True), (-33, False)])
+def test_a_small_thing_that_moves_as_near_things_do_is_found(device: Device, by: int, kept: bool) -> None:
+    """The wall moves by 3 px to the right: the camera moved left, and what is near moves far to the right.
+    What goes left walked."""
+    wall, board = texture(37, 371, 217), 1.05 - texture(38, 371, 217)
+    y, x = np.mgrid[0:217, 0:371]
+
+    def view(shift: int, background: int) -> tuple[np.ndarray, np.ndarray]:
+        there = (np.abs(x - shift - 180) < 20) & (np.abs(y - 100) < 30)
+        return np.where(there, np.roll(board, shift, 1), np.roll(wall, background, 1)), there
+
+    def bearings(places: np.ndarray) -> np.ndarray:
+        lon, lat = (places[:, 0] - 185) / 300, (108 - places[:, 1]) / 300
+        return np.stack([np.cos(lat) * np.sin(lon), np.cos(lat) * np.cos(lon), np.sin(lat)], 1)
+
+    (a, in_a), (b, _) = view(0, 0), view(by, 3)
+    images = [on_device(device, image, np.ones(a.shape)) for image in (a, b)]
+    forward, _ = flow.pair_flow(device, *images, bearings=bearings)
+    inside = forward.get()[ndimage.binary_erosion(in_a, iterations=6)]
+    assert ((np.linalg.norm(inside - (by, 0), axis=-1) < 1).mean() > 0.9) == kept
+
+
 def test_a_narrow_overlap_shows_all_of_its_motion(device: Device) -> None:
     """17 px wide, moved by 4.5 px across: the whole of it, not a part."""
     wide = ndimage.zoom(texture(39, 40, 160), 2, order=3)  # smooth enough to move by halves: 80 x 320

@@ -1,0 +1,57 @@
+"""Motion of what stands still, for a camera that moved: epipolar geometry on the sphere, on the host.
+
+A camera that moves towards the unit vector b without turning (the canvas has undone its turns) sees a still
+point leave u for v on the great circle through u and b, away from b: b . (u x v) = 0, and v - u points along
+(b . u) u - b (Longuet-Higgins, Prazdny, "The interpretation of a moving retinal image", 1980). Where both
+photos show what did not move, b is found from the flow; somebody who walks moves as he likes.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+
+Points = npt.NDArray[np.float64]
+
+# Below which misfit nothing loses weight, from round to round: an angle times the root of the motion. Most
+# count as fitting at first, so that a few which move otherwise cannot mislead the first guess.
+_FITS = tuple(np.geomspace(0.2, 0.005, 20).tolist())
+# Radians: what moves less does not move.
+_NO_MOTION = 1e-6
+# Fewer points say nothing about the move, more say no more.
+_LEAST, _MOST = 200, 20_000
+# The cosine of the angle by which motion may differ from that of still things, and the share that has to be
+# still for the move to be known, and for motion to be taken for parallax.
+_ALONG, _MOSTLY = 0.7, 0.8
+
+
+def move(u: Points, v: Points) -> Points:
+    """The direction (3) in which the camera moved between seeing points at u and at v: (n, 3) unit vectors,
+    n > 0. The sum of |b . (u x v)|, less for long motion, is least, and most points move away from it.
+    """
+    normals = np.cross(u, v)
+    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), _NO_MOTION) ** 0.5
+    weights = np.ones(len(u))
+    for fits in _FITS:
+        direction = np.linalg.eigh((normals * weights[:, None]).T @ normals).eigenvectors[:, 0]
+        weights = 1 / np.maximum(np.abs(normals @ direction), fits)
+    return direction if ((v - u) @ direction).sum() < 0 else -direction
+
+
+def along(u: Points, v: Points, direction: Points) -> npt.NDArray[np.float64]:
+    """Cosine (n) between the motion from u to v and that of still things, if the camera moved so; 0: none."""
+    expected = (u @ direction)[:, None] * u - direction
+    lengths = np.linalg.norm(v - u, axis=1) * np.linalg.norm(expected, axis=1)
+    cosines: npt.NDArray[np.float64] = ((v - u) * expected).sum(1) / np.maximum(lengths, _NO_MOTION**2)
+    return cosines
+
+
+def parallax(known: tuple[Points, Points], found: tuple[Points, Points]) -> bool:
+    """Whether the motion in `found` is that of still things, for the camera's move that `known` tells; not so
+    if it tells none. Each is where points are seen from the first and from the second place.
+    """
+    u, v = (points[:: max(1, len(points) // _MOST)] for points in known)
+    if len(u) < _LEAST or not len(found[0]):
+        return False
+    direction = move(u, v)
+    return all(float((along(*points, direction) > _ALONG).mean()) >= _MOSTLY for points in ((u, v), found))

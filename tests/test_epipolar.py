@@ -1,0 +1,64 @@
+"""Motion of what stands still, against points in space and cameras whose place is known."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from hugin_abflow import epipolar
+
+Points = np.ndarray
+
+
+def unit(points: Points) -> Points:
+    return points / np.linalg.norm(points, axis=-1, keepdims=True)
+
+
+def seen(seed: int, count: int, move: Points, around: Points, nearest: float = 2.0) -> tuple[Points, Points]:
+    """Directions before and after a camera's move of points within some 60 degrees of `around`."""
+    rng = np.random.default_rng(seed)
+    places = unit(around + 0.7 * rng.normal(size=(count, 3))) * rng.uniform(nearest, 9, (count, 1))
+    return unit(places), unit(places - move)
+
+
+@settings(max_examples=40, deadline=None)
+@given(seed=st.integers(0, 10_000))
+def test_the_move_is_found_among_things_that_move_otherwise(seed: int) -> None:
+    """A fifth of the points moves at random, by as much as the others."""
+    rng = np.random.default_rng(seed)
+    move, around = (unit(rng.normal(size=3)) for _ in range(2))
+    u, v = seen(seed, 1000, 0.1 * move, around)
+    v[::5] = unit(u[::5] + 0.05 * rng.normal(size=(200, 3)))
+    assert epipolar.move(u, v) @ move > np.cos(np.radians(3))
+
+
+def test_still_points_move_along_whatever_their_distance() -> None:
+    move = unit(np.array([0.3, -0.5, 0.2]))
+    u, v = seen(1, 300, 0.2 * move, np.array([0, 1.0, 0]), nearest=0.5)
+    assert epipolar.along(u, v, move).min() > 0.9
+    assert epipolar.along(v, u, move).max() < -0.9
+    assert not epipolar.along(u, u, move).any()
+
+
+@pytest.mark.parametrize(
+    ("direction", "expected"),
+    [((1, 0, 0), True), ((-1, 0, 0), False), ((0, 0, 1), False), ((0, 0, -1), False)],
+)
+def test_what_walks_is_no_parallax(direction: tuple[float, float, float], expected: bool) -> None:
+    """The camera moves left; what is found in front of it moves right, left, up, down, farther than all."""
+    known = seen(2, 2000, np.array([-0.1, 0, 0]), np.array([0, 1.0, 0]))
+    u, _ = seen(3, 300, np.zeros(3), np.array([0, 5.0, 0]))
+    assert epipolar.parallax(known, (u, unit(u + 0.2 * np.array(direction)))) is expected
+
+
+def test_an_unknown_move_proves_nothing() -> None:
+    """All moves at random, or hardly anything is known."""
+    rng = np.random.default_rng(4)
+    u, v = seen(5, 2000, np.array([-0.1, 0, 0]), np.array([0, 1.0, 0]))
+    found = (u[:300], v[:300])
+    assert epipolar.parallax((u, v), found)
+    assert not epipolar.parallax((u, unit(u + 0.05 * rng.normal(size=u.shape))), found)
+    assert not epipolar.parallax((u[:150], v[:150]), found)
+    assert not epipolar.parallax((u, v), (u[:0], v[:0]))
