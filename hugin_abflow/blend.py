@@ -164,6 +164,7 @@ def _bands(
         for band in plan:
             part = band.part
             size = part.width, part.height
+            pairs = -(-part.width // 2), part.height
             store.next()
             ways, way_starts = _lines(device, fields, part, full, grid, share)
             gained, gain_starts = _lines(device, gains, part, full, gain_grid, 0.0)
@@ -179,7 +180,7 @@ def _bands(
             lines = _turn(device, full.lens[2], -full.lens[3], part.top, part.height)
             out = device.empty((part.height, part.width, first.channels + 1), device_dtype(first))
             device.run(
-                "blend", "blend_band", size, store.rows, device.upload(table[used]), len(used), ways, gained,
+                "blend", "blend_band", pairs, store.rows, device.upload(table[used]), len(used), ways, gained,
                 columns, lines, full.border, full.lens, grid.border, gain_grid.border,
                 (part.left, part.top, *size), (region.left, region.top),
                 shoulder, int(settings.interpolation == "nearest"), share, out, options=options,

@@ -1,5 +1,9 @@
 /* The full-resolution pass over one band of rows. Built with PIXEL (stored sample type), SAMPLES (2 or 4, alpha
-   last), WHITE (full scale) and INTEGER (1: round and saturate). Places are pixels of the region. */
+   last), WHITE (full scale) and INTEGER (1: round and saturate). Places are pixels of the region.
+
+   A work item makes two pixels side by side: what is known of each is float2 or int2, their colours are float8, r, g,
+   b and one value more of the left one, then of the right one. PoCL's compiler makes vectors of no more than what
+   is written as vectors, and those of one pixel are half as long as a processor's. */
 
 #define BLEND_JOIN(type, n) type##n
 #define BLEND_VECTOR(type, n) BLEND_JOIN(type, n)
@@ -7,7 +11,14 @@
    all fractions, this next to nothing; a ramp stays one to 0.03 px. */
 #define BLEND_SLOPE (-2.0f / 3.0f)
 
+#if SAMPLES > 2
+#define BLEND_TWO 8
+#else
+#define BLEND_TWO 4
+#endif
+
 typedef BLEND_VECTOR(PIXEL, SAMPLES) blend_pixel; /* as stored */
+typedef BLEND_VECTOR(PIXEL, BLEND_TWO) blend_pixels; /* two of them */
 
 /* One layer as a band needs it: 64 bytes, made by hugin_abflow/blend.py. */
 typedef struct {
@@ -25,6 +36,36 @@ static inline float4 blend_samples(blend_pixel p) {
 #else
     return convert_float2(p).xxxy;
 #endif
+}
+
+static inline float8 blend_colours(blend_pixels p) {
+#if SAMPLES > 2
+    return convert_float8(p);
+#else
+    return convert_float4(p).s00012223;
+#endif
+}
+
+static inline blend_pixels blend_stored(float8 v) {
+#if SAMPLES > 2
+    return BLEND_VECTOR(convert_, BLEND_VECTOR(PIXEL, 8))(v);
+#else
+    return BLEND_VECTOR(convert_, BLEND_VECTOR(PIXEL, 4))(v.s0347);
+#endif
+}
+
+/* What is known of two pixels, for each of their samples. */
+#define BLEND_EACH(v) (v).s00001111
+
+/* Whether it is so for one of two pixels at least. */
+static inline bool blend_some(int2 v) {
+    return (v.x | v.y) != 0;
+}
+
+/* Where r, g or b is not 0. */
+static inline int2 blend_any(float8 v) {
+    const int8 set = v != 0.0f;
+    return set.s04 | set.s15 | set.s26;
 }
 
 /* Where a layer's stored row lies; its rows go round. */
@@ -45,10 +86,28 @@ static inline float4 blend_tap(__global const blend_pixel *stored, __global cons
     return c.w >= 0.5f * WHITE ? (float4)(c.xyz, 1.0f) : (float4)(0.0f);
 }
 
-static inline float4 blend_row(__global const blend_pixel *p, float4 weights, float4 *least) {
-    const float4 a = blend_samples(p[0]), b = blend_samples(p[1]), c = blend_samples(p[2]), d = blend_samples(p[3]);
-    const float4 ab = a < b ? a : b, cd = c < d ? c : d, low = ab < cd ? ab : cd;
-    *least = low < *least ? low : *least;
+/* The same for p and the pixel to its right. */
+static inline float8 blend_taps(__global const blend_pixel *stored, __global const blend_layer *layer, int2 p) {
+    const int4 place = layer->place;
+    const int x = p.x - place.x, y = p.y - place.y;
+    if (x < -1 || y < 0 || x >= place.z || y >= place.w)
+        return (float8)(0.0f);
+    if (x < 0 || x + 1 >= place.z)
+        return (float8)(blend_tap(stored, layer, p), blend_tap(stored, layer, p + (int2)(1, 0)));
+    __global const blend_pixel *first = blend_line(stored, layer, y) + x;
+    float8 c = blend_colours((blend_pixels)(first[0], first[1]));
+    const int2 valid = c.s37 >= 0.5f * WHITE;
+    c.s37 = (float2)(1.0f);
+    return BLEND_EACH(valid) ? c : (float8)(0.0f);
+}
+
+/* Four taps of two rows each, weighted; the least sample of each kind in them. */
+static inline float8 blend_rows_of_taps(__global const blend_pixel *p, __global const blend_pixel *q, float4 weights,
+                                        float8 *least) {
+    const float8 a = blend_colours((blend_pixels)(p[0], q[0])), b = blend_colours((blend_pixels)(p[1], q[1]));
+    const float8 c = blend_colours((blend_pixels)(p[2], q[2])), d = blend_colours((blend_pixels)(p[3], q[3]));
+    const float8 low = LEAST(LEAST(a, b), LEAST(c, d));
+    *least = LEAST(low, *least);
     return weights.x * a + weights.y * b + weights.z * c + weights.w * d;
 }
 
@@ -64,13 +123,19 @@ static float4 blend_sample(__global const blend_pixel *stored, __global const bl
     const int2 first = corner - 1 - place.xy;
     if (first.x >= 0 && first.y >= 0 && first.x + 3 < place.z && first.y + 3 < place.w) {
         /* nearly all samples: every tap is stored, no border rule is needed */
-        float4 least = (float4)(WHITE);
-        float4 sum = wy.x * blend_row(blend_line(stored, layer, first.y) + first.x, wx, &least);
-        sum += wy.y * blend_row(blend_line(stored, layer, first.y + 1) + first.x, wx, &least);
-        sum += wy.z * blend_row(blend_line(stored, layer, first.y + 2) + first.x, wx, &least);
-        sum += wy.w * blend_row(blend_line(stored, layer, first.y + 3) + first.x, wx, &least);
-        if (least.w >= 0.5f * WHITE)
+        __global const blend_pixel *r0 = blend_line(stored, layer, first.y) + first.x;
+        __global const blend_pixel *r1 = blend_line(stored, layer, first.y + 1) + first.x;
+        __global const blend_pixel *r2 = blend_line(stored, layer, first.y + 2) + first.x;
+        __global const blend_pixel *r3 = blend_line(stored, layer, first.y + 3) + first.x;
+        float8 least = (float8)(WHITE);
+        const float8 upper = blend_rows_of_taps(r0, r1, wx, &least), lower = blend_rows_of_taps(r2, r3, wx, &least);
+        if (least.s3 >= 0.5f * WHITE && least.s7 >= 0.5f * WHITE) {
+            float4 sum = wy.x * upper.lo;
+            sum += wy.y * upper.hi;
+            sum += wy.z * lower.lo;
+            sum += wy.w * lower.hi;
             return (float4)(sum.xyz, 1.0f);
+        }
     }
     const float ax[4] = {wx.x, wx.y, wx.z, wx.w}, ay[4] = {wy.x, wy.y, wy.z, wy.w};
     float4 cubic = (float4)(0.0f), linear = (float4)(0.0f);
@@ -132,77 +197,91 @@ __kernel void blend_rows(__global const float4 *values, /* arrays one after the 
     }
 }
 
-/* Linear reading of a line of such values, the grid's columns from span.x on, span.y of them, at q. */
-static inline float4 blend_read(__global const float4 *line, int2 span, float q, int4 border) {
-    const float p = q - 0.5f - span.x;
-    int left = (int)p;
-    left -= p < left;
-    const float t = p - left;
-    int right = left + 1;
+/* Where the columns of a coarse grid lie that two positions read, and how far between them. */
+typedef struct {
+    int2 left;
+    float2 t;
+} blend_between;
+
+static inline blend_between blend_columns(float2 q) {
+    const float2 p = q - 0.5f;
+    blend_between at = {convert_int2(p), p};
+    at.left += p < convert_float2(at.left); /* true is -1 */
+    at.t = p - convert_float2(at.left);
+    return at;
+}
+
+/* Linear reading of a line of such values, the grid's columns from span.x on, span.y of them. */
+static inline float8 blend_read(__global const float4 *line, int2 span, blend_between at, int4 border) {
+    int2 left = at.left - span.x, right = left + 1;
     if (border.z && span.y == border.x) {
         left += left < 0 ? border.x : 0;
         right -= right >= border.x ? border.x : 0;
     }
-    const float4 a = line[blend_clamp(left, span.y)], b = line[blend_clamp(right, span.y)];
-    return a + t * (b - a);
+    left = LIMITED(left, 0, span.y - 1);
+    right = LIMITED(right, 0, span.y - 1);
+    const float8 a = (float8)(line[left.x], line[left.y]), b = (float8)(line[right.x], line[right.y]);
+    return a + BLEND_EACH(at.t) * (b - a);
 }
 
-static inline bool blend_any(float3 v) {
-    return v.x != 0.0f || v.y != 0.0f || v.z != 0.0f;
-}
-
-/* A layer's gain at column q of the colour grid. */
-static inline float3 blend_gain(__global const float4 *gains, __global const blend_layer *layer, int y, float q,
-                                int4 border) {
+/* Smooth exposure correction of colours in stored units; `gained`: where there is one. */
+static inline float8 blend_correct(float8 c, __global const float4 *gains, __global const blend_layer *layer, int y,
+                                    blend_between at, int4 border, float shoulder, int2 *gained) {
+    *gained = (int2)(0);
     if (layer->gains < 0)
-        return (float3)(0.0f);
-    return blend_read(gains + layer->gains + y * layer->gain.y, layer->gain, q, border).xyz;
+        return c;
+    const float8 gain = blend_read(gains + layer->gains + y * layer->gain.y, layer->gain, at, border);
+    *gained = blend_any(gain);
+    return exposure_raise8(c, exponential8(gain) - 1.0f, WHITE, shoulder);
 }
 
-/* Smooth exposure correction of a colour in stored units. */
-static inline float3 blend_correct(float3 c, float3 gain, float shoulder) {
-    return blend_any(gain) ? exposure_raise(c, exponential(gain.xyzz).xyz - 1.0f, WHITE, shoulder) : c;
+/* atan2 of positive x; a few terms of the series do where angles are small, as they nearly always are. */
+static inline float2 blend_angles(float2 y, float2 x) {
+    const float2 t = y / x, t2 = t * t;
+    const int2 small = x > 0.0f && t2 < 0.01f;
+    const float2 angle = t * (1.0f - t2 * (1.0f / 3.0f - t2 * (0.2f - t2 / 7.0f)));
+    if (!blend_some(!small))
+        return angle;
+    return small ? angle : (float2)(atan2(y.x, x.x), atan2(y.y, x.y));
 }
 
-/* atan2 of a positive x; a few terms of the series do where the angle is small, as it nearly always is. */
-static inline float blend_angle(float y, float x) {
-    const float t = y / x, t2 = t * t;
-    if (x > 0.0f && t2 < 0.01f)
-        return t * (1.0f - t2 * (1.0f / 3.0f - t2 * (0.2f - t2 / 7.0f)));
-    return atan2(y, x);
-}
-
-/* Where a layer is sampled for the pixel at p: the field's displacement d carried to full resolution.
-   turn: sine and cosine of the pixel's longitude and latitude. */
-static inline float2 blend_position(float2 p, float3 d, float2 scale, float4 lens, float4 turn) {
-    if (lens.y == 0.0f)
-        return p + d.xy * scale;
+/* Where a layer is sampled for pixels at (px, py): the field's displacements d carried to full resolution.
+   sl, cl, sp, cp: sine and cosine of the pixels' longitudes and latitude. */
+static inline void blend_positions(float2 px, float py, float8 d, float2 scale, float4 lens, float2 sl, float2 cl,
+                                   float sp, float cp, float2 *x, float2 *y) {
+    const float2 dx = d.s04, dy = d.s15, dz = d.s26;
+    if (lens.y == 0.0f) {
+        *x = px + dx * scale.x;
+        *y = py + dy * scale.y;
+        return;
+    }
     /* in the frame of p (east, north, up) the change of longitude is small, hence exact in float32 */
-    const float sl = turn.x, cl = turn.y, sp = turn.z, cp = turn.w;
-    const float east = cl * d.x - sl * d.y, out = cp + sl * d.x + cl * d.y;
-    const float north = sp + d.z, level = ROOT(east * east + out * out);
-    return (float2)(p.x + blend_angle(east, out) / lens.y,
-                    p.y - blend_angle(north * cp - level * sp, level * cp + north * sp) / lens.w);
+    const float2 east = cl * dx - sl * dy, out = cp + sl * dx + cl * dy;
+    const float2 north = sp + dz, squared = east * east + out * out;
+    const float2 level = (float2)(ROOT(squared.x), ROOT(squared.y));
+    *x = px + blend_angles(east, out) / lens.y;
+    *y = py - blend_angles(north * cp - level * sp, level * cp + north * sp) / lens.w;
 }
 
-/* The fractions above which r, g, b are rounded up at canvas pixel (x, y): uniform in 0..1, so that the mean of
-   many rounded pixels is right. Steps of the golden ratio spread them evenly along a row, which halves the noise
-   that is coarse enough to be seen; where rows begin is mixed from all bits of y and channel. */
-static inline float4 blend_thresholds(int x, int y) {
+/* The fractions above which r, g, b are rounded up at canvas pixels (x, y) and (x + 1, y): uniform in 0..1, so that
+   the mean of many rounded pixels is right. Steps of the golden ratio spread them evenly along a row, which halves
+   the noise that is coarse enough to be seen; where rows begin is mixed from all bits of y and channel. */
+static inline float8 blend_thresholds(int x, int y) {
     uint4 h = (uint)y * 4u + (uint4)(0, 1, 2, 3);
     h = (h ^ (h >> 16)) * 0x85ebca6bu;
     h = (h ^ (h >> 13)) * 0xc2b2ae35u;
     h ^= h >> 16;
-    return (convert_float4((h + (uint)x * 0x9e3779b9u) >> 16) + 0.5f) / 65536.0f;
+    const uint8 across = (uint8)((uint4)x, (uint4)(x + 1)) * 0x9e3779b9u;
+    return (convert_float8((h.s01230123 + across) >> 16) + 0.5f) / 65536.0f;
 }
 
 /* Whole numbers from 0 to full scale, rounded to nearest, or by dither where a threshold says so. What is whole
    but for the rounding of float32 stays as it is. */
-static inline float4 blend_round(float4 v, float4 thresholds, int dithered) {
+static inline float8 blend_round(float8 v, float8 thresholds, int8 dithered) {
     v = v < 0.0f ? 0.0f : v > WHITE ? WHITE : v;
-    const float4 nearest = (v + 8388608.0f) - 8388608.0f, off = v - nearest; /* 2^23 leaves no bits below 1 */
-    const float4 below = convert_float4(convert_int4(v));
-    const float4 spread = v - below > thresholds ? below + 1.0f : below;
+    const float8 nearest = (v + 8388608.0f) - 8388608.0f, off = v - nearest; /* 2^23 leaves no bits below 1 */
+    const float8 below = convert_float8(convert_int8(v));
+    const float8 spread = v - below > thresholds ? below + 1.0f : below;
     return dithered ? (off <= 2e-7f * WHITE && off >= -2e-7f * WHITE ? nearest : spread) : nearest;
 }
 
@@ -218,80 +297,98 @@ __kernel void blend_band(
     __global const float2 *lines,        /* (band.w) sine and cosine of latitude; plane: not used */
     int4 border, float4 lens,            /* full-resolution grid of the region */
     int4 field_border, int4 gain_border, /* working grid; colour grid */
-    int4 band,                           /* the band's place: left, top, run size */
+    int4 band,                           /* the band's place: left, top, width, height; run size: pairs of columns, rows */
     int2 origin,                         /* the region's place on the canvas */
     float shoulder,                      /* of the exposure scale */
     int nearest,                         /* 1: nearest-neighbour sampling */
     float share,                         /* of all weight, below which a layer is hidden */
     __global blend_pixel *out)           /* (band.w, band.z) */
 {
-    const int x = get_global_id(0), y = get_global_id(1);
+    const int x = 2 * get_global_id(0), y = get_global_id(1);
     if (x >= band.z || y >= band.w)
         return;
     const int2 place = (int2)(x + band.x, y + band.y);
-    const float2 p = convert_float2(place) + 0.5f;
+    const float2 px = convert_float2(place.x + (int2)(0, 1)) + 0.5f;
+    const float py = place.y + 0.5f;
     const float2 scale = (float2)((float)border.x / field_border.x, (float)border.y / field_border.y);
-    const float cell = p.x * ((float)gain_border.x / border.x);
+    const blend_between cell = blend_columns(px * ((float)gain_border.x / border.x));
 
-    int first = 0, several = 0;
-    float4 reference = (float4)(0.0f);
-    for (int k = 0; k < count && !several; ++k) {
-        const float4 own = blend_tap(stored, layers + k, place);
-        if (own.w == 0.0f)
+    int first = count;
+    int2 known = (int2)(0), several = (int2)(0), corrected = (int2)(0), gained;
+    float8 reference = (float8)(0.0f);
+    for (int k = 0; k < count && blend_some(!several); ++k) {
+        float8 own = blend_taps(stored, layers + k, place);
+        const int2 seen = own.s37 != 0.0f, fresh = seen & ~known;
+        several |= seen & known;
+        known |= seen;
+        if (!blend_some(fresh))
             continue;
-        several = reference.w != 0.0f;
-        if (!several) {
-            first = k;
-            reference = own;
+        first = LEAST(first, k);
+        own = blend_correct(own, gains, layers + k, y, cell, gain_border, shoulder, &gained);
+        corrected |= fresh & gained;
+        reference = BLEND_EACH(fresh) ? own : reference;
+    }
+    float8 sum = (float8)(0.0f);
+    if (blend_some(several)) {
+        const blend_between column = blend_columns(px / scale.x);
+        float2 sl = (float2)(0.0f), cl = sl;
+        float sp = 0.0f, cp = 0.0f;
+        if (lens.y != 0.0f) {
+            const float2 left = columns[x], right = columns[LEAST(x + 1, band.z - 1)];
+            sl = (float2)(left.x, right.x);
+            cl = (float2)(left.y, right.y);
+            sp = lines[y].x;
+            cp = lines[y].y;
         }
-    }
-    int corrected = 0;
-    if (reference.w != 0.0f) {
-        const float3 gain = blend_gain(gains, layers + first, y, cell, gain_border);
-        reference.xyz = blend_correct(reference.xyz, gain, shoulder);
-        corrected = blend_any(gain);
-    }
-    float4 sum = (float4)(0.0f);
-    if (several) {
-        const float4 turn = lens.y == 0.0f ? (float4)(0.0f) : (float4)(columns[x], lines[y]);
-        float hidden = 0.0f;
+        float2 hidden = (float2)(0.0f);
+        int2 open = several;
         /* a second time with all layers, if most of what is seen lies outside its layer */
-        for (int round = 0; round < 2; ++round) {
-            float total = 0.0f;
-            sum = (float4)(0.0f);
+        for (int round = 0; round < 2 && blend_some(open); ++round) {
+            float2 total = (float2)(0.0f);
+            float8 all = (float8)(0.0f);
             for (int k = first; k < count; ++k) {
-                float4 c = blend_tap(stored, layers + k, place);
-                if (c.w == 0.0f)
+                float8 c = blend_taps(stored, layers + k, place);
+                int2 seen = open & (c.s37 != 0.0f);
+                if (!blend_some(seen))
                     continue;
                 __global const float4 *line = ways + layers[k].ways + y * layers[k].way.y;
-                const float4 way = blend_read(line, layers[k].way, p.x / scale.x, field_border);
-                float w = way.w + hidden;
-                if (w <= 0.0f)
+                const float8 way = blend_read(line, layers[k].way, column, field_border);
+                float2 w = way.s37 + hidden;
+                seen &= w > 0.0f;
+                if (!blend_some(seen))
                     continue;
+                w = seen ? w : 0.0f;
                 total += w;
-                if (blend_any(way.xyz))
-                    c = blend_sample(stored, layers + k, blend_position(p, way.xyz, scale, lens, turn), border,
-                                     nearest);
+                const int2 moved = seen & blend_any(way);
+                if (blend_some(moved)) {
+                    float2 qx, qy;
+                    blend_positions(px, py, way, scale, lens, sl, cl, sp, cp, &qx, &qy);
+                    if (moved.x)
+                        c.lo = blend_sample(stored, layers + k, (float2)(qx.x, qy.x), border, nearest);
+                    if (moved.y)
+                        c.hi = blend_sample(stored, layers + k, (float2)(qx.y, qy.y), border, nearest);
+                }
                 /* a sample that falls outside its layer counts smoothly less */
-                w *= c.w * c.w;
-                if (w <= 0.0f)
-                    continue;
-                const float3 gain = blend_gain(gains, layers + k, y, cell, gain_border);
-                sum += (float4)((blend_correct(c.xyz, gain, shoulder) - reference.xyz) * w, w);
-                corrected |= blend_any(gain);
+                w *= c.s37 * c.s37;
+                c = blend_correct(c, gains, layers + k, y, cell, gain_border, shoulder, &gained);
+                corrected |= gained & (w > 0.0f);
+                float8 part = (c - reference) * BLEND_EACH(w);
+                part.s37 = w;
+                all += part;
             }
-            if (sum.w >= 0.5f * total)
-                break;
+            sum = BLEND_EACH(open) ? all : sum;
+            open &= !(all.s37 >= 0.5f * total);
             hidden = share * total;
         }
     }
-    const float3 colour = sum.w > 1e-30f ? reference.xyz + sum.xyz / sum.w : reference.xyz;
-    float4 v = (float4)(colour, reference.w * WHITE);
+    const int2 mixed = sum.s37 > 1e-30f;
+    float8 v = BLEND_EACH(mixed) ? reference + sum / BLEND_EACH(sum.s37) : reference;
+    v.s37 = known ? (float2)(WHITE) : (float2)(0.0f);
     if (INTEGER)
-        v = blend_round(v, blend_thresholds(place.x + origin.x, place.y + origin.y), corrected);
-#if SAMPLES > 2
-    out[y * band.z + x] = (blend_pixel)((PIXEL)v.x, (PIXEL)v.y, (PIXEL)v.z, (PIXEL)v.w);
-#else
-    out[y * band.z + x] = (blend_pixel)((PIXEL)v.x, (PIXEL)v.w);
-#endif
+        v = blend_round(v, blend_thresholds(place.x + origin.x, place.y + origin.y), BLEND_EACH(corrected));
+    const blend_pixels made = blend_stored(v);
+    __global blend_pixel *target = out + y * band.z + x;
+    target[0] = made.lo;
+    if (x + 1 < band.z)
+        target[1] = made.hi;
 }

@@ -49,15 +49,18 @@ static inline float exponential1(float a) {
     return (1.0f + t * (0.693151312f + t * (0.240164443f + t * upper))) * as_float((whole + 127) << 23);
 }
 
-static inline float4 exponential(float4 a) {
-    const float4 y = a * 1.44269504f;
-    int4 whole = convert_int4(y);
-    whole += y < convert_float4(whole); /* true is -1 */
-    const float4 t = y - convert_float4(whole);
-    const float4 upper = 0.0557999383f + t * (0.00901699517f + t * 0.00186714665f);
-    const float4 power = 1.0f + t * (0.693151312f + t * (0.240164443f + t * upper));
-    return power * as_float4((whole + 127) << 23);
-}
+#define EXPONENTIAL(n)                                                                                             \
+    static inline float##n exponential##n(float##n a) {                                                            \
+        const float##n y = a * 1.44269504f;                                                                        \
+        int##n whole = convert_int##n(y);                                                                          \
+        whole += y < convert_float##n(whole); /* true is -1 */                                                     \
+        const float##n t = y - convert_float##n(whole);                                                            \
+        const float##n upper = 0.0557999383f + t * (0.00901699517f + t * 0.00186714665f);                          \
+        const float##n power = 1.0f + t * (0.693151312f + t * (0.240164443f + t * upper));                         \
+        return power * as_float##n((whole + 127) << 23);                                                           \
+    }
+EXPONENTIAL(4)
+EXPONENTIAL(8)
 
 /* The natural logarithm of a normal number above 0, to 1e-7: of its power of two, and of what is left, between the
    roots of 1/2 and 2, by the series of the inverse hyperbolic tangent. */
@@ -313,15 +316,18 @@ static inline float3 exposure_scale(float3 c, float shoulder) {
 
 /* Multiply these odds by 1 + rise, floats by it themselves. Black stays, and an integer image is not raised
    beyond white; with a shoulder of 1 white stays as well. Exactly c where the rise is 0. */
-static inline float3 exposure_raise(float3 c, float3 rise, float white, float shoulder) {
-    const float3 low = shoulder * (c < white ? c : white);
-    const float3 v = c + c * rise * ((white - low) / (white + low * rise));
-    return shoulder > 0.0f && v > white ? (c < white ? white : c) : v;
-}
+#define EXPOSURE_RAISE(n)                                                                                          \
+    static inline float##n exposure_raise##n(float##n c, float##n rise, float white, float shoulder) {             \
+        const float##n low = shoulder * (c < white ? c : white);                                                   \
+        const float##n v = c + c * rise * ((white - low) / (white + low * rise));                                  \
+        return shoulder > 0.0f && v > white ? (c < white ? white : c) : v;                                         \
+    }
+EXPOSURE_RAISE(3)
+EXPOSURE_RAISE(8)
 
 /* Add a gain on the exposure scale. */
 static inline float3 exposure_shift(float3 c, float3 gain, float shoulder) {
-    return exposure_raise(c, exponential(gain.xyzz).xyz - 1.0f, 1.0f, shoulder);
+    return exposure_raise3(c, exponential4(gain.xyzz).xyz - 1.0f, 1.0f, shoulder);
 }
 
 /* Weights of the four taps around fraction t by cubic convolution (Keys, "Cubic convolution interpolation for
