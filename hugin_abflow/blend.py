@@ -156,8 +156,12 @@ def _bands(
     whole = (0, 0, gain_grid.width, gain_grid.height)
     fields = [(layer.box, layer.field) for layer in layers]
     gains = [(whole, layer.gain) for layer in layers if layer.gain is not None]
-    columns = _turn(device, full.lens[0], full.lens[1], crop.left - region.left, crop.width)
+    longitudes = _turn(device, full.lens[0], full.lens[1], crop.left - region.left, crop.width)
     plan = _plan(layers, full, grid, crop, height)
+    lines = plan[0].part.height
+    ways, gained = (
+        device.empty((lines * sum(box[2] for box, _ in arrays), 4)) for arrays in (fields, gains)
+    )
     with _Store(
         device, [layer.layer for layer in layers], [band.rows for band in plan], settings.cores
     ) as store:
@@ -166,8 +170,8 @@ def _bands(
             size = part.width, part.height
             pairs = -(-part.width // 2), part.height
             store.next()
-            ways, way_starts = _lines(device, fields, part, full, grid, share)
-            gained, gain_starts = _lines(device, gains, part, full, gain_grid, 0.0)
+            way_starts = _lines(device, fields, part, full, grid, share, ways)
+            gain_starts = _lines(device, gains, part, full, gain_grid, 0.0, gained)
             table = np.zeros((len(layers), 16), np.int32)
             for k, (layer, (start, end)) in enumerate(zip(layers, band.rows, strict=True)):
                 box, ring = layer.layer.box, store.shelves.rings[k]
@@ -177,11 +181,11 @@ def _bands(
                 table[k, 10] = -1 if layer.gain is None else gain_starts.pop(0)
                 table[k, 11:13] = ring.rows, start % ring.rows
             used = [k for k, (start, end) in enumerate(band.rows) if start < end]
-            lines = _turn(device, full.lens[2], -full.lens[3], part.top, part.height)
+            latitudes = _turn(device, full.lens[2], -full.lens[3], part.top, part.height)
             out = device.empty((part.height, part.width, first.channels + 1), device_dtype(first))
             device.run(
                 "blend", "blend_band", pairs, store.rows, device.upload(table[used]), len(used), ways, gained,
-                columns, lines, full.border, full.lens, grid.border, gain_grid.border,
+                longitudes, latitudes, full.border, full.lens, grid.border, gain_grid.border,
                 (part.left, part.top, *size), (region.left, region.top),
                 shoulder, int(settings.interpolation == "nearest"), share, out, options=options,
             )  # fmt: skip
@@ -201,8 +205,9 @@ def _lines(
     full: Grid,
     grid: Grid,
     share: float,
-) -> tuple[Buffer, list[int]]:
-    """Arrays on boxes of a coarse grid at the rows of a band: float32 (n, 4), and where each begins."""
+    result: Buffer,
+) -> list[int]:
+    """Arrays on boxes of a coarse grid at the rows of a band, into float32 (n, 4); where each begins."""
     scale = full.height / grid.height
     table, values, lines = np.zeros((len(arrays), 8), np.int32), 0, 0
     for entry, (box, _) in zip(table, arrays, strict=True):
@@ -210,7 +215,7 @@ def _lines(
         entry[:6] = box[0], first, box[2], last - first, values, lines
         values += box[2] * (last - first)
         lines += box[2] * part.height
-    packed, result = device.empty((values, 4)), device.empty((lines, 4))
+    packed = device.empty((values, 4))
     for (_, first, width, height, start, _, _, _), (box, array) in zip(table.tolist(), arrays, strict=True):
         packed.copy(start, array, (first - box[1]) * width, height * width)
     device.run(
@@ -218,7 +223,8 @@ def _lines(
         (grid.width, part.height), part.top, scale, share, result,
         options="-DPIXEL=float -DSAMPLES=4 -DWHITE=1.0f -DINTEGER=0",
     )  # fmt: skip
-    return result, table[:, 5].tolist()
+    starts: list[int] = table[:, 5].tolist()
+    return starts
 
 
 def _coarse_rows(box: tuple[int, int, int, int], part: Box, scale: float) -> Span:

@@ -241,7 +241,8 @@ class _Times:
     """When the device did what; its queue does one thing after the other."""
 
     def __init__(self, queue: cl.CommandQueue) -> None:
-        self.events: deque[tuple[str, str, cl.Event]] = deque()
+        self._events: deque[tuple[str, str, cl.Event]] = deque()
+        self._lock = threading.Lock()
         # its clock to ours: the least of several, for we may be told late
         self._offset = min(self._lag(queue) for _ in range(8))
 
@@ -252,13 +253,20 @@ class _Times:
         event.wait()
         return time.perf_counter() - float(event.profile.end) * 1e-9
 
+    def add(self, name: str, kind: str, event: cl.Event) -> None:
+        """Have the trace told when this was done, later."""
+        self._events.append((name, kind, event))
+        if kind == trace.TRANSFER:
+            self.tell()  # at once: the event keeps the host's array
+
     def tell(self) -> None:
         """Tell the trace what is done."""
         complete = cl.command_execution_status.COMPLETE
-        while self.events and self.events[0][2].command_execution_status == complete:
-            name, kind, event = self.events.popleft()
-            start, end = (self._offset + ns * 1e-9 for ns in (event.profile.start, event.profile.end))
-            trace.add(name, kind, start, end, "device")
+        with self._lock:
+            while self._events and self._events[0][2].command_execution_status == complete:
+                name, kind, event = self._events.popleft()
+                start, end = (self._offset + ns * 1e-9 for ns in (event.profile.start, event.profile.end))
+                trace.add(name, kind, start, end, "device")
 
 
 class Device:
@@ -404,7 +412,7 @@ class Device:
     def timed(self, name: str, kind: str, event: cl.Event) -> None:
         """Have the trace, where there is one, told later when this was done."""
         if self._times:
-            self._times.events.append((name, kind, event))
+            self._times.add(name, kind, event)
 
     def tell_times(self) -> None:
         """Tell the trace what is done."""

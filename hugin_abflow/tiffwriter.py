@@ -120,7 +120,12 @@ class TiffWriter:
 
     def write(self, rows: Pixels) -> None:
         """Append rows (n, width, samples) of the file's dtype; they must not change afterwards."""
-        rows = np.concatenate([self._rest, rows]) if len(self._rest) else rows
+        if len(self._rest):
+            missing = _ROWS - len(self._rest)
+            self._rest, rows = np.concatenate([self._rest, rows[:missing]]), rows[missing:]
+            if len(self._rest) < _ROWS:
+                return
+            self._put(self._rest)
         whole = len(rows) // _ROWS * _ROWS
         for top in range(0, whole, _ROWS):
             self._put(rows[top : top + _ROWS])

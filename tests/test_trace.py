@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import threading
+import weakref
 from pathlib import Path
 from typing import Any
 
@@ -112,6 +113,17 @@ def test_a_run_tells_phases_kernels_and_files(tmp_path: Path) -> None:
     assert {event["args"]["file"] for event in decoded} == {"pano0000.tif", "pano0001.tif"}
     starts = sorted(event["ts"] for event in decoded)
     assert starts[0] < end(phases["read"]) < phases["blend"]["ts"] < starts[-1]
+
+
+def test_a_profile_keeps_nothing_that_was_uploaded(tmp_path: Path) -> None:
+    """Else all layers that are decoded stay in memory."""
+    with trace.recording(tmp_path / "profile.json"):
+        device = Device()
+        host = np.zeros((4, 5), np.float32)
+        watched = weakref.ref(host)
+        device.upload(host)
+        del host
+        assert watched() is None
 
 
 def test_a_profile_that_cannot_be_written_ends_the_run_before_it_starts(
