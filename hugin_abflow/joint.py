@@ -194,7 +194,8 @@ def _align(
     for _ in range(_SEAM_ROUNDS if settings.seam else 0):
         strict = correct(exposure, regions, strict=True)
         device.give_back()
-        found = seam.regions(device, layers, fields, pairs, strict, grid)
+        residual = seam.residuals(device, layers, fields, pairs, strict, grid)
+        found = seam.regions(residual, grid)
         grown = found if regions is None else found | regions
         if not grown.any() or (regions is not None and np.array_equal(grown, regions)):
             break
@@ -204,7 +205,10 @@ def _align(
         regions = ~seam.divide(device, layers, fields, pairs, strict, masks, grid)
     elif regions is not None:
         whole = regions
-        seam.cut(device, layers, fields, pairs, strict, regions, masks, grid)
+        with ThreadPoolExecutor(1, "gains") as beside:  # solved on one core: the device cuts meanwhile
+            gains = beside.submit(correct, settings, regions)
+            seam.cut(device, layers, fields, residual, regions, masks, grid)
+            return fields, gains.result(), whole
     return fields, correct(settings, regions), whole
 
 

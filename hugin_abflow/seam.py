@@ -66,35 +66,47 @@ def seam_grid(grid: Grid) -> Grid:
     return grid.coarser(_CELL)
 
 
-def regions(
+def residuals(
     device: Device,
     layers: Sequence[WorkingLayer],
     fields: Sequence[Buffer],
     pairs: Sequence[Pair],
     correction: Correction,
     grid: Grid,
-) -> npt.NDArray[np.bool_]:
-    """Where aligned, corrected layers still differ: (height, width) on the seam grid."""
+) -> npt.NDArray[np.float64]:
+    """r: how far low frequencies of aligned, corrected layers differ, (height, width) on the seam grid: the
+    largest of any pair and channel, 0 where no two lie.
+    """
     cells = seam_grid(grid)
-    found = _regions(_residual(device, layers, fields, pairs, correction, grid, cells), cells)
-    return np.logical_or.reduce(found) if found else np.zeros(cells.shape, bool)
+    largest = np.zeros(cells.shape)
+    for pair in pairs:
+        found = _difference(device, layers, fields, pair, correction, grid, cells)
+        share = found[..., 3]
+        mean = _smooth(np.dstack([found[..., :3] * share[..., None], share]), cells.wraps)
+        mean = np.abs(mean[..., :3]).max(-1) / np.where(share > 0, mean[..., 3], 1)
+        largest = np.maximum(largest, mean * (share > 0))
+    return largest
+
+
+def regions(residual: npt.NDArray[np.float64], grid: Grid) -> npt.NDArray[np.bool_]:
+    """Where layers differ too much to be blended, by `residuals`, of the same shape."""
+    found = _regions(residual, seam_grid(grid))
+    return np.logical_or.reduce(found) if found else np.zeros(residual.shape, bool)
 
 
 def cut(
     device: Device,
     layers: Sequence[WorkingLayer],
     fields: Sequence[Buffer],
-    pairs: Sequence[Pair],
-    correction: Correction,
+    residual: npt.NDArray[np.float64],
     whole: npt.NDArray[np.bool_],
     masks: Masks,
     grid: Grid,
 ) -> None:
-    """Give each cell of the regions `whole` to one layer: the others lose their colour weight there
-    (fields[...].w, in place).
+    """Give each cell of the regions `whole` to one layer, by `residuals`: the others lose their colour weight
+    there (fields[...].w, in place).
     """
     cells = seam_grid(grid)
-    residual = _residual(device, layers, fields, pairs, correction, grid, cells)
     owner = _owners(layers, fields, residual, whole, masks, grid, cells, _CUT)
     yields = [_soften((whole & (owner != k)).astype(np.float32), cells.wraps) for k in range(len(layers))]
     _yield(device, layers, fields, yields, grid, cells)
@@ -173,26 +185,6 @@ def _yield(
             device.run(
                 "seam", "seam_yield", layer.box[2:], field, layer.box, grid.border, there, cells.border
             )
-
-
-def _residual(
-    device: Device,
-    layers: Sequence[WorkingLayer],
-    fields: Sequence[Buffer],
-    pairs: Sequence[Pair],
-    correction: Correction,
-    grid: Grid,
-    cells: Grid,
-) -> npt.NDArray[np.float64]:
-    """How far low frequencies differ: per cell the largest of any pair and channel, 0 where no two lie."""
-    largest = np.zeros(cells.shape)
-    for pair in pairs:
-        found = _difference(device, layers, fields, pair, correction, grid, cells)
-        share = found[..., 3]
-        mean = _smooth(np.dstack([found[..., :3] * share[..., None], share]), cells.wraps)
-        mean = np.abs(mean[..., :3]).max(-1) / np.where(share > 0, mean[..., 3], 1)
-        largest = np.maximum(largest, mean * (share > 0))
-    return largest
 
 
 def _difference(

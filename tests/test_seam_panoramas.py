@@ -186,7 +186,7 @@ def test_weights_outside_the_regions_stay(device: Device, monkeypatch: pytest.Mo
     seen = {}
 
     def remember(device, layers, fields, *rest, original=seam.cut):
-        seen["before"], seen["regions"] = [f.get() for f in fields], rest[2]
+        seen["before"], seen["regions"] = [f.get() for f in fields], rest[1]
         original(device, layers, fields, *rest)
         seen["after"] = [f.get() for f in fields]
 
