@@ -159,9 +159,7 @@ def _bands(
     longitudes = _turn(device, full.lens[0], full.lens[1], crop.left - region.left, crop.width)
     plan = _plan(layers, full, grid, crop, height)
     lines = plan[0].part.height
-    ways, gained = (
-        device.empty((lines * sum(box[2] for box, _ in arrays), 4)) for arrays in (fields, gains)
-    )
+    ways, gained = (device.empty((lines * sum(box[2] for box, _ in arrays), 4)) for arrays in (fields, gains))
     with _Store(
         device, [layer.layer for layer in layers], [band.rows for band in plan], settings.cores
     ) as store:
@@ -242,7 +240,9 @@ def _rows_needed(layer: BlendLayer, full: Grid, part: Box, scale: float) -> Span
         return 0, 0
     first, last = (row - layer.box[1] for row in _coarse_rows(layer.box, part, scale))
     beyond = math.ceil(max(layer.reach[first:last]) * scale) + 3  # 3: bicubic taps, rounding
-    return max(0, part.top - beyond - offset), min(box.height, part.bottom + beyond - offset)
+    start, end = max(0, part.top - beyond - offset), min(box.height, part.bottom + beyond - offset)
+    strip = layer.layer.strip  # whole ones, unless they are large: a part would be decoded, cut and joined again
+    return start, min(box.height, end + (-end % strip if strip <= _STRIP_ROWS else 0))
 
 
 def _plan(layers: Sequence[BlendLayer], full: Grid, grid: Grid, crop: Box, height: int) -> list[_Band]:

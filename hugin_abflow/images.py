@@ -35,7 +35,7 @@ _DTYPES = {"uint8": np.uint8, "uint16": np.uint16, "half": np.float16, "float": 
 _UNASSOCIATED = "oiio:UnassociatedAlpha"
 _MIN_IS_BLACK, _RGB, _PALETTE, _SEPARATED = 1, 2, 3, 5  # TIFF PhotometricInterpretation
 _MAX_CHUNK = 32 << 20  # a strip above this size (bytes) is not decoded whole to get a few rows of it
-_MAX_KEPT = 4 << 20  # bytes of already decoded rows that a layer keeps for its next read
+_MAX_KEPT = 1 << 20  # bytes of already decoded rows that a layer keeps for its next read
 
 
 def read_layer(path: Path | str) -> Layer:
@@ -120,6 +120,7 @@ def _describe(path: Path, name: str, page: int, source: Any, place: tifftags.Pla
         canvas_size=canvas,
         file=path,
         has_alpha=rows.has_alpha,
+        strip=rows.chunk,
     )
 
 
@@ -216,7 +217,7 @@ class _Rows:
     def _extend(self, top: int, bottom: int, kept_from: int) -> tuple[Pixels, int]:
         """Rows that include `top` to `bottom`, and which is the first: kept ones and newly decoded ones."""
         end = min(self.height, bottom + -bottom % self.chunk)
-        if self._kept is not None and kept_from <= top <= self._end:
+        if self._kept is not None and kept_from <= top < self._end:
             return np.concatenate([self._kept[top - kept_from :], self._decode(self._end, end)]), top
         start = top - top % self.chunk
         return self._decode(start, end), start

@@ -100,6 +100,7 @@ class Layer:
     canvas_size (width, height) of the canvas that the layer was made for, if its file tells it.
     file        the file that `read` decodes; None for pixels in memory.
     has_alpha   False for a file without alpha: every pixel is valid.
+    strip       rows that `read` decodes together, from row 0 on: it is fastest asked for whole ones.
     """
 
     name: str
@@ -111,6 +112,7 @@ class Layer:
     canvas_size: tuple[int, int] | None = None
     file: Path | None = None
     has_alpha: bool = True
+    strip: int = 1
 
     @classmethod
     def from_array(

@@ -5,8 +5,6 @@
    b and one value more of the left one, then of the right one. PoCL's compiler makes vectors of no more than what
    is written as vectors, and those of one pixel are half as long as a processor's. */
 
-#define BLEND_JOIN(type, n) type##n
-#define BLEND_VECTOR(type, n) BLEND_JOIN(type, n)
 /* Of the cubic that layers are sampled with: Catmull-Rom's -1/2 loses a twentieth of fine texture's gradients over
    all fractions, this next to nothing; a ramp stays one to 0.03 px. */
 #define BLEND_SLOPE (-2.0f / 3.0f)
@@ -17,8 +15,7 @@
 #define BLEND_TWO 4
 #endif
 
-typedef BLEND_VECTOR(PIXEL, SAMPLES) blend_pixel; /* as stored */
-typedef BLEND_VECTOR(PIXEL, BLEND_TWO) blend_pixels; /* two of them */
+typedef PIXEL_VECTOR(PIXEL, BLEND_TWO) blend_pixels; /* two as stored */
 
 /* One layer as a band needs it: 64 bytes, made by hugin_abflow/blend.py. */
 typedef struct {
@@ -29,15 +26,7 @@ typedef struct {
     int unused[3];
 } blend_layer;
 
-/* r, g, b, alpha in stored units. */
-static inline float4 blend_samples(blend_pixel p) {
-#if SAMPLES > 2
-    return convert_float4(p);
-#else
-    return convert_float2(p).xxxy;
-#endif
-}
-
+/* r, g, b, alpha in stored units of two pixels. */
 static inline float8 blend_colours(blend_pixels p) {
 #if SAMPLES > 2
     return convert_float8(p);
@@ -48,9 +37,9 @@ static inline float8 blend_colours(blend_pixels p) {
 
 static inline blend_pixels blend_stored(float8 v) {
 #if SAMPLES > 2
-    return BLEND_VECTOR(convert_, BLEND_VECTOR(PIXEL, 8))(v);
+    return PIXEL_VECTOR(convert_, PIXEL_VECTOR(PIXEL, 8))(v);
 #else
-    return BLEND_VECTOR(convert_, BLEND_VECTOR(PIXEL, 4))(v.s0347);
+    return PIXEL_VECTOR(convert_, PIXEL_VECTOR(PIXEL, 4))(v.s0347);
 #endif
 }
 
@@ -69,7 +58,7 @@ static inline int2 blend_any(float8 v) {
 }
 
 /* Where a layer's stored row lies; its rows go round. */
-static inline __global const blend_pixel *blend_line(__global const blend_pixel *stored,
+static inline __global const pixel_stored *blend_line(__global const pixel_stored *stored,
                                                      __global const blend_layer *layer, int row) {
     row += layer->turn;
     row -= row >= layer->ring ? layer->ring : 0;
@@ -77,24 +66,24 @@ static inline __global const blend_pixel *blend_line(__global const blend_pixel 
 }
 
 /* r, g, b in stored units and 1 for a valid pixel, else zeros. */
-static inline float4 blend_tap(__global const blend_pixel *stored, __global const blend_layer *layer, int2 p) {
+static inline float4 blend_tap(__global const pixel_stored *stored, __global const blend_layer *layer, int2 p) {
     const int4 place = layer->place;
     const int x = p.x - place.x, y = p.y - place.y;
     if (x < 0 || y < 0 || x >= place.z || y >= place.w)
         return (float4)(0.0f);
-    const float4 c = blend_samples(blend_line(stored, layer, y)[x]);
+    const float4 c = pixel_samples(blend_line(stored, layer, y)[x]);
     return c.w >= 0.5f * WHITE ? (float4)(c.xyz, 1.0f) : (float4)(0.0f);
 }
 
 /* The same for p and the pixel to its right. */
-static inline float8 blend_taps(__global const blend_pixel *stored, __global const blend_layer *layer, int2 p) {
+static inline float8 blend_taps(__global const pixel_stored *stored, __global const blend_layer *layer, int2 p) {
     const int4 place = layer->place;
     const int x = p.x - place.x, y = p.y - place.y;
     if (x < -1 || y < 0 || x >= place.z || y >= place.w)
         return (float8)(0.0f);
     if (x < 0 || x + 1 >= place.z)
         return (float8)(blend_tap(stored, layer, p), blend_tap(stored, layer, p + (int2)(1, 0)));
-    __global const blend_pixel *first = blend_line(stored, layer, y) + x;
+    __global const pixel_stored *first = blend_line(stored, layer, y) + x;
     float8 c = blend_colours((blend_pixels)(first[0], first[1]));
     const int2 valid = c.s37 >= 0.5f * WHITE;
     c.s37 = (float2)(1.0f);
@@ -102,7 +91,7 @@ static inline float8 blend_taps(__global const blend_pixel *stored, __global con
 }
 
 /* Four taps of two rows each, weighted; the least sample of each kind in them. */
-static inline float8 blend_rows_of_taps(__global const blend_pixel *p, __global const blend_pixel *q, float4 weights,
+static inline float8 blend_rows_of_taps(__global const pixel_stored *p, __global const pixel_stored *q, float4 weights,
                                         float8 *least) {
     const float8 a = blend_colours((blend_pixels)(p[0], q[0])), b = blend_colours((blend_pixels)(p[1], q[1]));
     const float8 c = blend_colours((blend_pixels)(p[2], q[2])), d = blend_colours((blend_pixels)(p[3], q[3]));
@@ -112,7 +101,7 @@ static inline float8 blend_rows_of_taps(__global const blend_pixel *p, __global 
 }
 
 /* Bicubic sample at position q; next to the mask's rim bilinear over the valid taps, whose share is w. */
-static float4 blend_sample(__global const blend_pixel *stored, __global const blend_layer *layer, float2 q,
+static float4 blend_sample(__global const pixel_stored *stored, __global const blend_layer *layer, float2 q,
                            int4 border, int nearest) {
     int2 corner = floor_int2(nearest ? q : q - 0.5f);
     if (nearest)
@@ -123,10 +112,10 @@ static float4 blend_sample(__global const blend_pixel *stored, __global const bl
     const int2 first = corner - 1 - place.xy;
     if (first.x >= 0 && first.y >= 0 && first.x + 3 < place.z && first.y + 3 < place.w) {
         /* nearly all samples: every tap is stored, no border rule is needed */
-        __global const blend_pixel *r0 = blend_line(stored, layer, first.y) + first.x;
-        __global const blend_pixel *r1 = blend_line(stored, layer, first.y + 1) + first.x;
-        __global const blend_pixel *r2 = blend_line(stored, layer, first.y + 2) + first.x;
-        __global const blend_pixel *r3 = blend_line(stored, layer, first.y + 3) + first.x;
+        __global const pixel_stored *r0 = blend_line(stored, layer, first.y) + first.x;
+        __global const pixel_stored *r1 = blend_line(stored, layer, first.y + 1) + first.x;
+        __global const pixel_stored *r2 = blend_line(stored, layer, first.y + 2) + first.x;
+        __global const pixel_stored *r3 = blend_line(stored, layer, first.y + 3) + first.x;
         float8 least = (float8)(WHITE);
         const float8 upper = blend_rows_of_taps(r0, r1, wx, &least), lower = blend_rows_of_taps(r2, r3, wx, &least);
         if (least.s3 >= 0.5f * WHITE && least.s7 >= 0.5f * WHITE) {
@@ -289,7 +278,7 @@ static inline float8 blend_round(float8 v, float8 thresholds, int8 dithered) {
    say and weighted as they say. The sum is of differences from a reference, the first layer's own pixel, so
    that equal colours stay equal to the bit; where nothing else is known, that is the result. */
 __kernel void blend_band(
-    __global const blend_pixel *stored, /* a ring of rows for each layer: (ring, width) */
+    __global const pixel_stored *stored, /* a ring of rows for each layer: (ring, width) */
     __global const blend_layer *layers, int count, /* those that the band may touch */
     __global const float4 *ways,         /* per layer, (band.w, way.y): displacement, weight, from blend_rows */
     __global const float4 *gains,        /* per corrected layer, (band.w, gain.y) */
@@ -302,7 +291,7 @@ __kernel void blend_band(
     float shoulder,                      /* of the exposure scale */
     int nearest,                         /* 1: nearest-neighbour sampling */
     float share,                         /* of all weight, below which a layer is hidden */
-    __global blend_pixel *out)           /* (band.w, band.z) */
+    __global pixel_stored *out)           /* (band.w, band.z) */
 {
     const int x = 2 * get_global_id(0), y = get_global_id(1);
     if (x >= band.z || y >= band.w)
@@ -387,7 +376,7 @@ __kernel void blend_band(
     if (INTEGER)
         v = blend_round(v, blend_thresholds(place.x + origin.x, place.y + origin.y), BLEND_EACH(corrected));
     const blend_pixels made = blend_stored(v);
-    __global blend_pixel *target = out + y * band.z + x;
+    __global pixel_stored *target = out + y * band.z + x;
     target[0] = made.lo;
     if (x + 1 < band.z)
         target[1] = made.hi;

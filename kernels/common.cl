@@ -96,6 +96,22 @@ static inline int grid_index(int2 p, int4 grid) {
     return grid_border(&p, grid) ? p.y * grid.x + p.x : -1;
 }
 
+#ifdef PIXEL
+/* A pixel of a layer as it is stored: SAMPLES (2 or 4) of type PIXEL, alpha last. */
+#define PIXEL_JOIN(type, n) type##n
+#define PIXEL_VECTOR(type, n) PIXEL_JOIN(type, n)
+typedef PIXEL_VECTOR(PIXEL, SAMPLES) pixel_stored;
+
+/* r, g, b, alpha in stored units. */
+static inline float4 pixel_samples(pixel_stored p) {
+#if SAMPLES > 2
+    return convert_float4(p);
+#else
+    return convert_float2(p).xxxy;
+#endif
+}
+#endif
+
 /* What a board holds. With the flows u of the four neighbours, the data term's matrix J and right-hand side b, and
    weights s of smoothness, the linear system is
        (J11 + sum s) u1 + J12 u2 = b1 + sum s u1',    J12 u1 + (J22 + sum s) u2 = b2 + sum s u2'.

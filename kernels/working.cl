@@ -2,7 +2,7 @@
 
 /* Area mean of the full-resolution pixels under each working pixel; exact integer weights, because working
    edges lie at fractions of a pixel. Valid only if every pixel under it is. */
-__kernel void working_reduce(__global const PIXEL *rows, /* (box.w, box.z, SAMPLES) */
+__kernel void working_reduce(__global const pixel_stored *rows, /* (box.w, box.z) */
                              int4 box,      /* place of `rows` in the region: left, top, width, height, px */
                              int4 ratio,    /* region width, working width, region height, working height */
                              int4 out_box,  /* place of `layer` on the working grid */
@@ -16,26 +16,25 @@ __kernel void working_reduce(__global const PIXEL *rows, /* (box.w, box.z, SAMPL
         return;
     const int x0 = (i + out_box.x) * ratio.x, x1 = x0 + ratio.x; /* edges, times working width */
     const int y0 = (j + out_box.y) * ratio.z, y1 = y0 + ratio.z;
-    float3 sum = (float3)(0.0f);
-    float total = 0.0f;
-    bool valid = true;
-    for (int y = y0 / ratio.w; y * ratio.w < y1; ++y)
-        for (int x = x0 / ratio.y; x * ratio.y < x1; ++x) {
-            const int at = box_index((int2)(x, y), box);
-            if (at < 0) {
-                valid = false;
-                continue;
-            }
-            __global const PIXEL *p = rows + (size_t)at * SAMPLES;
-            if ((float)p[SAMPLES - 1] < 0.5f * white)
-                valid = false;
-            const float w = (float)(LEAST(y1, (y + 1) * ratio.w) - GREATEST(y0, y * ratio.w)) *
-                            (float)(LEAST(x1, (x + 1) * ratio.y) - GREATEST(x0, x * ratio.y));
-            sum += w * (float3)(p[0], p[SAMPLES > 2 ? 1 : 0], p[SAMPLES > 2 ? 2 : 0]);
+    const int left = x0 / ratio.y - box.x, right = (x1 - 1) / ratio.y - box.x;
+    const int top = y0 / ratio.w - box.y, bottom = (y1 - 1) / ratio.w - box.y;
+    bool valid = left >= 0 && top >= 0 && right < box.z && bottom < box.w;
+    float4 sum = (float4)(0.0f);
+    float total = 0.0f, least = white;
+    for (int y = top; y <= bottom && valid; ++y) {
+        const float down = LEAST(y1, (y + box.y + 1) * ratio.w) - GREATEST(y0, (y + box.y) * ratio.w);
+        for (int x = left; x <= right; ++x) {
+            const float4 c = pixel_samples(rows[y * box.z + x]);
+            const float across = LEAST(x1, (x + box.x + 1) * ratio.y) - GREATEST(x0, (x + box.x) * ratio.y);
+            const float w = down * across;
+            sum += w * c;
             total += w;
+            least = LEAST(c.w, least);
         }
+        valid = least >= 0.5f * white;
+    }
     const float scale = 1.0f / (white * total);
-    layer[j * out_box.z + i] = valid ? (float4)(sum * scale, 1.0f) : (float4)(0.0f);
+    layer[j * out_box.z + i] = valid ? (float4)(sum.xyz * scale, 1.0f) : (float4)(0.0f);
 }
 
 /* Raise `differs` if two layers show different colours on a working pixel that both cover. */

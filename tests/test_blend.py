@@ -294,10 +294,10 @@ def test_layers_that_no_band_needs_together_share_memory() -> None:
         assert all(shelves.rings[k].rows >= band[k][1] - band[k][0] for k in used)
 
 
-@pytest.mark.parametrize("far", [0.0, 9.0])
-def test_a_band_reads_only_rows_that_it_needs(device: Device, far: float) -> None:
+@pytest.mark.parametrize(("far", "strip"), [(0.0, 1), (9.0, 1), (9.0, 16)])
+def test_a_band_reads_only_rows_that_it_needs(device: Device, far: float, strip: int) -> None:
     """Memory grows with the band, not with the picture; and no row is read twice, where one band reaches far
-    back either."""
+    back either. Where a file decodes strips, whole ones are asked for."""
     full = plane(77, 300)
     grid = full.resized(39, 150)
     pixels = stored_pixels(14, 77, 300, np.uint8, 3, 1)
@@ -308,11 +308,12 @@ def test_a_band_reads_only_rows_that_it_needs(device: Device, far: float) -> Non
     layer = blend_layer(device, pixels, 0, 0, full, grid, field)
     watched = Layer(
         "w", layer.layer.box, np.dtype(np.uint8), 3,
-        lambda top, bottom: (asked.append((top, bottom)), pixels[top:bottom])[1],
+        lambda top, bottom: (asked.append((top, bottom)), pixels[top:bottom])[1], strip=strip,
     )  # fmt: skip
     layers = [replace(layer, layer=watched)] * 2
     assert np.array_equal(merged(device, layers, full, grid, rows=10), pixels) == (far == 0)
-    assert max(bottom - top for top, bottom in asked) <= 10 + 2 * (3 + 2 * far)
+    assert max(bottom - top for top, bottom in asked) <= 10 + 2 * (3 + 2 * far) + strip - 1
+    assert all(top % strip == 0 for top, _ in asked)
     rows = [row for top, bottom in asked for row in range(top, bottom)]
     assert sorted(rows) == sorted([*range(300)] * 2)
 
