@@ -279,7 +279,12 @@ class _Solver:
     """
 
     # a grid's factors are too sparse for SuperLU's own choice of supernodes and panels: it takes half as long again
-    _OPTIONS: Final = {"diag_pivot_thresh": 0, "relax": 1, "panel_size": 4, "options": {"SymmetricMode": True}}
+    _OPTIONS: Final = {
+        "diag_pivot_thresh": 0,
+        "relax": 1,
+        "panel_size": 4,
+        "options": {"SymmetricMode": True},
+    }
 
     def __init__(self) -> None:
         self._order: npt.NDArray[np.intp] | None = None
