@@ -23,8 +23,7 @@ from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
-from scipy.sparse import csr_array, diags_array
-from scipy.sparse.linalg import splu
+import scipy
 
 from hugin_abflow.coefficient import on_cells
 from hugin_abflow.geometry import Pair
@@ -256,7 +255,7 @@ def solve(measured: Measured, rounds: Sequence[tuple[float, float]] = _ROUNDS) -
     )
     difference = np.concatenate([d.values[e > 0, :3] for d, e in zip(differences, evidence, strict=True)])
     bounds = _Bounds(measured, number, area, count)
-    smooth = step.T @ diags_array(stiffness) @ step
+    smooth = step.T @ scipy.sparse.diags_array(stiffness) @ step
     round_ = cells.circumference / (cells.lens[1] or 1.0)  # cells
     solution, solver = np.zeros((count, 3)), _Solver()
     for data, limit in rounds:
@@ -265,7 +264,9 @@ def solve(measured: Measured, rounds: Sequence[tuple[float, float]] = _ROUNDS) -
         off = link @ solution + difference if solution.any() else np.zeros_like(difference)
         trusted = data * weight * _biweight(off, limit)
         held, pull = bounds.active(solution, limit)
-        matrix = diags_array(hold + held) + smooth + link.T @ diags_array(trusted) @ link
+        matrix = (
+            scipy.sparse.diags_array(hold + held) + smooth + link.T @ scipy.sparse.diags_array(trusted) @ link
+        )
         wanted = pull - link.T @ (trusted[:, None] * difference)
         solution = solver.solve(matrix, wanted)
     result = np.zeros((*inside.shape, 3))
@@ -278,7 +279,7 @@ class _Solver:
     unknowns are best eliminated serves the others as well. No factors are kept; they are large.
     """
 
-    # a grid's factors are too sparse for SuperLU's own choice of supernodes and panels: it takes half as long again
+    # SuperLU's own supernodes and panels are for factors that are less sparse than a grid's
     _OPTIONS: Final = {
         "diag_pivot_thresh": 0,
         "relax": 1,
@@ -289,8 +290,12 @@ class _Solver:
     def __init__(self) -> None:
         self._order: npt.NDArray[np.intp] | None = None
 
-    def solve(self, matrix: csr_array, wanted: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+    def solve(
+        self, matrix: scipy.sparse.csr_array, wanted: npt.NDArray[np.float64]
+    ) -> npt.NDArray[np.float64]:
         """x (n, k) of matrix (n, n) @ x = wanted."""
+        from scipy.sparse.linalg import splu  # SciPy's parts load when they are needed
+
         if self._order is None:
             factors = splu(matrix.tocsc(), "MMD_AT_PLUS_A", **self._OPTIONS)
             self._order = np.argsort(factors.perm_c)
@@ -336,7 +341,7 @@ def _biweight(off: npt.NDArray[np.float64], limit: float) -> npt.NDArray[np.floa
 
 def _steps(
     weighted: Sequence[tuple[npt.NDArray[np.intp], npt.NDArray[np.intp], npt.NDArray[np.float64]]], count: int
-) -> tuple[csr_array, npt.NDArray[np.float64]]:
+) -> tuple[scipy.sparse.csr_array, npt.NDArray[np.float64]]:
     """A matrix (n, count) that takes differences of `count` unknowns, and the weights (n,) of these.
 
     weighted    arrays of one shape: the unknown to take, the one to subtract, the weight; 0: no row.
@@ -345,7 +350,7 @@ def _steps(
     rows = np.arange(weights.size)
     signs = np.repeat([1.0, -1.0], rows.size)
     places = np.tile(rows, 2), np.concatenate([taken, less])
-    return csr_array((signs, places), shape=(rows.size, count)), weights
+    return scipy.sparse.csr_array((signs, places), shape=(rows.size, count)), weights
 
 
 def _extend(

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import importlib
 import logging
 import threading
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import combinations
@@ -35,7 +37,7 @@ from hugin_abflow import (
 from hugin_abflow.blend import BlendLayer
 from hugin_abflow.coefficient import Masks
 from hugin_abflow.colour import Correction
-from hugin_abflow.errors import SettingsError
+from hugin_abflow.errors import DeviceError, SettingsError
 from hugin_abflow.geometry import Pair, PairFlow
 from hugin_abflow.guides import Guide, by_pair
 from hugin_abflow.layer import Canvas, Layer
@@ -131,6 +133,7 @@ def prepare(
     """Everything that sees far, at working resolution: flow, coefficients, geometry, colour."""
     full = working.full_grid(canvas, layers)
     grid = working.working_grid(full, settings)
+    threading.Thread(target=_make_ready, args=(device, settings), name="loader").start()
     everything = _read(device, layers, grid, progress, settings.cores)
     masks = coefficient.masks(device, everything, grid)
     used = [i for i in range(len(everything)) if not _redundant(i, everything, masks)]
@@ -160,6 +163,16 @@ def prepare(
         advance(1)
     final += [_unblended(device, everything[i]) for i in range(len(everything)) if i not in used]
     return Prepared(tuple(final), full, grid, correction.grid, correction.shoulder)
+
+
+def _make_ready(device: Device, settings: Settings) -> None:
+    """Load and build what comes after reading, meanwhile: it takes most of a second on one core."""
+    of_flow = ("chart", "pyramid", "flow", "search", "consistency", "transition") if settings.flow else ()
+    with suppress(DeviceError):  # told where the kernel is needed
+        for module in ("coefficient", *of_flow, "highlights", "geometry", "colour", "seam"):
+            device.build(module)
+    for module in ("scipy.ndimage", "scipy.sparse.csgraph", "scipy.sparse.linalg"):
+        importlib.import_module(module)
 
 
 def _align(

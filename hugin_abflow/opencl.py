@@ -37,7 +37,6 @@ _INSTALL = {
     "darwin": "use a macOS with Apple's OpenCL, or install pocl from conda-forge",
 }
 
-
 # Where the ICD loader looks for drivers, and which devices PoCL offers: a wrong one hides them all.
 _HIDING = ("OCL_ICD_VENDORS", "POCL_DEVICES")
 
@@ -286,7 +285,8 @@ class Device:
         self._times = _Times(self.queue) if timing else None
         self.buffers: WeakSet[Buffer] = WeakSet()
         self.spare = Spare()
-        self._kernels: dict[tuple[str, str, str], cl.Kernel] = {}
+        self._kernels: dict[tuple[str, str], dict[str, cl.Kernel]] = {}
+        self._building = threading.Lock()
         self._repeated: dict[tuple[str, str, str], list[cl.Kernel]] = {}
         self._arguments = threading.Lock()  # a kernel keeps its arguments from when they are set to its start
         _log.info("device: %s", self.name)
@@ -328,21 +328,27 @@ class Device:
 
     def kernel(self, module: str, name: str, options: str = "") -> cl.Kernel:
         """Kernel `name` of ``kernels/<module>.cl``, built once per set of options."""
-        key = (module, name, options)
-        if key not in self._kernels:
-            try:
-                with warnings.catch_warnings():  # compilers chat; errors come with the exception
-                    warnings.simplefilter("ignore", cl.CompilerWarning)
-                    program = cl.Program(self.context, kernel_source(module))
-                    program.build(["-cl-std=CL1.2", *options.split()])
-            except cl.Error as error:
-                raise DeviceError(
-                    f"kernels/{module}.cl does not build on {self.device.name.strip()}: {error}; "
-                    "update the OpenCL driver or choose another --device"
-                ) from error
-            for found in program.all_kernels():
-                self._kernels[(module, found.function_name, options)] = found
-        return self._kernels[key]
+        return self.build(module, options)[name]
+
+    def build(self, module: str, options: str = "") -> dict[str, cl.Kernel]:
+        """The kernels of ``kernels/<module>.cl`` by name, built if they are not yet. For any thread."""
+        with self._building:
+            if (module, options) not in self._kernels:
+                self._kernels[module, options] = self._build(module, options)
+            return self._kernels[module, options]
+
+    def _build(self, module: str, options: str) -> dict[str, cl.Kernel]:
+        try:
+            with warnings.catch_warnings():  # compilers chat; errors come with the exception
+                warnings.simplefilter("ignore", cl.CompilerWarning)
+                program = cl.Program(self.context, kernel_source(module))
+                program.build(["-cl-std=CL1.2", *options.split()])
+        except cl.Error as error:
+            raise DeviceError(
+                f"kernels/{module}.cl does not build on {self.device.name.strip()}: {error}; "
+                "update the OpenCL driver or choose another --device"
+            ) from error
+        return {kernel.function_name: kernel for kernel in program.all_kernels()}
 
     def run(
         self,

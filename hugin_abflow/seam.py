@@ -27,9 +27,7 @@ from typing import Any
 import cv2
 import numpy as np
 import numpy.typing as npt
-from scipy import ndimage
-from scipy.sparse import csr_array
-from scipy.sparse.csgraph import breadth_first_order, maximum_flow
+import scipy
 
 from hugin_abflow.coefficient import Masks, on_cells
 from hugin_abflow.colour import Correction, clipping
@@ -165,8 +163,8 @@ def _owners(
 def _beside_cuts(owner: npt.NDArray[np.intp], wraps: bool) -> npt.NDArray[np.bool_]:
     """Cells around which the owner changes."""
     size, modes = 2 * _BESIDE + 1, ("nearest", "wrap" if wraps else "nearest")
-    highest = ndimage.maximum_filter(owner, size, mode=modes)
-    lowest = ndimage.minimum_filter(np.where(owner < 0, owner.max() + 1, owner), size, mode=modes)
+    highest = scipy.ndimage.maximum_filter(owner, size, mode=modes)
+    lowest = scipy.ndimage.minimum_filter(np.where(owner < 0, owner.max() + 1, owner), size, mode=modes)
     return np.asarray(lowest < highest)
 
 
@@ -216,7 +214,7 @@ def _difference(
 def _smooth(values: npt.NDArray[np.float64], wraps: bool) -> npt.NDArray[np.float64]:
     """A Gaussian of _SIGMA cells, not normalised at the borders."""
     modes = ("constant", "wrap" if wraps else "constant", "constant")
-    return np.asarray(ndimage.gaussian_filter(values, (_SIGMA, _SIGMA, 0), mode=modes, truncate=3))
+    return np.asarray(scipy.ndimage.gaussian_filter(values, (_SIGMA, _SIGMA, 0), mode=modes, truncate=3))
 
 
 def _padded(values: npt.NDArray[Any], by: int, wraps: bool) -> npt.NDArray[Any]:
@@ -324,11 +322,11 @@ def _expand(
     ends = np.concatenate([second, each, np.full(count, sink)])
     capacities = np.concatenate([edge, np.maximum(take, 0), np.maximum(-take, 0)])
     whole = np.minimum(np.rint(capacities * _UNIT), 2**30 - 1).astype(np.int32)
-    graph = csr_array((whole, (starts, ends)), shape=(count + 2, count + 2))
-    left = graph - maximum_flow(graph, source, sink).flow
+    graph = scipy.sparse.csr_array((whole, (starts, ends)), shape=(count + 2, count + 2))
+    left = graph - scipy.sparse.csgraph.maximum_flow(graph, source, sink).flow
     left.data = np.maximum(left.data, 0)
     left.eliminate_zeros()
-    keeps = breadth_first_order(left, source, return_predecessors=False)
+    keeps = scipy.sparse.csgraph.breadth_first_order(left, source, return_predecessors=False)
     takes = np.ones(count + 2, bool)
     takes[keeps] = False
     return np.where(takes[:count], alpha, current)
@@ -350,4 +348,4 @@ def _at_centres(
 def _soften(mask: npt.NDArray[np.float32], wraps: bool) -> npt.NDArray[np.float32]:
     """Blur a mask's outline over a cell to each side."""
     modes = ("nearest", "wrap" if wraps else "nearest")  # "nearest": nothing yields less at a pole
-    return np.ascontiguousarray(ndimage.uniform_filter(mask, 3, mode=modes))
+    return np.ascontiguousarray(scipy.ndimage.uniform_filter(mask, 3, mode=modes))

@@ -17,7 +17,7 @@ from collections.abc import Sequence
 
 import numpy as np
 import numpy.typing as npt
-from scipy import ndimage
+import scipy
 
 from hugin_abflow import geometry
 from hugin_abflow.coefficient import Coefficients
@@ -92,4 +92,4 @@ def exponent(
 def _smooth(values: npt.NDArray[np.float64], wraps: bool) -> npt.NDArray[np.float64]:
     """A Gaussian of _SIGMA cells, not normalised at the borders."""
     modes = ("constant", "wrap" if wraps else "constant", "constant")
-    return np.asarray(ndimage.gaussian_filter(values, (_SIGMA, _SIGMA, 0), mode=modes))
+    return np.asarray(scipy.ndimage.gaussian_filter(values, (_SIGMA, _SIGMA, 0), mode=modes))

@@ -246,6 +246,14 @@ def test_verbose_says_what_is_merged(folder: Path, capsys: pytest.CaptureFixture
     assert lines[len(expected) + 1] == "read ..."
 
 
+def test_interruption_while_modules_load_is_no_traceback(tmp_path: Path) -> None:
+    (tmp_path / "click.py").write_text("raise KeyboardInterrupt")
+    command = [sys.executable, "-m", "hugin_abflow", "--version"]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=60)
+    assert done.returncode == ExitCode.INTERRUPTED
+    assert (done.stdout, done.stderr) == ("", "hugin-abflow: interrupted\n")
+
+
 @pytest.mark.skipif(os.name == "nt", reason="Windows has no such signals")
 @pytest.mark.parametrize(
     ("number", "line", "jobs"), [(signal.SIGINT, 1, 1), (signal.SIGTERM, 8, 1), (signal.SIGTERM, 12, 3)]

@@ -46,7 +46,7 @@ def test_wheel_has_the_commands(wheel: Path) -> None:
     archive = zipfile.ZipFile(wheel)
     (points,) = (name for name in archive.namelist() if name.endswith("entry_points.txt"))
     expected = [f"{name} = {target}" for name, target in PROJECT["scripts"].items()]
-    assert expected[0] == "hugin-abflow = hugin_abflow.cli:main"
+    assert expected[0] == "hugin-abflow = hugin_abflow.__main__:main"
     assert archive.read(points).decode().splitlines()[1:] == sorted(expected)
     for target in PROJECT["scripts"].values():
         module, function = target.split(":")
