@@ -241,8 +241,9 @@ def _rows_needed(layer: BlendLayer, full: Grid, part: Box, scale: float) -> Span
     first, last = (row - layer.box[1] for row in _coarse_rows(layer.box, part, scale))
     beyond = math.ceil(max(layer.reach[first:last]) * scale) + 3  # 3: bicubic taps, rounding
     start, end = max(0, part.top - beyond - offset), min(box.height, part.bottom + beyond - offset)
-    strip = layer.layer.strip  # whole ones, unless they are large: a part would be decoded, cut and joined again
-    return start, min(box.height, end + (-end % strip if strip <= _STRIP_ROWS else 0))
+    # whole strips, unless they are large: parts would have to be cut and joined again
+    strip = layer.layer.strip if layer.layer.strip <= _STRIP_ROWS else 1
+    return start, min(box.height, end + -end % strip)
 
 
 def _plan(layers: Sequence[BlendLayer], full: Grid, grid: Grid, crop: Box, height: int) -> list[_Band]:
