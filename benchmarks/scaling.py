@@ -4,6 +4,9 @@ The layers of `speed.py` are enlarged or reduced, strip by strip, to canvases of
 as high) and blended. Wall time, CPU time (user + system) and peak memory are medians; the table is Markdown,
 the plot `scaling.svg` shows time per megapixel and peak memory. Enlarged layers are smoother than photos of
 that size, so they take less time to decode and encode. They are kept in --cache: 36,000 px take 2 GB.
+
+With --tall two cylinders of 9,000 px are blended instead, with the same layers, whose rows the second has
+twice: how much does peak memory grow with height alone?
 """
 
 from __future__ import annotations
@@ -74,6 +77,33 @@ def make_set(cache: Path, width: int) -> Path:
     return folder
 
 
+def repeat_rows(source: Path, target: Path, times: int) -> None:
+    """Write a layer with each row so many times; its place is moved alike."""
+    layer = read_layer(source)
+    box = layer.box
+    with ImageWriter(
+        target, box.width, box.height * times, 3, np.uint8, offset=(box.left, box.top * times)
+    ) as writer:
+        for first in range(0, box.height, STRIP):
+            rows = layer.read(first, min(first + STRIP, box.height))
+            writer.write_rows(np.repeat(rows, times, axis=0))
+
+
+def make_tall_set(cache: Path, times: int) -> Path:
+    """The folder with layers and project for a cylinder `times` as high as the base's canvas."""
+    base, folder = cache / f"speed-{BASE}", cache / f"tall-{times}"
+    make_layers(base, BASE)
+    if not (folder / "project.pto").exists():
+        folder.mkdir(parents=True, exist_ok=True)
+        for source in sorted(base.glob("layer[0-9]*.tif")):
+            print(f"{times} times as high: {source.name}", file=sys.stderr)
+            repeat_rows(source, folder / source.name, times)
+        text = (base / "project.pto").read_text(encoding="utf-8")
+        sphere, cylinder = f"p f2 w{BASE} h{BASE // 2} ", f"p f1 w{BASE} h{BASE // 2 * times} "
+        (folder / "project.pto").write_text(text.replace(sphere, cylinder), encoding="utf-8")
+    return folder
+
+
 def blend(folder: Path, options: list[str]) -> Run:
     """One run of hugin-abflow; its panorama is not kept."""
     out = folder / "result-scaling.tif"
@@ -81,6 +111,22 @@ def blend(folder: Path, options: list[str]) -> Run:
     run = measure([sys.executable, "-m", "hugin_abflow", *arguments])
     out.unlink()
     return run
+
+
+def median(runs: list[Run]) -> Run:
+    """Of each figure by itself."""
+    return Run(*(statistics.median(getattr(run, key) for run in runs) for key in ("wall", "cpu", "peak")))
+
+
+def tall_table(runs: dict[int, Run]) -> str:
+    """One line for each height, as a multiple of the base's."""
+    lines = ["| canvas | wall s | CPU s | peak MiB | peak ratio |", "|---|---|---|---|---|"]
+    for times, run in sorted(runs.items()):
+        lines.append(
+            f"| {BASE}x{BASE // 2 * times} | {run.wall:.1f} | {run.cpu:.1f} | {run.peak:.0f} "
+            f"| {run.peak / runs[1].peak:.2f} |"
+        )
+    return "\n".join(lines)
 
 
 def table(runs: dict[int, Run]) -> str:
@@ -130,6 +176,7 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--widths", type=int, nargs="+", default=[4500, 9000, 18000, 36000])
+    parser.add_argument("--tall", action="store_true", help="a cylinder, and one twice as high, instead")
     parser.add_argument("--runs", type=int, default=1, help="of each width")
     parser.add_argument("--max-memory", metavar="SIZE", help="of hugin-abflow")
     parser.add_argument("--plot", type=Path, default=ROOT / "benchmarks" / "scaling.svg")
@@ -139,16 +186,20 @@ def main() -> None:
     for width in options.widths:
         if width != BASE // 2 and width % BASE:
             raise SystemExit(f"{width} is neither half of {BASE} nor a multiple of it")
-    folders = {width: make_set(options.cache, width) for width in options.widths}
+    make, sizes = (make_tall_set, [1, 2]) if options.tall else (make_set, options.widths)
+    folders = {size: make(options.cache, size) for size in sizes}
     if options.only_layers:
         return
     limit = ["--max-memory", options.max_memory] if options.max_memory else []
-    runs = {}
-    for width, folder in folders.items():
-        done = [blend(folder, limit) for _ in range(options.runs)]
-        middle = [statistics.median(getattr(run, key) for run in done) for key in ("wall", "cpu", "peak")]
-        runs[width] = Run(*middle)
-        print(f"{width} px: {runs[width]}", file=sys.stderr)
+    done: dict[int, list[Run]] = {size: [] for size in sizes}
+    for _ in range(options.runs):
+        for size, folder in folders.items():
+            done[size].append(blend(folder, limit))
+            print(f"{folder.name}: {done[size][-1]}", file=sys.stderr)
+    runs = {size: median(its_runs) for size, its_runs in done.items()}
+    if options.tall:
+        print(tall_table(runs))
+        return
     print(table(runs))
     plot(runs, options.plot)
 

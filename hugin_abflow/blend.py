@@ -174,10 +174,9 @@ def _bands(
             for k, (layer, (start, end)) in enumerate(zip(layers, band.rows, strict=True)):
                 box, ring = layer.layer.box, store.shelves.rings[k]
                 table[k, :4] = box.left - region.left, box.top - region.top + start, box.width, end - start
-                table[k, 4:8] = layer.box[0], layer.box[2], whole[0], whole[2]
-                table[k, 8:10] = ring.start, way_starts[k]
-                table[k, 10] = -1 if layer.gain is None else gain_starts.pop(0)
-                table[k, 11:13] = ring.rows, start % ring.rows
+                table[k, 4:8] = layer.box[0], layer.box[2], ring.start, way_starts[k]
+                table[k, 8] = -1 if layer.gain is None else gain_starts.pop(0)
+                table[k, 9:11] = ring.rows, start % ring.rows
             used = [k for k, (start, end) in enumerate(band.rows) if start < end]
             latitudes = _turn(device, full.lens[2], -full.lens[3], part.top, part.height)
             out = device.empty((part.height, part.width, first.channels + 1), device_dtype(first))

@@ -20,10 +20,10 @@ typedef PIXEL_VECTOR(PIXEL, BLEND_TWO) blend_pixels; /* two as stored */
 /* One layer as a band needs it: 64 bytes, made by hugin_abflow/blend.py. */
 typedef struct {
     int4 place;     /* of its stored rows: left, top, width, height */
-    int2 way, gain; /* left, width of its field, on the working grid, and of its gain, on the colour grid */
+    int2 way;       /* left, width of its field on the working grid */
     int rows, ways, gains; /* where it begins in `stored`, `ways` and `gains`; gains -1: no correction */
     int ring, turn; /* rows lie in a ring of so many, the first one there */
-    int unused[3];
+    int unused[5];
 } blend_layer;
 
 /* r, g, b, alpha in stored units of two pixels. */
@@ -91,8 +91,8 @@ static inline float8 blend_taps(__global const pixel_stored *stored, __global co
 }
 
 /* Four taps of two rows each, weighted; the least sample of each kind in them. */
-static inline float8 blend_rows_of_taps(__global const pixel_stored *p, __global const pixel_stored *q, float4 weights,
-                                        float8 *least) {
+static inline float8 blend_across(__global const pixel_stored *p, __global const pixel_stored *q, float4 weights,
+                                  float8 *least) {
     const float8 a = blend_colours((blend_pixels)(p[0], q[0])), b = blend_colours((blend_pixels)(p[1], q[1]));
     const float8 c = blend_colours((blend_pixels)(p[2], q[2])), d = blend_colours((blend_pixels)(p[3], q[3]));
     const float8 low = LEAST(LEAST(a, b), LEAST(c, d));
@@ -117,7 +117,7 @@ static float4 blend_sample(__global const pixel_stored *stored, __global const b
         __global const pixel_stored *r2 = blend_line(stored, layer, first.y + 2) + first.x;
         __global const pixel_stored *r3 = blend_line(stored, layer, first.y + 3) + first.x;
         float8 least = (float8)(WHITE);
-        const float8 upper = blend_rows_of_taps(r0, r1, wx, &least), lower = blend_rows_of_taps(r2, r3, wx, &least);
+        const float8 upper = blend_across(r0, r1, wx, &least), lower = blend_across(r2, r3, wx, &least);
         if (least.s3 >= 0.5f * WHITE && least.s7 >= 0.5f * WHITE) {
             float4 sum = wy.x * upper.lo;
             sum += wy.y * upper.hi;
@@ -186,42 +186,55 @@ __kernel void blend_rows(__global const float4 *values, /* arrays one after the 
     }
 }
 
-/* Where the columns of a coarse grid lie that two positions read, and how far between them. */
+/* Which columns of a coarse line two positions lie between, and how far. */
 typedef struct {
-    int2 left;
+    int2 left, right;
     float2 t;
 } blend_between;
 
+/* The columns of a whole grid. */
 static inline blend_between blend_columns(float2 q) {
     const float2 p = q - 0.5f;
-    blend_between at = {convert_int2(p), p};
-    at.left += p < convert_float2(at.left); /* true is -1 */
-    at.t = p - convert_float2(at.left);
+    int2 left = convert_int2(p);
+    left += p < convert_float2(left); /* true is -1 */
+    const blend_between at = {left, left + 1, p - convert_float2(left)};
     return at;
 }
 
-/* Linear reading of a line of such values, the grid's columns from span.x on, span.y of them. */
-static inline float8 blend_read(__global const float4 *line, int2 span, blend_between at, int4 border) {
-    int2 left = at.left - span.x, right = left + 1;
+/* The same in a line of the columns from span.x on, span.y of them. */
+static inline blend_between blend_within(blend_between at, int2 span, int4 border) {
+    at.left -= span.x;
+    at.right -= span.x;
     if (border.z && span.y == border.x) {
-        left += left < 0 ? border.x : 0;
-        right -= right >= border.x ? border.x : 0;
+        at.left += at.left < 0 ? border.x : 0;
+        at.right -= at.right >= border.x ? border.x : 0;
     }
-    left = LIMITED(left, 0, span.y - 1);
-    right = LIMITED(right, 0, span.y - 1);
-    const float8 a = (float8)(line[left.x], line[left.y]), b = (float8)(line[right.x], line[right.y]);
+    at.left = LIMITED(at.left, 0, span.y - 1);
+    at.right = LIMITED(at.right, 0, span.y - 1);
+    return at;
+}
+
+/* Linear reading of a line of values. */
+static inline float8 blend_read(__global const float4 *line, blend_between at) {
+    const float8 a = (float8)(line[at.left.x], line[at.left.y]), b = (float8)(line[at.right.x], line[at.right.y]);
     return a + BLEND_EACH(at.t) * (b - a);
 }
 
-/* Smooth exposure correction of colours in stored units; `gained`: where there is one. */
-static inline float8 blend_correct(float8 c, __global const float4 *gains, __global const blend_layer *layer, int y,
-                                    blend_between at, int4 border, float shoulder, int2 *gained) {
-    *gained = (int2)(0);
-    if (layer->gains < 0)
-        return c;
-    const float8 gain = blend_read(gains + layer->gains + y * layer->gain.y, layer->gain, at, border);
-    *gained = blend_any(gain);
-    return exposure_raise8(c, exponential8(gain) - 1.0f, WHITE, shoulder);
+/* Smooth exposure correction of two pixels: what odds are multiplied by, less 1; where there is one. */
+typedef struct {
+    float8 rise;
+    int2 some;
+} blend_exposure;
+
+static inline blend_exposure blend_gain(__global const float4 *gains, __global const blend_layer *layer, int row,
+                                        blend_between cell) {
+    blend_exposure result = {(float8)(0.0f), (int2)(0)};
+    if (layer->gains >= 0) {
+        const float8 gain = blend_read(gains + layer->gains + row, cell);
+        result.rise = exponential8(gain) - 1.0f;
+        result.some = blend_any(gain);
+    }
+    return result;
 }
 
 /* atan2 of positive x; a few terms of the series do where angles are small, as they nearly always are. */
@@ -281,12 +294,12 @@ __kernel void blend_band(
     __global const pixel_stored *stored, /* a ring of rows for each layer: (ring, width) */
     __global const blend_layer *layers, int count, /* those that the band may touch */
     __global const float4 *ways,         /* per layer, (band.w, way.y): displacement, weight, from blend_rows */
-    __global const float4 *gains,        /* per corrected layer, (band.w, gain.y) */
+    __global const float4 *gains,        /* per corrected layer, (band.w, gain_border.x) */
     __global const float2 *columns,      /* (band.z) sine and cosine of longitude; plane: not used */
     __global const float2 *lines,        /* (band.w) sine and cosine of latitude; plane: not used */
     int4 border, float4 lens,            /* full-resolution grid of the region */
     int4 field_border, int4 gain_border, /* working grid; colour grid */
-    int4 band,                           /* the band's place: left, top, width, height; run size: pairs of columns, rows */
+    int4 band,                           /* its place: left, top, width, height; run size: pairs of columns, rows */
     int2 origin,                         /* the region's place on the canvas */
     float shoulder,                      /* of the exposure scale */
     int nearest,                         /* 1: nearest-neighbour sampling */
@@ -300,10 +313,13 @@ __kernel void blend_band(
     const float2 px = convert_float2(place.x + (int2)(0, 1)) + 0.5f;
     const float py = place.y + 0.5f;
     const float2 scale = (float2)((float)border.x / field_border.x, (float)border.y / field_border.y);
-    const blend_between cell = blend_columns(px * ((float)gain_border.x / border.x));
+    const blend_between cell =
+        blend_within(blend_columns(px * ((float)gain_border.x / border.x)), (int2)(0, gain_border.x), gain_border);
+    const int row = y * gain_border.x;
 
     int first = count;
-    int2 known = (int2)(0), several = (int2)(0), corrected = (int2)(0), gained;
+    blend_exposure exposure, first_exposure;
+    int2 known = (int2)(0), several = (int2)(0), corrected = (int2)(0);
     float8 reference = (float8)(0.0f);
     for (int k = 0; k < count && blend_some(!several); ++k) {
         float8 own = blend_taps(stored, layers + k, place);
@@ -312,9 +328,13 @@ __kernel void blend_band(
         known |= seen;
         if (!blend_some(fresh))
             continue;
-        first = LEAST(first, k);
-        own = blend_correct(own, gains, layers + k, y, cell, gain_border, shoulder, &gained);
-        corrected |= fresh & gained;
+        exposure = blend_gain(gains, layers + k, row, cell);
+        if (first == count) {
+            first = k;
+            first_exposure = exposure;
+        }
+        own = exposure_raise8(own, exposure.rise, WHITE, shoulder);
+        corrected |= fresh & exposure.some;
         reference = BLEND_EACH(fresh) ? own : reference;
     }
     float8 sum = (float8)(0.0f);
@@ -341,7 +361,7 @@ __kernel void blend_band(
                 if (!blend_some(seen))
                     continue;
                 __global const float4 *line = ways + layers[k].ways + y * layers[k].way.y;
-                const float8 way = blend_read(line, layers[k].way, column, field_border);
+                const float8 way = blend_read(line, blend_within(column, layers[k].way, field_border));
                 float2 w = way.s37 + hidden;
                 seen &= w > 0.0f;
                 if (!blend_some(seen))
@@ -359,8 +379,9 @@ __kernel void blend_band(
                 }
                 /* a sample that falls outside its layer counts smoothly less */
                 w *= c.s37 * c.s37;
-                c = blend_correct(c, gains, layers + k, y, cell, gain_border, shoulder, &gained);
-                corrected |= gained & (w > 0.0f);
+                exposure = k == first ? first_exposure : blend_gain(gains, layers + k, row, cell);
+                c = exposure_raise8(c, exposure.rise, WHITE, shoulder);
+                corrected |= exposure.some & (w > 0.0f);
                 float8 part = (c - reference) * BLEND_EACH(w);
                 part.s37 = w;
                 all += part;

@@ -260,6 +260,18 @@ def test_layers_of_other_sizes_show_the_same(tmp_path: Path, factor: float) -> N
     assert set(np.unique(pixels[..., 3])) == {0, 255}
 
 
+def test_taller_layers_have_each_row_twice(tmp_path: Path) -> None:
+    """More rows than are read at a time; the peak is compared with that of the first."""
+    picture = np.random.default_rng(3).integers(0, 256, (150, 21, 4), np.uint8)
+    write_image(tmp_path / "base.tif", picture, offset=(7, 13))
+    scaling.repeat_rows(tmp_path / "base.tif", tmp_path / "tall.tif", 2)
+    made = read_layer(tmp_path / "tall.tif")
+    assert (made.box.left, made.box.top) == (7, 26)
+    assert np.array_equal(made.read(0, 300), np.repeat(picture, 2, axis=0))
+    table = scaling.tall_table({1: Run(10, 12, 500), 2: Run(20, 24, 525)})
+    assert "| 9000x9000 | 20.0 | 24.0 | 525 | 1.05 |" in table
+
+
 def test_the_plot_of_growth_is_an_svg_and_always_the_same(tmp_path: Path) -> None:
     pytest.importorskip("matplotlib", reason="only the benchmark needs it")
     runs = {4500: Run(10, 12, 500), 9000: Run(20, 30, 600)}

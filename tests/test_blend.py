@@ -151,13 +151,12 @@ def test_a_band_of_three_layers_equals_its_twin(
     table = np.zeros((3, 16), np.int32)
     table[:, :4] = places
     table[:, 4:6] = [(box[0], box[2]) for box in boxes]
-    table[:, 6:8] = 0, 7
-    table[:, 9] = np.cumsum([0, *(box[2] * band[3] for box in boxes)])[:3]
-    table[:, 10] = -1, 0, 7 * band[3]
+    table[:, 7] = np.cumsum([0, *(box[2] * band[3] for box in boxes)])[:3]
+    table[:, 8] = -1, 0, 7 * band[3]
     # rings of as many rows as there are, or more; they begin anywhere
     rings, turns = [p[3] + spare for p, spare in zip(places, (0, 3, 1), strict=True)], (0, 30, 17)
-    table[:, 8] = np.cumsum([0, *(p[2] * ring for p, ring in zip(places, rings, strict=True))])[:3]
-    table[:, 11:13] = list(zip(rings, turns, strict=True))
+    table[:, 6] = np.cumsum([0, *(p[2] * ring for p, ring in zip(places, rings, strict=True))])[:3]
+    table[:, 9:11] = list(zip(rings, turns, strict=True))
     turned = [
         np.roll(np.pad(rows, ((0, ring - len(rows)), (0, 0), (0, 0))), turn, 0)
         for rows, ring, turn in zip(stored, rings, turns, strict=True)
@@ -171,8 +170,8 @@ def test_a_band_of_three_layers_equals_its_twin(
     ]
     rows, lines, factors = (device.upload(a) for a in packed)
     device.run(
-        "blend", "blend_band", band[2:], rows, device.upload(table), 3, lines, factors, *axes,
-        full.border, full.lens, grid.border, cells.border, band, origin, shoulder, nearest, share,
+        "blend", "blend_band", (-(-band[2] // 2), band[3]), rows, device.upload(table), 3, lines, factors,
+        *axes, full.border, full.lens, grid.border, cells.border, band, origin, shoulder, nearest, share,
         out, options=options,
     )  # fmt: skip
     lefts = [box[0] for box in boxes]
