@@ -31,6 +31,8 @@ _LEAST_ROWS = 4
 # What files keep of each layer between two reads, and what is allocated beside that which is reckoned.
 _STRIP_ROWS = 64
 _SLACK = 48 << 20
+# Bytes of a strip up to which bands end where strips do, although they hold some rows more then.
+_WHOLE_STRIP = 2 << 20
 # A layer with less than this share of a pixel's weight changes it by less than a quarter of a level, and need
 # not be sampled; of a level of 16 bits for floats.
 _QUARTER_LEVEL = {np.dtype(np.uint8): 0.25 / 255}
@@ -241,8 +243,8 @@ def _rows_needed(layer: BlendLayer, full: Grid, part: Box, scale: float) -> Span
     beyond = math.ceil(max(layer.reach[first:last]) * scale) + 3  # 3: bicubic taps, rounding
     start, end = max(0, part.top - beyond - offset), min(box.height, part.bottom + beyond - offset)
     # whole strips, unless they are large: parts would have to be cut and joined again
-    strip = layer.layer.strip if layer.layer.strip <= _STRIP_ROWS else 1
-    return start, min(box.height, end + -end % strip)
+    strip, row = layer.layer.strip, box.width * (layer.layer.channels + 1) * layer.layer.dtype.itemsize
+    return start, min(box.height, end + (-end % strip if strip * row <= _WHOLE_STRIP else 0))
 
 
 def _plan(layers: Sequence[BlendLayer], full: Grid, grid: Grid, crop: Box, height: int) -> list[_Band]:
