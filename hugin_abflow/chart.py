@@ -122,18 +122,22 @@ def _axes(points: npt.NDArray[np.float64], weights: npt.NDArray[np.float64]) -> 
 
 def _sphere(overlap: npt.NDArray[np.bool_], mask_grid: Grid, scale: float) -> Chart:
     lon0, dlon, lat0, dlat = mask_grid.lens
+    lon = lon0 + (np.arange(mask_grid.width) + 0.5) * dlon
+    lat = lat0 - (np.arange(mask_grid.height) + 0.5) * dlat
     rows, columns = np.nonzero(overlap)
-    lon, lat = lon0 + (columns + 0.5) * dlon, lat0 - (rows + 0.5) * dlat
-    points = np.stack([np.cos(lat) * np.sin(lon), np.cos(lat) * np.cos(lon), np.sin(lat)], 1)
-    axes = _axes(points, np.cos(lat))
+    across_axis = np.cos(lat)[rows]
+    points = np.stack(
+        [across_axis * np.sin(lon)[columns], across_axis * np.cos(lon)[columns], np.sin(lat)[rows]], 1
+    )
+    axes = _axes(points, across_axis)
     x, y, z = axes @ points.T
-    chart_lon, chart_lat = np.arctan2(x, y), np.arcsin(np.clip(z, -1, 1))
+    chart_lon, lowest, highest = np.arctan2(x, y), *np.arcsin(np.clip([z.min(), z.max()], -1, 1))
     steps = 720
     margin = _MARGIN / scale + 2 * math.pi / steps
     used = np.zeros(steps, bool)
     used[((chart_lon / (2 * math.pi) + 0.5) * steps).astype(int) % steps] = True
-    south = max(chart_lat.min() - margin, -math.pi / 2)
-    north = min(chart_lat.max() + margin, math.pi / 2)
+    south = max(lowest - margin, -math.pi / 2)
+    north = min(highest + margin, math.pi / 2)
     first, gap = _gap(used)
     wraps = gap * 2 * math.pi / steps < 2 * margin + 4 * math.pi / steps
     if wraps:

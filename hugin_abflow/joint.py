@@ -368,10 +368,10 @@ def _flows(
     largest = _REACH * (grid.canvas_width or grid.region.width) * grid.width / grid.region.width
     reach = largest / coarse if settings.large_motion != "off" else 0.0
     result, shifts = [], []
-    with progress("flow", len(overlaps)) as advance:
-        for pair, overlap in overlaps:
+    with ThreadPoolExecutor(1, "chart") as beside, progress("flow", len(overlaps)) as advance:
+        charts = beside.map(lambda overlap: chart.pair_chart(overlap[1], masks.grid, grid, coarse), overlaps)
+        for (pair, _), its_chart in zip(overlaps, charts, strict=True):
             its_layers = (layers[pair.a], layers[pair.b])
-            its_chart = chart.pair_chart(overlap, masks.grid, grid, coarse)
             image_a, image_b = (chart.sample(device, layer, grid, its_chart) for layer in its_layers)
             bearings = its_chart.bearings if its_chart.spherical else None
             found = flow.pair_flow(device, image_a, image_b, parameters, reach=reach, bearings=bearings)

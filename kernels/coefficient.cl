@@ -59,12 +59,13 @@ __kernel void coefficient_flood(__global const int *seed,    /* (grid.y, grid.x)
         flooded[y * grid.x + x] = x + (y << 16);
         return;
     }
+    const bool inner = x >= step && y >= step && x + step < grid.x && y + step < grid.y;
     int best = -1;
     float nearest = INFINITY;
     for (int j = -step; j <= step; j += step)
         for (int i = -step; i <= step; i += step) {
             int2 p = (int2)(x + i, y + j);
-            if (!grid_border(&p, grid))
+            if (!inner && !grid_border(&p, grid))
                 continue;
             const int s = seed[p.y * grid.x + p.x];
             if (s < 0 || s == best)

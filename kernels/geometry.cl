@@ -26,10 +26,10 @@ __kernel void geometry_add(__global const float *blend_j,   /* (box_j.w, box_j.z
     const int x = i * every, y = j * every, at = j * size.x + i;
     const int2 p = (int2)(x + box_k.x, y + box_k.y);
     const int at_j = box_index(p, box_j);
-    if (at_j < 0 || layer_k[y * box_k.z + x].w == 0.0f)
+    if (at_j < 0)
         return;
     const float w = blend_j[at_j];
-    if (w < GEOMETRY_NEGLIGIBLE)
+    if (w < GEOMETRY_NEGLIGIBLE || layer_k[y * box_k.z + x].w == 0.0f)
         return;
     float3 q = canvas_point((float2)(p.x + 0.5f, p.y + 0.5f), lens);
     if (use_guess) {
