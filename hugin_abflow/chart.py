@@ -131,7 +131,8 @@ def _sphere(overlap: npt.NDArray[np.bool_], mask_grid: Grid, scale: float) -> Ch
     )
     axes = _axes(points, across_axis)
     x, y, z = axes @ points.T
-    chart_lon, lowest, highest = np.arctan2(x, y), *np.arcsin(np.clip([z.min(), z.max()], -1, 1))
+    chart_lon = np.arctan2(x, y)
+    lowest, highest = (math.asin(min(max(end, -1.0), 1.0)) for end in (z.min(), z.max()))
     steps = 720
     margin = _MARGIN / scale + 2 * math.pi / steps
     used = np.zeros(steps, bool)

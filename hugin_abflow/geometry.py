@@ -110,6 +110,7 @@ def _displacement(
 ) -> Buffer:
     layer = layers[index]
     size = tuple(-(-n // every) for n in layer.box[2:])
+    four_at_a_time = (-(-size[0] // 4), size[1])
     field = device.zeros((*size[::-1], 4))
     for pair in flows:
         if index not in (pair.a, pair.b):
@@ -118,7 +119,7 @@ def _displacement(
         flow = pair.between(other if guess is None else index)
         chart_grid = (pair.chart.width, pair.chart.height, int(pair.chart.wraps), 0)
         device.run(
-            "geometry", "geometry_add", size, coefficients[other].blend, layers[other].box,
+            "geometry", "geometry_add", four_at_a_time, coefficients[other].blend, layers[other].box,
             layer.pixels, layer.box, every, grid.border, grid.lens, flow, chart_grid, pair.chart.transform,
             int(guess is not None), guess or field, field, size,
         )  # fmt: skip

@@ -21,6 +21,14 @@
 #define ROOT(a) sqrt(a)
 #endif
 
+static inline float root(float a) {
+    return ROOT(a);
+}
+
+static inline float4 root4(float4 a) {
+    return (float4)(ROOT(a.x), ROOT(a.y), ROOT(a.z), ROOT(a.w));
+}
+
 /* The largest whole number that is not above a. */
 static inline int floor_int(float a) {
     const int whole = (int)a;
@@ -158,39 +166,81 @@ static inline int box_index(int2 p, int4 box) {
 }
 
 /* Sine, and by its address cosine, of an angle of a few turns at most, to 1e-7: positions are calculated several
-   times for each pixel, and PoCL's own functions, good for any angle, take four times as long. */
-static inline float angle_sincos(float angle, float *cosine) {
-    const int turn = floor_int(angle * M_2_PI_F + 0.5f);
-    const float quarter = turn;
-    /* pi / 2 in two parts, so that nothing is lost */
-    const float r = (angle - quarter * 1.5707962513f) - quarter * 7.5497894e-8f, r2 = r * r;
-    const float s = r + r * r2 * (-0.166666502f + r2 * (0.00833195158f - r2 * 0.000194922077f));
-    const float c = 1.0f - 0.5f * r2 + r2 * r2 * (0.0416666463f + r2 * (-0.00138873371f + r2 * 2.44348453e-5f));
-    const float first = turn & 1 ? c : s, second = turn & 1 ? s : c;
-    *cosine = (turn + 1) & 2 ? -second : second;
-    return turn & 2 ? -first : first;
-}
-
-/* atan2 likewise; 0 where both are 0. */
-static inline float angle_of(float y, float x) {
-    const float ax = MAGNITUDE(x), ay = MAGNITUDE(y), longer = GREATEST(ax, ay);
-    const float t = longer > 0.0f ? LEAST(ax, ay) / longer : 0.0f, t2 = t * t;
-    const float far = 0.0964219166f + t2 * (-0.055912249f + t2 * (0.0218629038f - t2 * 0.00405455219f));
-    const float near = -0.333298607f + t2 * (0.199465652f + t2 * (-0.139086273f + t2 * far));
-    float angle = t * (0.999999336f + t2 * near);
-    angle = ay > ax ? M_PI_2_F - angle : angle;
-    angle = x < 0.0f ? M_PI_F - angle : angle;
-    return as_int(y) < 0 ? -angle : angle; /* by the sign bit: -0 is below 0 */
-}
+   times for each pixel, and PoCL's own functions, good for any angle, take four times as long. And atan2 likewise;
+   0 where both are 0. */
+#define ANGLES(n)                                                                                                  \
+    static inline float##n angle_sincos##n(float##n angle, float##n *cosine) {                                     \
+        const float##n turns = angle * M_2_PI_F + 0.5f;                                                            \
+        int##n turn = convert_int##n(turns);                                                                       \
+        turn -= turns < convert_float##n(turn) ? (int##n)(1) : (int##n)(0);                                        \
+        const float##n quarter = convert_float##n(turn);                                                           \
+        /* pi / 2 in two parts, so that nothing is lost */                                                         \
+        const float##n r = (angle - quarter * 1.5707962513f) - quarter * 7.5497894e-8f, r2 = r * r;                \
+        const float##n s = r + r * r2 * (-0.166666502f + r2 * (0.00833195158f - r2 * 0.000194922077f));            \
+        const float##n c = 1.0f - 0.5f * r2 +                                                                      \
+                           r2 * r2 * (0.0416666463f + r2 * (-0.00138873371f + r2 * 2.44348453e-5f));               \
+        const float##n first = (turn & 1) != 0 ? c : s, second = (turn & 1) != 0 ? s : c;                          \
+        *cosine = ((turn + 1) & 2) != 0 ? -second : second;                                                        \
+        return (turn & 2) != 0 ? -first : first;                                                                   \
+    }                                                                                                              \
+    static inline float##n angle_of##n(float##n y, float##n x) {                                                   \
+        const float##n ax = MAGNITUDE(x), ay = MAGNITUDE(y), longer = GREATEST(ax, ay);                            \
+        const float##n t = longer > 0.0f ? LEAST(ax, ay) / longer : (float##n)(0.0f), t2 = t * t;                  \
+        const float##n far = 0.0964219166f + t2 * (-0.055912249f + t2 * (0.0218629038f - t2 * 0.00405455219f));    \
+        const float##n near = -0.333298607f + t2 * (0.199465652f + t2 * (-0.139086273f + t2 * far));               \
+        float##n angle = t * (0.999999336f + t2 * near);                                                           \
+        angle = ay > ax ? M_PI_2_F - angle : angle;                                                                \
+        angle = x < 0.0f ? M_PI_F - angle : angle;                                                                 \
+        return as_int##n(y) < 0 ? -angle : angle; /* by the sign bit: -0 is below 0 */                             \
+    }
+ANGLES()
+ANGLES(4)
 
 /* The lens of a canvas grid: lens = (lon of x = 0, radians per column, lat of y = 0, radians per row);
-   radians per column 0 means a plane. */
+   radians per column 0 means a plane.
+
+   A chart is the flat grid on which one pair's flow lives. Sphere: an equirectangular projection about an
+   axis of its own; s0-2, s3-5, s6-8 are the rows of the rotation from the scene to the chart's axes.
+   s9, sa: pixels per radian (sphere) or per canvas pixel (plane) in x, y; sb, sc: chart position of
+   longitude 0, latitude 0 (sphere) or of the canvas's origin (plane); sd: 1 on the sphere;
+   se: period of a wrapped plane in canvas pixels, else 0. Handed on by its address: compilers warn of
+   float16 arguments of functions on a CPU without registers of that size.
+
+   What follows is canvas_point, chart_point and chart_position on spheres, for one point or several. */
+#define SPHERE(n)                                                                                                  \
+    typedef struct {                                                                                               \
+        float##n x, y, z;                                                                                          \
+    } points##n;                                                                                                   \
+    static inline points##n canvas_sphere##n(float##n x, float##n y, float4 lens) {                                \
+        float##n cl, cp;                                                                                           \
+        const float##n sl = angle_sincos##n(lens.x + x * lens.y, &cl);                                             \
+        const float##n sp = angle_sincos##n(lens.z - y * lens.w, &cp);                                             \
+        return (points##n){cp * sl, cp * cl, sp};                                                                  \
+    }                                                                                                              \
+    static inline points##n chart_sphere##n(float##n u, float##n v, const float16 *chart) {                        \
+        float##n cl, cp;                                                                                           \
+        const float##n sl = angle_sincos##n((u - chart->sb) / chart->s9, &cl);                                     \
+        const float##n z = angle_sincos##n((chart->sc - v) / chart->sa, &cp), x = cp * sl, y = cp * cl;            \
+        return (points##n){chart->s0 * x + chart->s3 * y + chart->s6 * z,                                          \
+                           chart->s1 * x + chart->s4 * y + chart->s7 * z,                                          \
+                           chart->s2 * x + chart->s5 * y + chart->s8 * z};                                         \
+    }                                                                                                              \
+    static inline float##n chart_sphere_position##n(points##n q, const float16 *chart, float##n *v) {              \
+        const float##n x = chart->s0 * q.x + chart->s1 * q.y + chart->s2 * q.z;                                    \
+        const float##n y = chart->s3 * q.x + chart->s4 * q.y + chart->s5 * q.z;                                    \
+        const float##n z = chart->s6 * q.x + chart->s7 * q.y + chart->s8 * q.z;                                    \
+        const float##n lon = angle_of##n(x, y), lat = angle_of##n(z, root##n(x * x + y * y));                      \
+        *v = chart->sc - lat * chart->sa;                                                                          \
+        return lon * chart->s9 + chart->sb;                                                                        \
+    }
+SPHERE()
+SPHERE(4)
+
 static inline float3 canvas_point(float2 p, float4 lens) {
     if (lens.y == 0.0f)
         return (float3)(p.x, p.y, 0.0f);
-    float cl, cp;
-    const float sl = angle_sincos(lens.x + p.x * lens.y, &cl), sp = angle_sincos(lens.z - p.y * lens.w, &cp);
-    return (float3)(cp * sl, cp * cl, sp);
+    const points q = canvas_sphere(p.x, p.y, lens);
+    return (float3)(q.x, q.y, q.z);
 }
 
 static inline float2 canvas_position(float3 q, float4 lens) {
@@ -200,34 +250,23 @@ static inline float2 canvas_position(float3 q, float4 lens) {
     return (float2)((lon - lens.x) / lens.y, (lens.z - lat) / lens.w);
 }
 
-/* A chart is the flat grid on which one pair's flow lives. Sphere: an equirectangular projection about an
-   axis of its own; s0-2, s3-5, s6-8 are the rows of the rotation from the scene to the chart's axes.
-   s9, sa: pixels per radian (sphere) or per canvas pixel (plane) in x, y; sb, sc: chart position of
-   longitude 0, latitude 0 (sphere) or of the canvas's origin (plane); sd: 1 on the sphere;
-   se: period of a wrapped plane in canvas pixels, else 0. Handed on by its address: compilers warn of
-   float16 arguments of functions on a CPU without registers of that size. */
 static inline float3 chart_point(float2 u, const float16 *chart) {
     if (chart->sd == 0.0f)
         return (float3)((u.x - chart->sb) / chart->s9, (u.y - chart->sc) / chart->sa, 0.0f);
-    float cl, cp;
-    const float sl = angle_sincos((u.x - chart->sb) / chart->s9, &cl);
-    const float z = angle_sincos((chart->sc - u.y) / chart->sa, &cp), x = cp * sl, y = cp * cl;
-    return (float3)(chart->s0 * x + chart->s3 * y + chart->s6 * z, chart->s1 * x + chart->s4 * y + chart->s7 * z,
-                    chart->s2 * x + chart->s5 * y + chart->s8 * z);
+    const points q = chart_sphere(u.x, u.y, chart);
+    return (float3)(q.x, q.y, q.z);
 }
 
 static inline float2 chart_position(float3 q, const float16 *chart) {
-    if (chart->sd == 0.0f) {
-        float2 u = (float2)(q.x * chart->s9 + chart->sb, q.y * chart->sa + chart->sc);
-        if (chart->se > 0.0f) /* the copy that lies on the chart, which may reach across the canvas's border */
-            u.x -= floor_int(u.x / (chart->se * chart->s9)) * chart->se * chart->s9;
-        return u;
+    float2 u = (float2)(q.x * chart->s9 + chart->sb, q.y * chart->sa + chart->sc);
+    if (chart->sd != 0.0f) {
+        float v;
+        u.x = chart_sphere_position((points){q.x, q.y, q.z}, chart, &v);
+        u.y = v;
+    } else if (chart->se > 0.0f) { /* the copy that lies on the chart, which may reach across the canvas's border */
+        u.x -= floor_int(u.x / (chart->se * chart->s9)) * chart->se * chart->s9;
     }
-    const float x = chart->s0 * q.x + chart->s1 * q.y + chart->s2 * q.z;
-    const float y = chart->s3 * q.x + chart->s4 * q.y + chart->s5 * q.z;
-    const float z = chart->s6 * q.x + chart->s7 * q.y + chart->s8 * q.z;
-    const float lon = angle_of(x, y), lat = angle_of(z, ROOT(x * x + y * y));
-    return (float2)(lon * chart->s9 + chart->sb, chart->sc - lat * chart->sa);
+    return u;
 }
 
 /* Weights of the four pixels from `corner` on, to read between them at the fraction t, and their indices; weight

@@ -5,6 +5,42 @@
 /* Coefficients below this move nothing by as much as a thousandth of a pixel. */
 #define GEOMETRY_NEGLIGIBLE 1e-5f
 
+/* Pixels of a row that a work item takes: compilers for CPUs make vectors only of what is written as vectors. */
+#define GEOMETRY_CHUNK 4
+
+/* The coefficient of layer j where layer k has its pixel (x, y); 0 where it moves nothing, or a layer is not. */
+static inline float geometry_share(__global const float *blend_j, int4 box_j, __global const float4 *layer_k,
+                                   int4 box_k, int x, int y) {
+    const int at_j = box_index((int2)(x + box_k.x, y + box_k.y), box_j);
+    const float w = at_j < 0 ? 0.0f : blend_j[at_j];
+    return w < GEOMETRY_NEGLIGIBLE || layer_k[y * box_k.z + x].w == 0.0f ? 0.0f : w;
+}
+
+/* From four points q the ways that flow leads, by its chart; moves: where it leads anywhere. */
+static inline points4 geometry_ways(points4 q, __global const float2 *flow, int4 grid, const float16 *chart,
+                                    int4 *moves) {
+    const bool plane = chart->sd == 0.0f;
+    float4 u, v;
+    if (plane) {
+        const float2 a = chart_position((float3)(q.x.x, q.y.x, 0.0f), chart);
+        const float2 b = chart_position((float3)(q.x.y, q.y.y, 0.0f), chart);
+        const float2 c = chart_position((float3)(q.x.z, q.y.z, 0.0f), chart);
+        const float2 d = chart_position((float3)(q.x.w, q.y.w, 0.0f), chart);
+        u = (float4)(a.x, b.x, c.x, d.x);
+        v = (float4)(a.y, b.y, c.y, d.y);
+    } else {
+        u = chart_sphere_position4(q, chart, &v);
+    }
+    const float2 a = bilinear_flow(flow, (float2)(u.x, v.x), grid), b = bilinear_flow(flow, (float2)(u.y, v.y), grid);
+    const float2 c = bilinear_flow(flow, (float2)(u.z, v.z), grid), d = bilinear_flow(flow, (float2)(u.w, v.w), grid);
+    const float4 fx = (float4)(a.x, b.x, c.x, d.x), fy = (float4)(a.y, b.y, c.y, d.y);
+    *moves = fx != 0.0f || fy != 0.0f;
+    if (plane) /* on one that wraps, u may be of a copy of q */
+        return (points4){fx / chart->s9, fy / chart->sa, (float4)(0.0f)};
+    const points4 to = chart_sphere4(u + fx, v + fy, chart);
+    return (points4){to.x - q.x, to.y - q.y, to.z - q.z};
+}
+
 /* Add one other layer's part. guess = 0: read F_jk at p (first order, as published). Otherwise F_kj is read at
    the place that `guess` says layer k is sampled, whose way to p it is: x_k = p - sum_j w_j F_kj(x_k). */
 __kernel void geometry_add(__global const float *blend_j,   /* (box_j.w, box_j.z) */
@@ -18,32 +54,41 @@ __kernel void geometry_add(__global const float *blend_j,   /* (box_j.w, box_j.z
                            int use_guess,
                            __global const float4 *guess,    /* (size.y, size.x) displacement */
                            __global float4 *field,          /* (size.y, size.x) displacement is added */
-                           int2 size)                       /* box_k.zw / every, rounded up; run size */
+                           int2 size)                       /* box_k.zw / every, rounded up; run size: that,
+                                                               its columns by GEOMETRY_CHUNK, rounded up */
 {
-    const int i = get_global_id(0), j = get_global_id(1);
+    const int i = get_global_id(0) * GEOMETRY_CHUNK, j = get_global_id(1);
     if (i >= size.x || j >= size.y)
         return;
-    const int x = i * every, y = j * every, at = j * size.x + i;
-    const int2 p = (int2)(x + box_k.x, y + box_k.y);
-    const int at_j = box_index(p, box_j);
-    if (at_j < 0)
-        return;
-    const float w = blend_j[at_j];
-    if (w < GEOMETRY_NEGLIGIBLE || layer_k[y * box_k.z + x].w == 0.0f)
-        return;
-    float3 q = canvas_point((float2)(p.x + 0.5f, p.y + 0.5f), lens);
-    if (use_guess) {
-        q += guess[at].xyz;
-        if (lens.y != 0.0f)
-            q /= ROOT(square3(q));
+    const int y = j * every, at = j * size.x + i, last = size.x - 1 - i;
+    float share[GEOMETRY_CHUNK], most = 0.0f;
+    for (int k = 0; k < GEOMETRY_CHUNK; ++k) {
+        share[k] = k <= last ? geometry_share(blend_j, box_j, layer_k, box_k, (i + k) * every, y) : 0.0f;
+        most = GREATEST(most, share[k]);
     }
-    const float2 u = chart_position(q, &chart);
-    const float2 f = bilinear_flow(flow, u, grid);
-    if (f.x == 0.0f && f.y == 0.0f)
+    if (most == 0.0f)
         return;
-    /* on a sphere q is the chart's point at u, on a plane that wraps a copy of it */
-    const float3 d = chart.sd == 0.0f ? (float3)(f.x / chart.s9, f.y / chart.sa, 0.0f) : chart_point(u + f, &chart) - q;
-    field[at].xyz += (use_guess ? -w : w) * d;
+    const float4 px = convert_float4((i + (int4)(0, 1, 2, 3)) * every + box_k.x) + 0.5f;
+    const float4 py = (float4)(y + box_k.y + 0.5f);
+    points4 q = lens.y == 0.0f ? (points4){px, py, (float4)(0.0f)} : canvas_sphere4(px, py, lens);
+    if (use_guess) {
+        const float4 a = guess[at], b = guess[at + LEAST(1, last)];
+        const float4 c = guess[at + LEAST(2, last)], d = guess[at + LEAST(3, last)];
+        q = (points4){q.x + (float4)(a.x, b.x, c.x, d.x), q.y + (float4)(a.y, b.y, c.y, d.y),
+                      q.z + (float4)(a.z, b.z, c.z, d.z)};
+        if (lens.y != 0.0f) {
+            const float4 length = root4(q.x * q.x + q.y * q.y + q.z * q.z);
+            q = (points4){q.x / length, q.y / length, q.z / length};
+        }
+    }
+    int4 moves;
+    const points4 d = geometry_ways(q, flow, grid, &chart, &moves);
+    const float3 way[GEOMETRY_CHUNK] = {(float3)(d.x.x, d.y.x, d.z.x), (float3)(d.x.y, d.y.y, d.z.y),
+                                        (float3)(d.x.z, d.y.z, d.z.z), (float3)(d.x.w, d.y.w, d.z.w)};
+    const int moved[GEOMETRY_CHUNK] = {moves.x, moves.y, moves.z, moves.w};
+    for (int k = 0; k < GEOMETRY_CHUNK; ++k)
+        if (share[k] > 0.0f && moved[k])
+            field[at + k].xyz += (use_guess ? -share[k] : share[k]) * way[k];
 }
 
 /* a_k = sharpness * w_k * (1 + magnitude * f_k / width), with f_k = |displacement| / (1 - w_k); and the maximum

@@ -73,9 +73,9 @@ def test_add_equals_its_twin(device: Device, name: str, use_guess: int, every: i
     out = device.upload(field)
     chart_grid = (found.width, found.height, int(found.wraps), 0)
     device.run(
-        "geometry", "geometry_add", size, device.upload(blend), box_j, device.upload(layer), box, every,
-        grid.border, grid.lens, device.upload(flow), chart_grid, found.transform, use_guess,
-        device.upload(guess), out, size,
+        "geometry", "geometry_add", (-(-size[0] // 4), size[1]),
+        device.upload(blend), box_j, device.upload(layer), box, every, grid.border, grid.lens,
+        device.upload(flow), chart_grid, found.transform, use_guess, device.upload(guess), out, size,
     )  # fmt: skip
     expected = twin.geometry_add(
         blend, box_j, layer, box, every, grid.lens, flow, chart_grid, found.transform, use_guess, guess, field
