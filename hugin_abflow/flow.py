@@ -180,15 +180,17 @@ def finest_features(device: Device, image: Level, parameters: FlowParameters) ->
 
 
 def _choose(
-    device: Device, features: Buffer, stacked: Buffer, grid: Grid, level: int,
-    searched: bool, reach: float, parameters: FlowParameters,
+    device: Device, features: Buffer, stacked: Buffer, grid: Grid, reach: int, parameters: FlowParameters,
 ) -> Buffer:  # fmt: skip
-    """The flows with which a level starts: each pixel's own, found by search, or from beside it."""
+    """The flows with which a level starts: each pixel's own, found by search, or from beside it.
+
+    reach: px of the level up to which motion is searched; 0: not at all.
+    """
     how = parameters.search
     descriptors = a, b = [search.descriptor(device, one, grid, how) for one in _apart(device, features)]
     flows = others = _apart(device, stacked)
-    if searched:
-        others = search.exhaustive(device, a, b, flows, grid, reach / 2**level, how)
+    if reach:
+        others = search.exhaustive(device, a, b, flows, grid, reach, how)
     return _together(
         device,
         [
@@ -296,11 +298,12 @@ def pair_flow(
     """
     parameters = parameters or FlowParameters()
     count = start.level + 1 if start else levels(a, parameters)
-    searched, reach = -1, parameters.reach * max(a.grid[:2]) if reach is None else reach
+    reach = parameters.reach * max(a.grid[:2]) if reach is None else reach
+    searched: dict[int, int] = {}
     if reach > 0 and not start:
         common = np.count_nonzero(a.mask.get() * b.mask.get())
         reach = min(reach, parameters.overlap * math.sqrt(common))
-        searched = search.level(reach, count, parameters.search) if reach > 0 else -1
+        searched = search.reaches(reach, count, parameters.search, finest=parameters.decide_on)
     pyramids = [pyramid.build(device, image, count + 1) for image in (a, b)]
     flows: list[Buffer] = []  # without what a search found, and with it, as long as both may be taken
     for level in reversed(range(count)):
@@ -310,11 +313,11 @@ def pair_flow(
             flows = [_expand(device, one, grid) for one in flows]
         else:
             flows = [_together(device, start.flows) if start else device.zeros((2, grid[1], grid[0], 2))]
-        # a search on a level finer than choose_from (of a small image) is followed by no other choice
-        followed = level == searched or parameters.search.always or len(flows) > 1
-        if followed and min(searched, parameters.choose_from) <= level <= searched:
-            chosen = _choose(device, features, flows[-1], grid, level, level == searched, reach, parameters)
-            flows = [chosen] if parameters.search.always else [flows[0], chosen]
+        always = parameters.search.always and level <= max(searched, default=-1)
+        followed = always or len(flows) > 1
+        if level in searched or (followed and level >= parameters.choose_from):
+            chosen = _choose(device, features, flows[-1], grid, searched.get(level, 0), parameters)
+            flows = [chosen] if always else [flows[0], chosen]
         pulls = start.pulls if start else (None, None)
         flows = [_refine(device, features, one, grid, level, parameters, pulls) for one in flows]
         if len(flows) > 1:

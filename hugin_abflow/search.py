@@ -22,12 +22,14 @@ class SearchParameters:
     """How large motion is searched. Costs are misfits of descriptors, 0 to 1."""
 
     coarse: float = 9.0  # px: displacements are tried on the finest level on which reach is at most this
-    furthest: int = 10  # px: and nothing beyond this is tried, where the coarsest level is too fine for that
+    # px: and nothing beyond this is tried, where the coarsest level is too fine for that; and how far on the
+    # levels below, which show what is too fine for it
+    furthest: tuple[int, ...] = (10, 7)
     noise: float = 0.05  # amplitude of h that is no texture
     outside: float = 0.5  # cost, on the coarse level, of what the other image does not show
     couplings: tuple[float, ...] = (0.001, 0.01, 0.03, 0.1, 0.3)  # of a squared pixel, in turns
     tolerance: float = 2.5  # px: by how much both directions may disagree
-    distinct: float = 0.2  # how much less the one found costs than any other more than 2 px away
+    distinct: float = 0.1  # how much less the one found costs than any other more than 2 px away
     own_outside: float = 0.25  # the same for a pixel's own flow, which is not given up for want of evidence
     other_outside: float = 0.75  # and for a flow that it may take over
     patience: float = 0.06  # by how much a flow from elsewhere must fit better
@@ -66,21 +68,30 @@ def filtered(
     return result
 
 
-def level(reach: float, levels: int, parameters: SearchParameters) -> int:
-    """The level, of `levels`, on which displacements of up to `reach` px of the finest are tried."""
-    return min(levels - 1, max(0, math.ceil(math.log2(max(reach, 1) / parameters.coarse))))
+def reaches(reach: float, levels: int, parameters: SearchParameters, finest: int = 0) -> dict[int, int]:
+    """On which levels, of `levels`, how many of their px are tried, for motion of up to `reach` px of the
+    finest; none but the first is finer than `finest`.
+    """
+    if reach <= 0:
+        return {}
+    first = min(levels - 1, max(0, math.ceil(math.log2(max(reach, 1) / parameters.coarse))))
+    return {
+        level: min(math.ceil(reach / 2**level), furthest)
+        for level, furthest in zip(range(first, -1, -1), parameters.furthest, strict=False)
+        if level >= min(first, finest)
+    }
 
 
 def exhaustive(
-    device: Device, a: Buffer, b: Buffer, flows: Sequence[Buffer], grid: Grid, largest: float,
+    device: Device, a: Buffer, b: Buffer, flows: Sequence[Buffer], grid: Grid, largest: int,
     parameters: SearchParameters,
 ) -> list[Buffer]:  # fmt: skip
     """Both directions' flow: what is found within `largest` px and beyond doubt, elsewhere `flows`.
 
     a, b: descriptors; flows, from a to b and from b to a, and the result: float32 (height, width, 2), px.
     """
-    size, limit = grid[:2], min(math.ceil(largest), parameters.furthest)
-    reach = min(limit, size[0] // 2), min(limit, size[1] // 2)
+    size = grid[:2]
+    reach = min(largest, size[0] // 2), min(largest, size[1] // 2)
     count = (2 * reach[0] + 1) * (2 * reach[1] + 1)
     pixel_cost, cost = (device.empty((count, size[1], size[0])) for _ in range(2))
     every, outside = (size[0], size[1] * count), parameters.outside

@@ -287,7 +287,13 @@ def test_a_narrow_overlap_shows_all_of_its_motion(device: Device) -> None:
     assert np.median(backward.get()[(x >= 16) & (x < 28)][:, 0]) == pytest.approx(4.5, abs=0.15)
 
 
-def test_level_of_the_search() -> None:
-    how = search.SearchParameters(coarse=9.0)
-    assert [search.level(reach, 6, how) for reach in (0, 9, 9.1, 18, 70, 200)] == [0, 0, 1, 1, 3, 5]
-    assert search.level(200, 3, how) == 2
+def test_levels_of_the_search() -> None:
+    """The finest on which reach is at most 9 px, or the coarsest there is, and the one below it."""
+    how = search.SearchParameters(coarse=9.0, furthest=(10, 7))
+    assert search.reaches(0, 6, how) == {}
+    assert search.reaches(9, 6, how) == {0: 9}
+    assert search.reaches(9.1, 6, how) == {1: 5, 0: 7}
+    assert search.reaches(70, 6, how) == {3: 9, 2: 7}
+    assert search.reaches(200, 3, how) == {2: 10, 1: 7}
+    assert search.reaches(18, 6, how, finest=1) == {1: 9}
+    assert search.reaches(3, 6, how, finest=1) == {0: 3}
