@@ -112,7 +112,7 @@ def _coupled(
     parameters: SearchParameters,
 ) -> Buffer:  # fmt: skip
     """The displacements of least cost, ever less free to differ from `flow`, then from their own mean."""
-    size = grid[:2]
+    size, eight_at_a_time = grid[:2], (-(-grid[0] // 8), grid[1])
     smooth, best, median = (device.empty(flow.shape) for _ in range(3))
     for turn, coupling in enumerate(parameters.couplings):
         if turn:
@@ -120,7 +120,7 @@ def _coupled(
                 best, median = filtered(device, best, grid, median), best
             device.run("search", "search_mean", size, best, grid, smooth)
         device.run(
-            "search", "search_best", size, cost, smooth if turn else flow, grid, reach, parameters.outside,
+            "search", "search_best", eight_at_a_time, cost, smooth if turn else flow, grid, reach, parameters.outside,
             coupling, backward, best,
         )  # fmt: skip
     return best

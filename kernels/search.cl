@@ -81,45 +81,61 @@ __kernel void search_cost(__global const float *pixel_cost, /* (displacements, g
     cost[row * grid.x + x] = weight > 0.0f ? sum / weight : outside;
 }
 
-/* The displacement that costs least, with what it is away from `flow`. */
+/* Costs at columns x to x + 7 of a row; `outside` beyond the grid. */
+static inline float8 search_row(__global const float *row, int x, int4 grid, float outside) {
+    if (x >= 0 && x + 8 <= grid.x)
+        return vload8(0, row + x);
+    float lanes[8];
+    for (int i = 0; i < 8; ++i) {
+        int2 p = (int2)(x + i, 0);
+        lanes[i] = grid_border(&p, grid) ? row[p.x] : outside;
+    }
+    return vload8(0, lanes);
+}
+
+/* The displacement that costs least, with what it is away from `flow`; eight pixels at a time. */
 __kernel void search_best(__global const float *cost,  /* (displacements, grid.y, grid.x) from a to b */
                           __global const float2 *flow, /* (grid.y, grid.x) px */
-                          int4 grid,                   /* run size */
+                          int4 grid,                   /* run size: (ceil(grid.x / 8), grid.y) */
                           int2 reach,                  /* px */
                           float outside,               /* cost of what lies beyond the grid */
                           float coupling,              /* cost of a squared pixel away from flow */
                           int backward,                /* 1: flow from b to a */
                           __global float2 *best)       /* (grid.y, grid.x) px */
 {
-    const int x = get_global_id(0), y = get_global_id(1);
-    if (x >= grid.x || y >= grid.y)
+    const int x = 8 * get_global_id(0), y = get_global_id(1), count = min(8, grid.x - x);
+    if (count <= 0 || y >= grid.y)
         return;
-    const int at = y * grid.x + x, plane = grid.x * grid.y;
-    const float2 near = flow[at];
-    float least = INFINITY;
-    float2 found = near;
-    if (backward) { /* what b shows at q, a shows at q + d: the cost of -d there, the last first */
-        int start = ((2 * reach.x + 1) * (2 * reach.y + 1) - 1) * plane;
-        for (int v = -reach.y; v <= reach.y; ++v)
-            for (int u = -reach.x; u <= reach.x; ++u, start -= plane) {
-                const float2 away = (float2)(u, v) - near;
-                int2 p = (int2)(x + u, y + v);
-                const float own = grid_border(&p, grid) ? cost[start + p.y * grid.x + p.x] : outside;
-                const float total = own + coupling * dot(away, away);
-                found = total < least ? (float2)(u, v) : found;
-                least = total < least ? total : least;
-            }
-    } else {
-        int start = at;
-        for (int v = -reach.y; v <= reach.y; ++v)
-            for (int u = -reach.x; u <= reach.x; ++u, start += plane) {
-                const float2 away = (float2)(u, v) - near;
-                const float total = cost[start] + coupling * dot(away, away);
-                found = total < least ? (float2)(u, v) : found;
-                least = total < least ? total : least;
-            }
+    float near_x[8], near_y[8];
+    for (int i = 0; i < 8; ++i) {
+        const float2 near = flow[y * grid.x + x + min(i, count - 1)];
+        near_x[i] = near.x;
+        near_y[i] = near.y;
     }
-    best[at] = found;
+    const float8 from_x = vload8(0, near_x), from_y = vload8(0, near_y);
+    float8 least = (float8)(INFINITY), found_x = from_x, found_y = from_y;
+    for (int v = -reach.y; v <= reach.y; ++v) {
+        const float8 away_y = (float)v - from_y, down = away_y * away_y;
+        const int row = backward ? y + v : y; /* what b shows at q, a shows at q + d: the cost of -d there */
+        const bool inside = row >= 0 && row < grid.y;
+        for (int u = -reach.x; u <= reach.x; ++u) {
+            const int2 d = backward ? (int2)(-u, -v) : (int2)(u, v);
+            const int index = (d.y + reach.y) * (2 * reach.x + 1) + d.x + reach.x;
+            const float8 own =
+                inside ? search_row(cost + (index * grid.y + row) * grid.x, backward ? x + u : x, grid, outside)
+                       : (float8)(outside);
+            const float8 away_x = (float)u - from_x, total = own + coupling * (away_x * away_x + down);
+            const int8 less = total < least;
+            least = select(least, total, less);
+            found_x = select(found_x, (float8)(u), less);
+            found_y = select(found_y, (float8)(v), less);
+        }
+    }
+    float bx[8], by[8];
+    vstore8(found_x, 0, bx);
+    vstore8(found_y, 0, by);
+    for (int i = 0; i < count; ++i)
+        best[y * grid.x + x + i] = (float2)(bx[i], by[i]);
 }
 
 /* Mean of 3 x 3 pixels. */
