@@ -120,8 +120,8 @@ def _coupled(
                 best, median = filtered(device, best, grid, median), best
             device.run("search", "search_mean", size, best, grid, smooth)
         device.run(
-            "search", "search_best", eight_at_a_time, cost, smooth if turn else flow, grid, reach, parameters.outside,
-            coupling, backward, best,
+            "search", "search_best", eight_at_a_time, cost, smooth if turn else flow, grid, reach,
+            parameters.outside, coupling, backward, best,
         )  # fmt: skip
     return best
 
