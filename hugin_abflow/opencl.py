@@ -53,18 +53,17 @@ class DeviceInfo:
     default: bool
 
 
-def _kernel_folder() -> Path:
-    """Kernels lie in the package (wheel) or beside it (checkout, editable install)."""
-    package = Path(__file__).resolve().parent
-    return next(f for f in (package / "kernels", package.parent / "kernels") if f.is_dir())
-
-
 @cache
+def _kernel_files() -> dict[str, str]:
+    """By name, in the package (wheel) or beside it (checkout); read once: they may be replaced meanwhile."""
+    package = Path(__file__).resolve().parent
+    folder = next(f for f in (package / "kernels", package.parent / "kernels") if f.is_dir())
+    return {path.stem: path.read_text() for path in folder.glob("*.cl")}
+
+
 def kernel_source(module: str) -> str:
     """Source of ``kernels/<module>.cl`` with common.cl in front; #line keeps messages true."""
-    folder = _kernel_folder()
-    parts = [f'#line 1 "{name}.cl"\n{(folder / f"{name}.cl").read_text()}\n' for name in ("common", module)]
-    return "".join(parts)
+    return "".join(f'#line 1 "{name}.cl"\n{_kernel_files()[name]}\n' for name in ("common", module))
 
 
 def _kind(device: cl.Device) -> str:

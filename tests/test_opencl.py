@@ -69,6 +69,13 @@ def test_a_file_that_does_not_build_is_a_device_error_with_its_name(
         device.kernel("broken", "broken")
 
 
+def test_kernels_of_one_version_are_used(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A version that is installed while this one runs must not mix its kernels with this one's host code."""
+    kernel_source("working")
+    monkeypatch.setattr(Path, "read_text", lambda _: "of another version")
+    assert "flow_warp" in kernel_source("flow")
+
+
 def test_source_lines_keep_their_own_file_and_number() -> None:
     source = kernel_source("working")
     assert source.startswith('#line 1 "common.cl"\n')
