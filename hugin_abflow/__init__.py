@@ -41,10 +41,17 @@ _HOMES = {
 }  # fmt: skip
 
 
-def __getattr__(name: str) -> Any:
-    """A public name, from the module that it lives in."""
-    if name == "pto":
-        return import_module("hugin_abflow.pto")
-    if name not in _HOMES:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(import_module(f"{__name__}.{_HOMES[name]}"), name)
+def __dir__() -> list[str]:
+    """The public names too that nobody has used yet."""
+    return sorted({*globals(), *__all__})
+
+
+if not TYPE_CHECKING:  # else type checkers would take every misspelled name for one of these
+
+    def __getattr__(name: str) -> Any:
+        """A public name, from the module that it lives in."""
+        if name == "pto":
+            return import_module("hugin_abflow.pto")
+        if name not in _HOMES:
+            raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+        return getattr(import_module(f"{__name__}.{_HOMES[name]}"), name)

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import ast
+import subprocess
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -82,6 +85,22 @@ def test_all_public_names_are_there():
     assert sorted(hugin_abflow.__all__) == list(hugin_abflow.__all__)
     for name in hugin_abflow.__all__:
         assert getattr(hugin_abflow, name).__doc__
+
+
+def test_public_names_are_listed_before_they_are_loaded():
+    code = "import hugin_abflow, sys; print(*dir(hugin_abflow)); print('hugin_abflow.merge' in sys.modules)"
+    command = [sys.executable, "-W", "error", "-c", code]
+    names, loaded = subprocess.run(command, capture_output=True, text=True, check=True).stdout.splitlines()
+    assert set(hugin_abflow.__all__) <= set(names.split())
+    assert loaded == "False"
+
+
+def test_a_name_that_is_not_there_is_refused():
+    """When the program runs, and by type checkers, which believe a `__getattr__` that they see."""
+    with pytest.raises(AttributeError, match="module 'hugin_abflow' has no attribute 'merge_layrs'"):
+        hugin_abflow.merge_layrs  # noqa: B018
+    tree = ast.parse(Path(hugin_abflow.__file__).read_text("utf-8"))
+    assert "__getattr__" not in {node.name for node in tree.body if isinstance(node, ast.FunctionDef)}
 
 
 def test_project_becomes_a_panorama_beside_it(folder):
