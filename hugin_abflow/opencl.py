@@ -58,7 +58,7 @@ def _kernel_files() -> dict[str, str]:
     """By name, in the package (wheel) or beside it (checkout); read once: they may be replaced meanwhile."""
     package = Path(__file__).resolve().parent
     folder = next(f for f in (package / "kernels", package.parent / "kernels") if f.is_dir())
-    return {path.stem: path.read_text() for path in folder.glob("*.cl")}
+    return {path.stem: path.read_text("utf-8") for path in folder.glob("*.cl")}
 
 
 def kernel_source(module: str) -> str:

@@ -72,8 +72,15 @@ def test_a_file_that_does_not_build_is_a_device_error_with_its_name(
 def test_kernels_of_one_version_are_used(monkeypatch: pytest.MonkeyPatch) -> None:
     """A version that is installed while this one runs must not mix its kernels with this one's host code."""
     kernel_source("working")
-    monkeypatch.setattr(Path, "read_text", lambda _: "of another version")
+    monkeypatch.setattr(Path, "read_text", lambda *_: "of another version")
     assert "flow_warp" in kernel_source("flow")
+
+
+def test_kernels_are_read_whatever_the_locale() -> None:
+    """Comments name people who do not write themselves in ASCII."""
+    code = "from hugin_abflow.opencl import kernel_source; kernel_source('flow')"
+    plain = {"LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"}
+    subprocess.run([sys.executable, "-c", code], env={**os.environ, **plain}, check=True)
 
 
 def test_source_lines_keep_their_own_file_and_number() -> None:
