@@ -53,6 +53,9 @@ class PtoError(ProjectError):
         where = f"{file}, line {line}" if line else file
         super().__init__(f"{where}: found {token!r}, expected {expected}")
 
+    def __reduce__(self) -> tuple[type[PtoError], tuple[str, int, str, str]]:
+        return type(self), (self.file, self.line, self.token, self.expected)
+
 
 class LayersMissingError(AbflowError):
     """Layers are not there and cannot be made."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pickle
 import re
 from pathlib import Path
 
@@ -73,6 +74,14 @@ def test_the_error_names_line_token_and_expectation(
     assert expected in error.expected
     assert str(error).startswith("folder/x.pto, line 5: found ")
     assert error.exit_code is ExitCode.PROJECT
+
+
+def test_the_error_reaches_another_process() -> None:
+    """Exceptions are pickled on their way; one that cannot be read there breaks `concurrent.futures`' pools."""
+    error = pickle.loads(pickle.dumps(PtoError("x.pto", 5, "w", "a number")))
+    assert type(error) is PtoError
+    assert (error.file, error.line, error.token, error.expected) == ("x.pto", 5, "w", "a number")
+    assert str(error) == "x.pto, line 5: found 'w', expected a number"
 
 
 @pytest.mark.parametrize(
