@@ -77,7 +77,7 @@ def test_the_error_names_line_token_and_expectation(
 
 
 def test_the_error_reaches_another_process() -> None:
-    """Exceptions are pickled on their way; one that cannot be read there breaks `concurrent.futures`' pools."""
+    """Exceptions are pickled on their way; one that cannot be read there breaks a pool of processes."""
     error = pickle.loads(pickle.dumps(PtoError("x.pto", 5, "w", "a number")))
     assert type(error) is PtoError
     assert (error.file, error.line, error.token, error.expected) == ("x.pto", 5, "w", "a number")
