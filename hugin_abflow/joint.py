@@ -6,9 +6,9 @@ import importlib
 import logging
 import threading
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import combinations
@@ -111,15 +111,16 @@ def prepare_in_memory(
 ) -> Prepared:
     """`prepare`, on a smaller working canvas where the device's memory does not hold the wanted one."""
     region = working.full_grid(canvas, layers).region
-    while True:
-        try:
-            return prepare(device, layers, canvas, settings, progress, guides)
-        except DeviceMemoryError:
-            fewer = min(settings.working_limit, region.width * region.height) // 2
-            if fewer < _LEAST_WORKING_PIXELS:
-                raise
-            _log.warning("the device's memory is too small; trying again at a lower working resolution")
-            settings = replace(settings, working_pixels=fewer)
+    with _making_ready(device, layers[0], settings):
+        while True:
+            try:
+                return prepare(device, layers, canvas, settings, progress, guides)
+            except DeviceMemoryError:
+                fewer = min(settings.working_limit, region.width * region.height) // 2
+                if fewer < _LEAST_WORKING_PIXELS:
+                    raise
+                _log.warning("the device's memory is too small; trying again at a lower working resolution")
+                settings = replace(settings, working_pixels=fewer)
 
 
 def prepare(
@@ -133,7 +134,6 @@ def prepare(
     """Everything that sees far, at working resolution: flow, coefficients, geometry, colour."""
     full = working.full_grid(canvas, layers)
     grid = working.working_grid(full, settings)
-    threading.Thread(target=_make_ready, args=(device, settings), name="loader").start()
     everything = _read(device, layers, grid, progress, settings.cores)
     masks = coefficient.masks(device, everything, grid)
     used = [i for i in range(len(everything)) if not _redundant(i, everything, masks)]
@@ -165,14 +165,30 @@ def prepare(
     return Prepared(tuple(final), full, grid, correction.grid, correction.shoulder)
 
 
-def _make_ready(device: Device, settings: Settings) -> None:
-    """Load and build what comes after reading, meanwhile: it takes most of a second on one core."""
+@contextmanager
+def _making_ready(device: Device, first: Layer, settings: Settings) -> Iterator[None]:
+    """Load and build what comes after reading, meanwhile: it takes most of a second on one core, and several
+    where kernels are compiled for the first time; no process that is to end waits for all of it.
+    """
     of_flow = ("chart", "pyramid", "flow", "search", "consistency", "transition") if settings.flow else ()
-    with suppress(DeviceError):  # told where the kernel is needed
-        for module in ("coefficient", *of_flow, "highlights", "geometry", "colour", "seam"):
-            device.build(module)
-    for module in ("scipy.ndimage", "scipy.sparse.csgraph", "scipy.sparse.linalg"):
-        importlib.import_module(module)
+    kernels = ("coefficient", *of_flow, "highlights", "geometry", "colour", "seam")
+    libraries = ("scipy.ndimage", "scipy.sparse.csgraph", "scipy.sparse.linalg")
+    steps: list[Callable[[], object]] = [partial(device.build, name) for name in kernels]
+    steps += [partial(importlib.import_module, name) for name in libraries]
+    device.build("working", working.pixel_options(first)[0])  # else reading would wait for all the others
+    done = threading.Event()
+
+    def load() -> None:
+        for step in steps:
+            with suppress(DeviceError):  # told where the kernel is needed
+                if not done.is_set():
+                    step()
+
+    threading.Thread(target=load, name="loader").start()
+    try:
+        yield
+    finally:
+        done.set()
 
 
 def _align(

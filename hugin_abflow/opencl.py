@@ -331,10 +331,12 @@ class Device:
 
     def build(self, module: str, options: str = "") -> dict[str, cl.Kernel]:
         """The kernels of ``kernels/<module>.cl`` by name, built if they are not yet. For any thread."""
-        with self._building:
-            if (module, options) not in self._kernels:
-                self._kernels[module, options] = self._build(module, options)
-            return self._kernels[module, options]
+        key = module, options
+        if key not in self._kernels:  # what is built does not wait for what is being built
+            with self._building:
+                if key not in self._kernels:
+                    self._kernels[key] = self._build(module, options)
+        return self._kernels[key]
 
     def _build(self, module: str, options: str) -> dict[str, cl.Kernel]:
         try:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import threading
+from dataclasses import replace
 from itertools import pairwise, permutations
 
 import numpy as np
@@ -321,6 +323,35 @@ def test_neither_threads_nor_memory_change_a_pixel(monkeypatch):
         SettingsError, match=rf"20\.0 MiB is too little.* about {reckoned}; give {reckoned}, or"
     ):
         merged(layers, canvas, max_memory=20 << 20)
+
+
+def test_what_fails_waits_for_no_kernels(monkeypatch):
+    """Of those that are built meanwhile no other is begun: it may take seconds, as if Ctrl-C were lost."""
+
+    def wait_for_loaders():
+        for thread in threading.enumerate():
+            if thread.name == "loader":
+                thread.join(60)
+
+    wait_for_loaders()  # of other tests
+    built, failed, build = [], threading.Event(), Device.build
+
+    def slow(device, module, options=""):
+        if threading.current_thread().name == "loader":
+            built.append(module)
+            assert failed.wait(60)
+        return build(device, module, options)
+
+    def interrupted(top, bottom):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(Device, "build", slow)
+    layer = replace(masked(noise(151, 301), columns(PLANE, 0, 301)), read=interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        merged([layer], PLANE)
+    failed.set()
+    wait_for_loaders()
+    assert built == ["coefficient"]
 
 
 @pytest.mark.parametrize("upright", [False, True])

@@ -69,6 +69,15 @@ def test_a_file_that_does_not_build_is_a_device_error_with_its_name(
         device.kernel("broken", "broken")
 
 
+def test_what_is_built_does_not_wait_for_what_is_being_built(
+    device: Device, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Layers are read while kernels of what follows are built."""
+    first = device.kernel("working", "working_compare", "-DPIXEL=uchar -DSAMPLES=4")
+    monkeypatch.setattr(device, "_building", None)  # nobody gets this lock
+    assert device.kernel("working", "working_compare", "-DPIXEL=uchar -DSAMPLES=4") is first
+
+
 def test_kernels_of_one_version_are_used(monkeypatch: pytest.MonkeyPatch) -> None:
     """A version that is installed while this one runs must not mix its kernels with this one's host code."""
     kernel_source("working")
