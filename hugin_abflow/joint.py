@@ -357,7 +357,8 @@ def _check_memory(
     if needed <= limit:
         return
     given, remedy = memory.shortage(settings.max_memory, needed)
-    said = f"{given} is too little for these layers, whose flow takes about {memory.size(needed)}"
+    what = "whose flow takes" if settings.flow else "which take"
+    said = f"{given} is too little for these layers, {what} about {memory.size(needed)}"
     if settings.max_memory:
         raise SettingsError(f"{said}; {remedy}, or choose --flow-quality fast")
     _log.warning("%s; going on with that", said)

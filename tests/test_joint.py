@@ -323,6 +323,8 @@ def test_neither_threads_nor_memory_change_a_pixel(monkeypatch):
         SettingsError, match=rf"20\.0 MiB is too little.* about {reckoned}; give {reckoned}, or"
     ):
         merged(layers, canvas, max_memory=20 << 20)
+    with pytest.raises(SettingsError, match="too little for these layers, which take about"):
+        merged(layers, canvas, max_memory=20 << 20, flow=False)
 
 
 def test_what_fails_waits_for_no_kernels(monkeypatch):
