@@ -304,7 +304,7 @@ __kernel void blend_band(
     float shoulder,                      /* of the exposure scale */
     int nearest,                         /* 1: nearest-neighbour sampling */
     float share,                         /* of all weight, below which a layer is hidden */
-    __global pixel_stored *out)           /* (band.w, band.z) */
+    __global pixel_stored *out)          /* (band.w, band.z) */
 {
     const int x = 2 * get_global_id(0), y = get_global_id(1);
     if (x >= band.z || y >= band.w)
