@@ -334,8 +334,7 @@ class Device:
         key = module, options
         if key not in self._kernels:  # what is built does not wait for what is being built
             with self._building:
-                if key not in self._kernels:
-                    self._kernels[key] = self._build(module, options)
+                self._kernels[key] = self._kernels.get(key) or self._build(module, options)
         return self._kernels[key]
 
     def _build(self, module: str, options: str) -> dict[str, cl.Kernel]:
