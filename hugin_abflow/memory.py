@@ -6,6 +6,7 @@ Host and device count together: the device may be the host's own processor.
 from __future__ import annotations
 
 import ctypes
+import math
 import re
 import sys
 from contextlib import suppress
@@ -70,11 +71,16 @@ def shortage(max_memory: int, needed: int) -> tuple[str, str]:
     whole = size(limit(max_memory) * _sharers)
     given = f"--max-memory {whole}" if max_memory else f"half of the machine's memory, {whole}"
     if _sharers == 1:
-        return given, f"give {size(needed)}"
+        return given, f"give {_enough(needed)}"
     return (
         f"{given}, for each of {_sharers} --jobs {size(limit(max_memory))},",
-        f"give {size(needed * _sharers)}, or fewer --jobs",
+        f"give {_enough(needed * _sharers)}, or fewer --jobs",
     )
+
+
+def _enough(needed: int) -> str:
+    """For so many bytes, as `--max-memory` takes it; a little more, since what a process holds varies."""
+    return f"{math.ceil(needed * 1.03 / (1 << 20))}M"
 
 
 def resident() -> int:

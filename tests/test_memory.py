@@ -53,7 +53,7 @@ def test_processes_side_by_side_share_the_limit(monkeypatch: pytest.MonkeyPatch)
     assert memory.limit(8 * MIB) == 2 * MIB
     given, remedy = memory.shortage(8 * MIB, 3 * MIB)
     assert given == "--max-memory 8.0 MiB, for each of 4 --jobs 2.0 MiB,"
-    assert remedy == "give 12.0 MiB, or fewer --jobs"
+    assert remedy == "give 13M, or fewer --jobs"
     monkeypatch.setattr(memory, "machine", lambda: 64 * MIB)
     assert memory.shortage(0, 9 * MIB)[0].startswith("half of the machine's memory, 32.0 MiB, for each of 4")
 
