@@ -12,7 +12,6 @@ twice: how much does peak memory grow with height alone?
 from __future__ import annotations
 
 import argparse
-import statistics
 import sys
 from pathlib import Path
 
@@ -22,7 +21,7 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
 from benchmarks.rigs import RIGS
-from benchmarks.speed import ROOT, Run, make_layers, measure
+from benchmarks.speed import ROOT, Run, make_layers, measure, median
 from hugin_abflow.images import ImageWriter, read_layer
 from sample_projects.project import project_text
 
@@ -111,11 +110,6 @@ def blend(folder: Path, options: list[str]) -> Run:
     run = measure([sys.executable, "-m", "hugin_abflow", *arguments])
     out.unlink()
     return run
-
-
-def median(runs: list[Run]) -> Run:
-    """Of each figure by itself."""
-    return Run(*(statistics.median(getattr(run, key) for run in runs) for key in ("wall", "cpu", "peak")))
 
 
 def tall_table(runs: dict[int, Run]) -> str:

@@ -16,7 +16,7 @@ import statistics
 import sys
 import tempfile
 import time
-from dataclasses import dataclass
+from dataclasses import astuple, dataclass
 from pathlib import Path
 
 import numpy as np
@@ -93,14 +93,16 @@ def commands(folder: Path, width: int) -> dict[str, list[str]]:
     }
 
 
+def median(runs: list[Run]) -> Run:
+    """Of each figure by itself."""
+    return Run(*(statistics.median(getattr(run, key) for run in runs) for key in ("wall", "cpu", "peak")))
+
+
 def table(runs: dict[str, list[Run]]) -> str:
     """Medians, and their ratios to the first blender's."""
     lines = ["| blender | wall s | CPU s | peak MiB | wall ratio | CPU ratio | memory ratio |"]
     lines.append("|---|---|---|---|---|---|---|")
-    medians = {
-        name: [statistics.median(getattr(run, key) for run in done) for key in ("wall", "cpu", "peak")]
-        for name, done in runs.items()
-    }
+    medians = {name: astuple(median(done)) for name, done in runs.items()}
     reference = next(iter(medians.values()))
     for name, (wall, cpu, peak) in medians.items():
         ratios = [value / base for value, base in zip((wall, cpu, peak), reference, strict=True)]

@@ -15,7 +15,7 @@ import numpy.typing as npt
 
 from hugin_abflow.opencl import Device
 from hugin_abflow.pyramid import Level
-from hugin_abflow.working import Grid, WorkingLayer
+from hugin_abflow.working import Grid, WorkingLayer, directions
 
 # Chart pixels around the overlap, so that flow is smooth across its border.
 _MARGIN = 16
@@ -46,7 +46,7 @@ class Chart:
         """Unit vectors (n, 3) in which positions (n, 2) on a sphere's chart are seen, in its own axes."""
         t = self.transform.astype(np.float64)
         lon, lat = (places[:, 0] - t[11]) / t[9], (t[12] - places[:, 1]) / t[10]
-        return np.stack([np.cos(lat) * np.sin(lon), np.cos(lat) * np.cos(lon), np.sin(lat)], 1)
+        return directions(lon, lat)
 
     @property
     def spherical(self) -> bool:

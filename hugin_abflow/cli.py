@@ -153,7 +153,7 @@ _information = partial(click.option, cls=Option, group="Information")
     type=click.Choice(get_args(LargeMotion)),
     default=_DEFAULTS.large_motion,
     help="Search for motion of up to a tenth of the canvas's width (very near things). auto: keep what makes "
-    "photos clearly more alike and did not walk; on: all that is found, by which grids may mislead.",
+    "photos clearly more alike, unless it is small and walked; on: all that is found, even if grids mislead.",
 )
 @_blending(
     "--seam",

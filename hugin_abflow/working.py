@@ -34,6 +34,14 @@ _MOST_ROWS = 32_000
 PIXEL = {"uint8": ("uchar", 255.0), "uint16": ("ushort", 65535.0), "float32": ("float", 1.0)}
 
 
+def directions(
+    longitudes: npt.NDArray[np.float64], latitudes: npt.NDArray[np.float64]
+) -> npt.NDArray[np.float64]:
+    """Unit vectors (n, 3) to places (n,) on a sphere, radians (kernels/common.cl)."""
+    level = np.cos(latitudes)
+    return np.stack([level * np.sin(longitudes), level * np.cos(longitudes), np.sin(latitudes)], 1)
+
+
 @dataclass(frozen=True)
 class Grid:
     """A pixel grid over the region.
@@ -77,7 +85,7 @@ class Grid:
         if not self.lens[1]:
             return np.stack([x, y, np.zeros_like(x)], 1)
         lon, lat = self.lens[0] + x * self.lens[1], self.lens[2] - y * self.lens[3]
-        return np.stack([np.cos(lat) * np.sin(lon), np.cos(lat) * np.cos(lon), np.sin(lat)], 1)
+        return directions(lon, lat)
 
     def places(self, points: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
         """The inverse of `points`; points on a sphere may have any length but 0."""

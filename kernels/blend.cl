@@ -26,7 +26,7 @@ typedef struct {
     int unused[5];
 } blend_layer;
 
-/* r, g, b, alpha in stored units of two pixels. */
+/* pixel_samples of common.cl for two pixels: in OpenCL C no text says which samples go where for both. */
 static inline float8 blend_colours(blend_pixels p) {
 #if SAMPLES > 2
     return convert_float8(p);
@@ -143,10 +143,6 @@ static float4 blend_sample(__global const pixel_stored *stored, __global const b
     return linear.w > 0.0f ? (float4)(linear.xyz / linear.w, linear.w) : (float4)(0.0f);
 }
 
-static inline int blend_clamp(int i, int size) {
-    return i < 0 ? 0 : i < size ? i : size - 1;
-}
-
 /* Values of coarse arrays at the heights of a band's rows, linear between their rows; beyond an array, its rim.
    Weights (w) that are less than a share of their sum, which nobody sees, become negative. */
 __kernel void blend_rows(__global const float4 *values, /* arrays one after the other: (box.w, box.z) each */
@@ -171,8 +167,8 @@ __kernel void blend_rows(__global const float4 *values, /* arrays one after the 
         if (column < 0 || column >= box.z)
             continue;
         __global const float4 *from = values + arrays[k].s4 + column;
-        const float4 a = from[blend_clamp(upper - box.y, box.w) * box.z];
-        const float4 v = a + t * (from[blend_clamp(upper + 1 - box.y, box.w) * box.z] - a);
+        const float4 a = from[LIMITED(upper - box.y, 0, box.w - 1) * box.z];
+        const float4 v = a + t * (from[LIMITED(upper + 1 - box.y, 0, box.w - 1) * box.z] - a);
         rows[arrays[k].s5 + y * box.z + column] = v;
         total += v.w > 0.0f ? v.w : 0.0f;
     }

@@ -49,24 +49,17 @@ static inline float square3(float3 a) {
 }
 
 /* exp(a) to 1e-7, exactly 1 for 0, of -87 to 88: a power of two times a polynomial fitted to 2^t over 0..1. */
-static inline float exponential1(float a) {
-    const float y = a * 1.44269504f;
-    int whole = (int)y;
-    whole -= y < (float)whole ? 1 : 0;
-    const float t = y - (float)whole, upper = 0.0557999383f + t * (0.00901699517f + t * 0.00186714665f);
-    return (1.0f + t * (0.693151312f + t * (0.240164443f + t * upper))) * as_float((whole + 127) << 23);
-}
-
 #define EXPONENTIAL(n)                                                                                             \
     static inline float##n exponential##n(float##n a) {                                                            \
         const float##n y = a * 1.44269504f;                                                                        \
         int##n whole = convert_int##n(y);                                                                          \
-        whole += y < convert_float##n(whole); /* true is -1 */                                                     \
+        whole -= y < convert_float##n(whole) ? (int##n)(1) : (int##n)(0);                                          \
         const float##n t = y - convert_float##n(whole);                                                            \
         const float##n upper = 0.0557999383f + t * (0.00901699517f + t * 0.00186714665f);                          \
         const float##n power = 1.0f + t * (0.693151312f + t * (0.240164443f + t * upper));                         \
         return power * as_float##n((whole + 127) << 23);                                                           \
     }
+EXPONENTIAL()
 EXPONENTIAL(4)
 EXPONENTIAL(8)
 

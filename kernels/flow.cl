@@ -213,7 +213,7 @@ static inline float flow_link(__global const float *board, int pitch, int at, in
     __global const float *u = board + BOARD_U * pitch, *v = board + BOARD_V * pitch;
     const float step = (h[at] - h[to]) / contrast, du = u[to] - u[at], dv = v[to] - v[at];
     const float edge = valid[at] * valid[to] > 0.0f ? LEAST(MAGNITUDE(step), 80.0f) : 0.0f;
-    return exponential1(-edge) / ROOT(du * du + dv * dv + 1e-4f);
+    return exponential(-edge) / ROOT(du * du + dv * dv + 1e-4f);
 }
 
 /* The linear system of one warp, for the whole flow (not the increment). */

@@ -127,7 +127,7 @@ __kernel void geometry_softmax(__global float4 *field,       /* (box.w, box.z); 
     const int at = y * box.z + x;
     const float a = field[at].w - highest[(y + box.y) * border.x + x + box.x];
     field[at].w = blend[at] > 0.0f
-                      ? rim[at] / 255.0f * exponential1(GREATEST(a, -87.0f))
+                      ? rim[at] / 255.0f * exponential(GREATEST(a, -87.0f))
                       : 0.0f;
 }
 

@@ -40,5 +40,5 @@ __kernel void highlights_yield(__global float4 *field,       /* (box.w, box.z) o
     const float2 ratio = (float2)((float)cells.x / border.x, (float)cells.y / border.y);
     const float share = bilinear_scalar(clipped, (float2)(x + box.x + 0.5f, y + box.y + 0.5f) * ratio, cells);
     if (share > 0.0f) /* hardly anywhere: elsewhere nothing is read or written */
-        field[y * box.z + x].w *= exponential1(-strength * share);
+        field[y * box.z + x].w *= exponential(-strength * share);
 }

@@ -57,7 +57,7 @@ __kernel void transition_sharpen(__global float *blend,           /* (box.w, box
         const float2 ratio = (float2)((float)cells.x / border.x, (float)cells.y / border.y);
         const float n = bilinear_scalar(power, ((float2)(x + box.x, y + box.y) + 0.5f) * ratio, cells);
         const float exponent = n * logarithm1(w);
-        w = exponent > -87.0f ? exponential1(exponent) : 0.0f;
+        w = exponent > -87.0f ? exponential(exponent) : 0.0f;
     }
     blend[at] = w;
     total[(y + box.y) * border.x + x + box.x] += w;
