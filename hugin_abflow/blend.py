@@ -49,6 +49,7 @@ class BlendLayer:
     field   displacement and colour weight, float32 (height, width, 4).
     reach   per row of `field`, the largest vertical displacement, working px.
     gain    on the exposure scale and the colour grid, float32 (height, width, 4); None: no correction.
+    offset  what is added after that (multiband.py), its place on its grid and float32 (height, width, 4).
     """
 
     layer: Layer
@@ -56,6 +57,7 @@ class BlendLayer:
     field: Buffer
     reach: Sequence[float]
     gain: Buffer | None
+    offset: tuple[tuple[int, int, int, int], Buffer] | None = None
 
 
 @dataclass(frozen=True)
@@ -72,6 +74,7 @@ def bands(
     full: Grid,
     grid: Grid,
     gain_grid: Grid,
+    offset_grid: Grid,
     shoulder: float,
     crop: Box,
     settings: Settings,
@@ -86,7 +89,9 @@ def bands(
     while top < crop.bottom:
         rest = Box(crop.left, top, crop.right, crop.bottom)
         try:
-            for out in _bands(device, layers, full, grid, gain_grid, shoulder, rest, height, settings):
+            for out in _bands(
+                device, layers, full, grid, gain_grid, offset_grid, shoulder, rest, height, settings
+            ):
                 yield out
                 advance(len(out))
                 top += len(out)
@@ -135,7 +140,7 @@ def _pass_memory(layers: Sequence[BlendLayer], plan: Sequence[_Band]) -> int:
         )
         for band in plan
     )
-    lines = sum(16 * one.box[2] * part.height for one in layers)
+    lines = sum(16 * (one.box[2] + (one.offset[0][2] if one.offset else 0)) * part.height for one in layers)
     return shelves.total * pixel + fresh * pixel + 4 * out + 2 * lines
 
 
@@ -145,6 +150,7 @@ def _bands(
     full: Grid,
     grid: Grid,
     gain_grid: Grid,
+    offset_grid: Grid,
     shoulder: float,
     crop: Box,
     height: int,
@@ -158,10 +164,13 @@ def _bands(
     whole = (0, 0, gain_grid.width, gain_grid.height)
     fields = [(layer.box, layer.field) for layer in layers]
     gains = [(whole, layer.gain) for layer in layers if layer.gain is not None]
+    offsets = [layer.offset for layer in layers if layer.offset is not None]
     longitudes = _turn(device, full.lens[0], full.lens[1], crop.left - region.left, crop.width)
     plan = _plan(layers, full, grid, crop, height)
     lines = plan[0].part.height
-    ways, gained = (device.empty((lines * sum(box[2] for box, _ in arrays), 4)) for arrays in (fields, gains))
+    ways, gained, added = (
+        device.empty((lines * sum(box[2] for box, _ in arrays), 4)) for arrays in (fields, gains, offsets)
+    )
     with _Store(
         device, [layer.layer for layer in layers], [band.rows for band in plan], settings.cores
     ) as store:
@@ -172,19 +181,23 @@ def _bands(
             store.next()
             way_starts = _lines(device, fields, part, full, grid, share, ways)
             gain_starts = _lines(device, gains, part, full, gain_grid, 0.0, gained)
+            offset_starts = _lines(device, offsets, part, full, offset_grid, 0.0, added)
             table = np.zeros((len(layers), 16), np.int32)
             for k, (layer, (start, end)) in enumerate(zip(layers, band.rows, strict=True)):
                 box, ring = layer.layer.box, store.shelves.rings[k]
                 table[k, :4] = box.left - region.left, box.top - region.top + start, box.width, end - start
                 table[k, 4:8] = layer.box[0], layer.box[2], ring.start, way_starts[k]
                 table[k, 8] = -1 if layer.gain is None else gain_starts.pop(0)
-                table[k, 9:11] = ring.rows, start % ring.rows
+                table[k, 9:12] = ring.rows, start % ring.rows, -1
+                if layer.offset is not None:
+                    table[k, 11:14] = offset_starts.pop(0), layer.offset[0][0], layer.offset[0][2]
             used = [k for k, (start, end) in enumerate(band.rows) if start < end]
             latitudes = _turn(device, full.lens[2], -full.lens[3], part.top, part.height)
             out = device.empty((part.height, part.width, first.channels + 1), device_dtype(first))
             device.run(
                 "blend", "blend_band", pairs, store.rows, device.upload(table[used]), len(used), ways, gained,
-                longitudes, latitudes, full.border, full.lens, grid.border, gain_grid.border,
+                added, longitudes, latitudes, full.border, full.lens, grid.border, gain_grid.border,
+                offset_grid.border,
                 (part.left, part.top, *size), (region.left, region.top),
                 shoulder, int(settings.interpolation == "nearest"), share, out, options=options,
             )  # fmt: skip

@@ -53,7 +53,7 @@ _UNSEEN = 0.003
 # The correction fades out over this share of the canvas's width; a trend hardly does.
 _FADE, _TREND_FADE = 0.12, 1.0
 # All gains shrink towards 0 by this, at most a quarter of an 8-bit level, so that small ones are exactly 0.
-_NEGLIGIBLE = 1e-3
+NEGLIGIBLE = 1e-3
 
 # Shoulders of the exposure scale that are tried for integer images, and by how much better than the first,
 # which keeps white, another one has to explain the differences.
@@ -155,12 +155,12 @@ def correction(
     if ignored is not None:
         counts = ~on_cells(ignored[None], cells, np.logical_or)[0]
         differences = tuple(_weighed(d, counts) for d in differences)
-    if settings.flow:  # without, layers are cut, and `ignored` leaves what is beside the cuts
+    if settings.flow:  # without, nobody knows yet where layers will be cut
         differences = tuple(_weighed(d, d.mixing + _UNSEEN) for d in differences)
     if not any(np.any(v[..., :3] * v[..., 3:]) for d in differences for v in (d.values, d.beyond)):
         return none
     gains = solve(replace(measured, differences=differences), _STRICT if strict else _ROUNDS)
-    gains = np.sign(gains) * np.maximum(np.abs(gains) - _NEGLIGIBLE, 0)
+    gains = np.sign(gains) * np.maximum(np.abs(gains) - NEGLIGIBLE, 0)
     result: list[Buffer | None] = []
     for gain, mask in zip(gains, inside, strict=True):
         if not gain.any():

@@ -29,6 +29,7 @@ from hugin_abflow import (
     guidance,
     highlights,
     memory,
+    multiband,
     quality,
     seam,
     transition,
@@ -56,9 +57,9 @@ _LEAST_OVERLAP = 64
 _SEAM_ROUNDS = 2
 # Motion that is looked for, as a share of the canvas's width.
 _REACH = 0.1
-# Bytes that are to come for each working pixel of a layer: a field, an array of coefficients, a rim; for each
-# that two layers share: flow both ways, on a chart that is half as large again.
-_STEP_BYTES, _FLOW_BYTES = 16 + 4 + 1, 1.5 * 16
+# Bytes that are to come for each working pixel of a layer: a field, an array of coefficients, a rim, offsets
+# and what they are made from; for each that two layers share: flow both ways, on a chart half as large again.
+_STEP_BYTES, _FLOW_BYTES = 16 + 4 + 1 + 9, 1.5 * 16
 # Below this a working canvas is too small to be worth another attempt.
 _LEAST_WORKING_PIXELS = 20_000
 
@@ -71,6 +72,7 @@ class Prepared:
     full: Grid
     grid: Grid
     gain_grid: Grid
+    offset_grid: Grid
     shoulder: float
 
 
@@ -97,7 +99,7 @@ def bands(
     with progress("blend", canvas.crop.height) as advance:
         yield from blend.bands(
             device, prepared.layers, prepared.full, prepared.grid, prepared.gain_grid,
-            prepared.shoulder, canvas.crop, settings, advance,
+            prepared.offset_grid, prepared.shoulder, canvas.crop, settings, advance,
         )  # fmt: skip
 
 
@@ -154,15 +156,22 @@ def prepare(
             flows[index] = consistency.mend(device, pair_flow)
         pairs = [pair for pair, _ in overlaps]
         fields, correction, whole = _align(device, reduced, pairs, flows, masks, grid, settings)
+        offsets = multiband.none(grid, len(reduced))
+        if settings.exposure and pairs:
+            offsets = multiband.offsets(device, reduced, fields, correction, grid)
         if _log.isEnabledFor(logging.INFO):
             _tell_overlaps(reduced, overlaps, shifts, grid, whole)
         final = [
-            BlendLayer(layer.layer, layer.box, field, geometry.reach(device, layer, field, grid), gain)
-            for layer, field, gain in zip(reduced, fields, correction.gains, strict=True)
+            BlendLayer(
+                layer.layer, layer.box, field, geometry.reach(device, layer, field, grid), gain, offset
+            )
+            for layer, field, gain, offset in zip(
+                reduced, fields, correction.gains, offsets.layers, strict=True
+            )
         ]
         advance(1)
     final += [_unblended(device, everything[i]) for i in range(len(everything)) if i not in used]
-    return Prepared(tuple(final), full, grid, correction.grid, correction.shoulder)
+    return Prepared(tuple(final), full, grid, correction.grid, offsets.grid, correction.shoulder)
 
 
 @contextmanager
@@ -171,7 +180,7 @@ def _making_ready(device: Device, first: Layer, settings: Settings) -> Iterator[
     where kernels are compiled for the first time; no process that is to end waits for all of it.
     """
     of_flow = ("chart", "pyramid", "flow", "search", "consistency", "transition") if settings.flow else ()
-    kernels = ("coefficient", *of_flow, "highlights", "geometry", "colour", "seam")
+    kernels = ("coefficient", *of_flow, "highlights", "geometry", "colour", "seam", "multiband")
     libraries = ("scipy.ndimage", "scipy.sparse.csgraph", "scipy.sparse.linalg")
     steps: list[Callable[[], object]] = [partial(device.build, name) for name in kernels]
     steps += [partial(importlib.import_module, name) for name in libraries]
@@ -230,8 +239,9 @@ def _align(
             break
         regions = grown
     if settings.seam and not settings.flow:
-        # exposures have to agree where the eye compares them; elsewhere unaligned layers tell little
-        regions = ~seam.divide(device, layers, fields, pairs, strict, masks, grid)
+        seam.divide(device, layers, fields, pairs, strict, masks, grid)
+        # what is not aligned tells little of exposures; bands of frequencies change over as they are
+        return fields, correct(replace(settings, exposure=False)), whole
     elif regions is not None:
         whole = regions
         with ThreadPoolExecutor(1, "gains") as beside:  # solved on one core: the device cuts meanwhile
@@ -320,7 +330,7 @@ def _redundant(index: int, layers: Sequence[WorkingLayer], masks: Masks) -> bool
 def _unblended(device: Device, layer: WorkingLayer) -> BlendLayer:
     """A layer without weight: it shows only where no other layer is."""
     left, top = layer.box[:2]
-    return BlendLayer(layer.layer, (left, top, 1, 1), device.zeros((1, 1, 4)), [0.0], None)
+    return BlendLayer(layer.layer, (left, top, 1, 1), device.zeros((1, 1, 4)), [0.0], None, None)
 
 
 def _overlaps(

@@ -15,7 +15,7 @@ over best where it does so slowly.
 
 Where there is no flow, layers are not aligned, and each overlap is such a region, whole: on finer cells, with
 the mean square of the difference in place of r, since fine texture is as much in the way of a cut, and with
-narrow transitions. Low frequencies are not blended across them: the gains of colour.py make them agree there.
+narrow transitions; multiband.py blends low frequencies across them.
 """
 
 from __future__ import annotations
@@ -49,8 +49,6 @@ _LEAST = 6.0
 _CUT = 20.0
 # The same without flow, where the softmax has little to say: overlaps are some hundred cells wide.
 _FINE_CUT = 120.0
-# Cells to each side of a cut whose exposure counts.
-_BESIDE = 4
 # Residual of layers that agree, without flow: of two cuts that nobody sees the shorter one is taken.
 _SHORTER = 0.005
 # No layer is taken where it is not.
@@ -118,11 +116,8 @@ def divide(
     correction: Correction,
     masks: Masks,
     grid: Grid,
-) -> npt.NDArray[np.bool_]:
-    """Give each cell of every overlap of layers that are not aligned to one layer, as `cut` does.
-
-    Returns where the cuts are, with some cells beside them: (height, width) on a grid over the same region.
-    """
+) -> None:
+    """Give each cell of every overlap of layers that are not aligned to one layer, as `cut` does."""
     cells = grid.coarser(_FINE_CELL)
     residual = np.zeros(cells.shape)
     for pair in pairs:
@@ -132,7 +127,6 @@ def divide(
     owner = _owners(layers, fields, residual, whole, masks, grid, cells, _FINE_CUT)
     yields = [(whole & (owner != k)).astype(np.float32) for k in range(len(layers))]
     _yield(device, layers, fields, yields, grid, cells)
-    return _beside_cuts(owner, cells.wraps)
 
 
 def _owners(
@@ -158,14 +152,6 @@ def _owners(
         rows, columns = np.nonzero(region)
         owner[rows, columns] = label(rows, columns, residual, shares, cover, cells.wraps, cut_price)
     return owner
-
-
-def _beside_cuts(owner: npt.NDArray[np.intp], wraps: bool) -> npt.NDArray[np.bool_]:
-    """Cells around which the owner changes."""
-    size, modes = 2 * _BESIDE + 1, ("nearest", "wrap" if wraps else "nearest")
-    highest = scipy.ndimage.maximum_filter(owner, size, mode=modes)
-    lowest = scipy.ndimage.minimum_filter(np.where(owner < 0, owner.max() + 1, owner), size, mode=modes)
-    return np.asarray(lowest < highest)
 
 
 def _yield(

@@ -23,7 +23,9 @@ typedef struct {
     int2 way;       /* left, width of its field on the working grid */
     int rows, ways, gains; /* where it begins in `stored`, `ways` and `gains`; gains -1: no correction */
     int ring, turn; /* rows lie in a ring of so many, the first one there */
-    int unused[5];
+    int offsets;    /* where they begin in `offsets`; -1: none */
+    int2 span;      /* left, width of its offsets on their grid */
+    int unused[2];
 } blend_layer;
 
 /* pixel_samples of common.cl for two pixels: in OpenCL C no text says which samples go where for both. */
@@ -216,21 +218,43 @@ static inline float8 blend_read(__global const float4 *line, blend_between at) {
     return a + BLEND_EACH(at.t) * (b - a);
 }
 
-/* Smooth exposure correction of two pixels: what odds are multiplied by, less 1; where there is one. */
+/* How two pixels are corrected: what odds are multiplied by, less 1, then what is added, for floats to the logarithms
+   of exposure_scale; where there is something. */
 typedef struct {
-    float8 rise;
+    float8 rise, offset;
     int2 some;
-} blend_exposure;
+} blend_correction;
 
-static inline blend_exposure blend_gain(__global const float4 *gains, __global const blend_layer *layer, int row,
-                                        blend_between cell) {
-    blend_exposure result = {(float8)(0.0f), (int2)(0)};
+/* Where corrections of two pixels are read: arrays, columns, the row of gains and that of the band. */
+typedef struct {
+    __global const float4 *gains, *offsets;
+    blend_between cell, column;
+    int gain_row, row;
+    int4 offset_border;
+} blend_corrections;
+
+static inline blend_correction blend_corrected(const blend_corrections *from, __global const blend_layer *layer) {
+    blend_correction result = {(float8)(0.0f), (float8)(0.0f), (int2)(0)};
     if (layer->gains >= 0) {
-        const float8 gain = blend_read(gains + layer->gains + row, cell);
+        const float8 gain = blend_read(from->gains + layer->gains + from->gain_row, from->cell);
         result.rise = exponential8(gain) - 1.0f;
         result.some = blend_any(gain);
     }
+    if (layer->offsets >= 0) {
+        const float8 offset = blend_read(from->offsets + layer->offsets + from->row * layer->span.y,
+                                         blend_within(from->column, layer->span, from->offset_border));
+        result.offset = INTEGER ? WHITE * offset : exponential8(offset) - 1.0f;
+        result.some |= blend_any(offset);
+    }
     return result;
+}
+
+static inline float8 blend_correct(float8 c, blend_correction by, float shoulder) {
+    c = exposure_raise8(c, by.rise, WHITE, shoulder);
+    if (INTEGER)
+        return c + by.offset;
+    const float8 light = GREATEST(c, (float8)(0.0f)), v = c + (light + EXPOSURE_FLOOR) * by.offset;
+    return v < 0.0f && c >= 0.0f ? (float8)(0.0f) : v;
 }
 
 /* atan2 of positive x; a few terms of the series do where angles are small, as they nearly always are. */
@@ -291,10 +315,11 @@ __kernel void blend_band(
     __global const blend_layer *layers, int count, /* those that the band may touch */
     __global const float4 *ways,         /* per layer, (band.w, way.y): displacement, weight, from blend_rows */
     __global const float4 *gains,        /* per corrected layer, (band.w, gain_border.x) */
+    __global const float4 *offsets,      /* per layer with offsets, (band.w, span.y) */
     __global const float2 *columns,      /* (band.z) sine and cosine of longitude; plane: not used */
     __global const float2 *lines,        /* (band.w) sine and cosine of latitude; plane: not used */
     int4 border, float4 lens,            /* full-resolution grid of the region */
-    int4 field_border, int4 gain_border, /* working grid; colour grid */
+    int4 field_border, int4 gain_border, int4 offset_border, /* working grid; colour grid; grid of offsets */
     int4 band,                           /* its place: left, top, width, height; run size: pairs of columns, rows */
     int2 origin,                         /* the region's place on the canvas */
     float shoulder,                      /* of the exposure scale */
@@ -309,12 +334,13 @@ __kernel void blend_band(
     const float2 px = convert_float2(place.x + (int2)(0, 1)) + 0.5f;
     const float py = place.y + 0.5f;
     const float2 scale = (float2)((float)border.x / field_border.x, (float)border.y / field_border.y);
-    const blend_between cell =
-        blend_within(blend_columns(px * ((float)gain_border.x / border.x)), (int2)(0, gain_border.x), gain_border);
-    const int row = y * gain_border.x;
+    const blend_corrections corrections = {
+        gains, offsets,
+        blend_within(blend_columns(px * ((float)gain_border.x / border.x)), (int2)(0, gain_border.x), gain_border),
+        blend_columns(px * ((float)offset_border.x / border.x)), y * gain_border.x, y, offset_border};
 
     int first = count;
-    blend_exposure exposure, first_exposure;
+    blend_correction correction, first_correction;
     int2 known = (int2)(0), several = (int2)(0), corrected = (int2)(0);
     float8 reference = (float8)(0.0f);
     for (int k = 0; k < count && blend_some(!several); ++k) {
@@ -324,13 +350,13 @@ __kernel void blend_band(
         known |= seen;
         if (!blend_some(fresh))
             continue;
-        exposure = blend_gain(gains, layers + k, row, cell);
+        correction = blend_corrected(&corrections, layers + k);
         if (first == count) {
             first = k;
-            first_exposure = exposure;
+            first_correction = correction;
         }
-        own = exposure_raise8(own, exposure.rise, WHITE, shoulder);
-        corrected |= fresh & exposure.some;
+        own = blend_correct(own, correction, shoulder);
+        corrected |= fresh & correction.some;
         reference = BLEND_EACH(fresh) ? own : reference;
     }
     float8 sum = (float8)(0.0f);
@@ -375,9 +401,9 @@ __kernel void blend_band(
                 }
                 /* a sample that falls outside its layer counts smoothly less */
                 w *= c.s37 * c.s37;
-                exposure = k == first ? first_exposure : blend_gain(gains, layers + k, row, cell);
-                c = exposure_raise8(c, exposure.rise, WHITE, shoulder);
-                corrected |= exposure.some & (w > 0.0f);
+                correction = k == first ? first_correction : blend_corrected(&corrections, layers + k);
+                c = blend_correct(c, correction, shoulder);
+                corrected |= correction.some & (w > 0.0f);
                 float8 part = (c - reference) * BLEND_EACH(w);
                 part.s37 = w;
                 all += part;

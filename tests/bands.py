@@ -47,8 +47,9 @@ def blend_layer(
     grid: Grid,
     field: np.ndarray | None = None,
     gain: np.ndarray | None = None,
+    offset: np.ndarray | None = None,
 ) -> BlendLayer:
-    """A layer as the pass takes it; without a field it does not move."""
+    """A layer as the pass takes it; without a field it does not move. gain, offset: on grids of `merged`."""
     layer = Layer.from_array("layer", pixels, left + full.region.left, top + full.region.top)
     reduced = working.reduce_layer(device, layer, grid, lambda units: None)
     if field is None:
@@ -58,7 +59,9 @@ def blend_layer(
         field = field[: reduced.box[3], : reduced.box[2]]
     buffer = device.upload(field)
     reach = geometry.reach(device, reduced, buffer, grid)
-    return BlendLayer(layer, reduced.box, buffer, reach, None if gain is None else device.upload(gain))
+    gains = None if gain is None else device.upload(gain)
+    offsets = None if offset is None else ((0, 0, *offset.shape[1::-1]), device.upload(offset))
+    return BlendLayer(layer, reduced.box, buffer, reach, gains, offsets)
 
 
 def merged(
@@ -66,7 +69,7 @@ def merged(
 ) -> np.ndarray:
     shoulder = float(layers[0].layer.dtype.kind == "u")
     parts = blend.bands(
-        device, layers, full, grid, grid.resized(7, 5), shoulder, crop or full.region,
-        Settings(band_rows=rows), lambda units: None,
+        device, layers, full, grid, grid.resized(7, 5), grid.resized(24, 13), shoulder,
+        crop or full.region, Settings(band_rows=rows), lambda units: None,
     )  # fmt: skip
     return np.concatenate(list(parts))

@@ -44,6 +44,12 @@ GRIDS = {
 }
 
 
+def boxes(grid: Grid) -> list[tuple[int, int, int, int]]:
+    """The whole grid; a part that lies at its right border; one inside."""
+    w, h = grid.width, grid.height
+    return [(0, 0, w, h), (9, 1, w - 9, h - 3), (5, h // 3, w // 2, h // 2)]
+
+
 def patches(seed: int, width: int, height: int, share: float, size: int = 5) -> np.ndarray:
     """A random mask, float32 0 or 1, in patches."""
     random = np.random.default_rng(seed)

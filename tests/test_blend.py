@@ -129,9 +129,9 @@ def blended_rows(
 def test_a_band_of_three_layers_equals_its_twin(
     device: Device, dtype: type, channels: int, name: str, nearest: int
 ) -> None:
-    """They overlap in part, reach across the border, and differ in exposure; some is hidden."""
+    """They overlap in part, reach across the border, differ in exposure and are raised; some is hidden."""
     full = GRIDS[name]
-    grid, cells = full.resized(48, 25), full.resized(7, 5)
+    grid, cells, halves = full.resized(48, 25), full.resized(7, 5), full.resized(24, 13)
     places = [(3, 0, 50, 37), (0, 5, full.width, 34), (20, 2, 40, 30)]
     boxes = [(2, 0, 31, 24), (0, 3, 48, 22), (12, 1, 26, 20)]
     band, origin, share = (2, 1, 71, 36), (1301, 77), 0.05
@@ -143,16 +143,24 @@ def test_a_band_of_three_layers_equals_its_twin(
         gain = np.random.default_rng(seed).normal(size=(5, 7, 4)).astype(np.float32) * 0.2
         gain[:, :3] = 0
         gains.append(gain)
+    spans = [(0, 0, 24, 13), (9, 1, 15, 11)]
+    offsets = [np.random.default_rng(20 + i).normal(size=(box[3], box[2], 4)) for i, box in enumerate(spans)]
+    offsets = [(0.15 * offset).astype(np.float32) for offset in offsets]
+    for offset in offsets:
+        offset[:, :4] = 0
     stored = [stored_pixels(5 + i, p[2], p[3], dtype, channels, 0.95) for i, p in enumerate(places)]
     options, white = options_of(Layer.from_array("a", stored[0]))
     ways, _ = blended_rows(device, fields, boxes, full, grid, band, share)
     gained, _ = blended_rows(device, gains[1:], [(0, 0, 7, 5)] * 2, full, cells, band, 0.0)
+    added, _ = blended_rows(device, offsets, spans, full, halves, band, 0.0)
 
     table = np.zeros((3, 16), np.int32)
     table[:, :4] = places
     table[:, 4:6] = [(box[0], box[2]) for box in boxes]
     table[:, 7] = np.cumsum([0, *(box[2] * band[3] for box in boxes)])[:3]
     table[:, 8] = -1, 0, 7 * band[3]
+    # the second layer has none
+    table[:, 11:14] = (0, 0, 24), (-1, 0, 0), (24 * band[3], 9, 15)
     # rings of as many rows as there are, or more; they begin anywhere
     rings, turns = [p[3] + spare for p, spare in zip(places, (0, 3, 1), strict=True)], (0, 30, 17)
     table[:, 6] = np.cumsum([0, *(p[2] * ring for p, ring in zip(places, rings, strict=True))])[:3]
@@ -166,18 +174,19 @@ def test_a_band_of_three_layers_equals_its_twin(
     axes = [device.upload(np.stack([np.sin(a), np.cos(a)], -1).astype(np.float32)) for a in angles]
     out = device.empty((36, 71, channels + 1), dtype)
     packed = [
-        np.concatenate([a.reshape(-1, a.shape[-1]) for a in arrays]) for arrays in (turned, ways, gained)
+        np.concatenate([a.reshape(-1, a.shape[-1]) for a in arrays])
+        for arrays in (turned, ways, gained, added)
     ]
-    rows, lines, factors = (device.upload(a) for a in packed)
+    rows, lines, factors, summands = (device.upload(a) for a in packed)
     device.run(
         "blend", "blend_band", (-(-band[2] // 2), band[3]), rows, device.upload(table), 3, lines, factors,
-        *axes, full.border, full.lens, grid.border, cells.border, band, origin, shoulder, nearest, share,
-        out, options=options,
+        summands, *axes, full.border, full.lens, grid.border, cells.border, halves.border, band, origin,
+        shoulder, nearest, share, out, options=options,
     )  # fmt: skip
     lefts = [box[0] for box in boxes]
     expected = twin.blend_band(
-        stored, places, ways, lefts, [None, *gained], full.border, full.lens, grid.border, cells.border,
-        band, origin, shoulder, nearest, share, white,
+        stored, places, ways, lefts, [None, *gained], [(0, added[0]), None, (9, added[1])], full.border,
+        full.lens, grid.border, cells.border, halves.border, band, origin, shoulder, nearest, share, white,
     )  # fmt: skip
     result = out.get()
     assert 0.6 < (expected[..., -1] > 0).mean() < 1
@@ -226,11 +235,12 @@ def test_bands_of_any_height_give_the_same(device: Device, name: str, dtype: typ
     grid = full.resized(48, 25)
     field = field_of(10, grid, (0, 0, 48, 25), 4.0)
     gain = np.random.default_rng(11).normal(size=(5, 7, 4)).astype(np.float32) * 0.2
+    offset = np.random.default_rng(14).normal(size=(13, 24, 4)).astype(np.float32) * 0.1
     layers = [
         blend_layer(
             device, stored_pixels(12, full.width, full.height, dtype, 3, 0.9), 0, 0, full, grid, field
         ),
-        blend_layer(device, stored_pixels(13, 50, 31, dtype, 3, 0.9), 9, 3, full, grid, -field, gain),
+        blend_layer(device, stored_pixels(13, 50, 31, dtype, 3, 0.9), 9, 3, full, grid, -field, gain, offset),
     ]
     whole = merged(device, layers, full, grid)
     assert whole.shape == (full.height, full.width, 4)
@@ -266,8 +276,11 @@ def test_bands_are_as_high_as_memory_allows(device: Device, monkeypatch: pytest.
     for limit in (0, 6 << 20, 3 << 20, 1 << 18):
         settings = Settings(max_memory=limit)
         cells = grid.resized(7, 5)
-        found = blend.bands(device, layers, full, grid, cells, 1.0, full.region, settings, lambda units: None)
-        parts = list(found)
+        parts = list(
+            blend.bands(
+                device, layers, full, grid, cells, cells, 1.0, full.region, settings, lambda units: None
+            )
+        )
         heights.append(len(parts[0]))
         results.append(np.concatenate(parts))
     assert heights[0] == 400 > heights[1] > heights[2] > heights[3] == blend._LEAST_ROWS
@@ -408,17 +421,3 @@ def test_linear_flow_is_carried_to_full_resolution(device: Device, size: tuple[i
 
     for found, start, moved in zip((out[..., 0], out[..., 1]), (x, y), way(x, y), strict=True):
         assert np.abs(found - sampled(start + moved))[8:-8, 8:-12].max() < 1e-3
-
-
-def test_gains_of_floats_are_factors_and_none_is_exact(device: Device) -> None:
-    """Correction is (c + floor) exp(g) - floor; where the gain is 0 pixels stay as they are."""
-    full = plane()
-    grid = full.resized(40, 27)
-    pixels = stored_pixels(21, 77, 53, np.float32, 3, 1)
-    gain = np.zeros((5, 7, 4), np.float32)
-    gain[:, 4:, 1] = 0.5
-    out = merged(device, [blend_layer(device, pixels, 0, 0, full, grid, gain=gain)], full, grid)
-    assert np.array_equal(out[:, :38], pixels[:, :38])
-    assert np.array_equal(out[..., [0, 2, 3]], pixels[..., [0, 2, 3]])
-    right = out[:, 60:, 1]
-    assert np.allclose(right, pixels[:, 60:, 1] * math.exp(0.5), rtol=1e-5, atol=1e-6)

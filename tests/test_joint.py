@@ -56,12 +56,13 @@ def ring(canvas: Canvas, parts: int = 4, overlap: int = 29) -> list[np.ndarray]:
 
 
 def moved(
-    canvas: Canvas, mask: np.ndarray, dx: float, dy: float = 0.0, dtype: type = np.uint8, light: float = 1.0
-) -> Layer:
-    """A layer that shows the texture moved by (dx, dy) pixels, darker if light < 1."""
+    canvas: Canvas, mask: np.ndarray, dx: float, dy: float = 0.0, dtype: type = np.uint8, light: float = 1.0,
+    black: float = 0.0,
+) -> Layer:  # fmt: skip
+    """A layer that shows the texture moved by (dx, dy) pixels, darker if light < 1, on top of `black`."""
     y, x = pixel_places(canvas.height, canvas.width)
     picture = texture(y - dy, x - dx, dtype, canvas.width if canvas.wraps else 0)
-    picture[..., :3] = (picture[..., :3] * light).astype(dtype)
+    picture[..., :3] = (black + picture[..., :3] * light).astype(dtype)
     return masked(picture, mask, f"moved {dx} {dy}")
 
 
@@ -166,16 +167,15 @@ def test_picture_cut_along_any_shapes_comes_back(canvas, one_device_for_all, dat
 @given(data=st.data())
 def test_result_is_opaque_where_a_layer_is_and_nowhere_else(canvas, one_device_for_all, data):
     masks = data.draw(shapes(canvas))
-    layers = [moved(canvas, mask, 3.0 * k, -2.0 * k) for k, mask in enumerate(masks)]
+    layers = [moved(canvas, mask, 3.0 * k, -2.0 * k, light=0.5, black=64) for k, mask in enumerate(masks)]
     exposure, flow = data.draw(st.booleans()), data.draw(st.booleans())
     working_pixels = data.draw(st.sampled_from([2_100_000, 1_500]))
     result = merged(layers, canvas, exposure=exposure, flow=flow, working_pixels=working_pixels)
     union = np.logical_or.reduce(masks)
     np.testing.assert_array_equal(result[..., 3] == 255, union)
     np.testing.assert_array_equal(result[~union], 0)
-    # not darkened by what lies outside a mask either: the texture is nowhere as dark as black
-    darkest = min(layer.read(0, layer.box.height)[..., :3].min() for layer in layers)
-    assert darkest > 0 and (result[union][:, :3] > 0).all()
+    # not darkened by what lies outside a mask either; a multi-band blend and cubics overshoot by some levels
+    assert result[union][:, :3].min() >= 64 - 8
 
 
 @pytest.mark.parametrize("canvas", CANVASES.values(), ids=CANVASES)

@@ -294,17 +294,3 @@ def test_cells_that_a_layer_covers_whole() -> None:
     covered[0, 12, 20] = covered[1, 52, 76] = False
     whole = on_cells(covered, plane(110, 70).resized(9, 5), np.logical_and)
     assert np.argwhere(~whole).tolist() == [[0, 1, 2], [1, 4, 8]]
-
-
-def test_beside_a_cut_are_the_cells_near_another_owner() -> None:
-    """Cells without an owner are none; across the border too."""
-    owner = np.zeros((15, 40), int)
-    owner[:, 20:28] = 2
-    owner[:, 28:38] = -1
-    for wraps in WRAPS:
-        owner[:, 0] = 1 if wraps else 0
-        expected = np.zeros(owner.shape, bool)
-        expected[:, 20 - seam._BESIDE : 20 + seam._BESIDE] = True
-        if wraps:
-            expected[:, : 1 + seam._BESIDE] = expected[:, 40 - seam._BESIDE :] = True
-        assert np.array_equal(seam._beside_cuts(owner, wraps), expected)

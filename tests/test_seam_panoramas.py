@@ -86,21 +86,41 @@ def doubt(result: np.ndarray, plain: np.ndarray, away: np.ndarray) -> np.ndarray
     return np.minimum(off(result, plain), off(result, shown))
 
 
-@pytest.mark.usefixtures(one_device.__name__)
-@pytest.mark.parametrize(
+THINGS = pytest.mark.parametrize(
     ("name", "who"),
     [("plane", 0), ("plane", 1), ("across the border", 0), ("across the border", 1), ("beside the border", 0),
      ("sphere", 1), ("near a pole", 0)],
 )  # fmt: skip
+
+
+@pytest.mark.usefixtures(one_device.__name__)
+@THINGS
 def test_what_only_one_layer_shows_is_whole_or_absent(name: str, who: int) -> None:
+    """As it is stored, where exposures are left as they are."""
     layers, canvas, away, plain = scene(name, who)
-    result = merged(layers, canvas, seam=True)
+    result = merged(layers, canvas, seam=True, exposure=False)
     unsure = doubt(result, plain, away)  # every pixel is one layer's, but for an outline that flow moves
     assert (unsure > 8).mean() < 2e-3
     assert unsure.max() <= 32
     assert (off(result, DISC)[away < RADIUS - 1] <= 8).mean() in (0, 1)
     assert off(result, plain)[away >= RADIUS + 16].max() <= 8
     assert (result[..., 3] == 255).all()
+
+
+@pytest.mark.usefixtures(one_device.__name__)
+@THINGS
+def test_what_only_one_layer_shows_leaves_a_faint_halo(name: str, who: int) -> None:
+    """The lower bands of frequencies change over beside the disc, too, which is 100 levels darker: around it
+    brightness changes by some levels in the mean, and within 64 px only."""
+    layers, canvas, away, plain = scene(name, who)
+    result = merged(layers, canvas, seam=True)
+    assert doubt(result, plain, away).max() <= 32
+    assert (off(result, DISC)[away < RADIUS - 1] <= 32).mean() in (0, 1)
+    difference = result[..., 1].astype(float) - plain[..., 1]
+    for inner, outer, most in ((4, 16, 4), (16, 32, 3), (32, 64, 1)):
+        assert abs(difference[(away >= RADIUS + inner) & (away < RADIUS + outer)].mean()) < most
+    assert off(result, plain)[away >= RADIUS + 4].max() <= 20
+    assert off(result, plain)[away >= RADIUS + 64].max() <= 5
 
 
 @pytest.mark.usefixtures(one_device.__name__)
@@ -115,17 +135,20 @@ def test_without_seam_it_is_half_transparent(name: str) -> None:
 @pytest.mark.parametrize("who", [0, 1])
 @pytest.mark.parametrize("name", ["plane", "across the border"])
 def test_what_only_one_layer_shows_does_not_change_the_exposure_around(name: str, who: int) -> None:
-    """With layers of different light, beside the same without the disc."""
+    """With layers of different light, beside the same without the disc; some levels close to it, since the
+    lower bands of frequencies change over there."""
     layers, canvas, away, _ = scene(name, who, 0.8)
     clean = merged(scene(name, None, 0.8)[0], canvas)
     result = merged(layers, canvas)
-    assert off(result, clean)[away > RADIUS + 32].max() <= 2
+    assert off(result, clean)[away > RADIUS + 32].max() <= 4
+    assert off(result, clean)[away > RADIUS + 64].max() <= 2
     # where the disc is absent the wall behind it has its light, but for what the correction fades by over so
-    # small a canvas, else the disc is whole; layers differ by some 26 levels, the disc and the wall by 100
+    # small a canvas and a shadow of low bands, else the disc is whole; layers differ by some 26 levels, the
+    # disc and the wall by 100
     inside = away < RADIUS - 8
     behind = ndimage.gaussian_filter(result[..., 1].astype(float) - clean[..., 1], 3, mode="wrap")[inside]
-    absent = np.abs(behind).max() <= 10
-    assert absent or off(result, DISC)[inside].max() <= 8
+    absent = np.abs(behind).max() <= 20
+    assert absent or off(result, DISC)[inside].max() <= 16
 
 
 def prepared(device: Device, layers: list[Layer], canvas: Canvas, **chosen) -> joint.Prepared:
@@ -276,7 +299,26 @@ def test_without_flow_exposures_meet_at_the_cut() -> None:
     ratio = ndimage.gaussian_filter(merged(layers, canvas, flow=False)[..., 1].astype(float), 4)
     ratio /= ndimage.gaussian_filter(clean[..., 1].astype(float), 4)
     slope = np.abs(ratio[:, 12:] - ratio[:, :-12])
-    assert np.percentile(slope, 99) < 0.1  # layers differ by 0.2
+    assert np.percentile(slope, 99) < 0.05  # layers differ by 0.2
+
+
+@pytest.mark.usefixtures(one_device.__name__)
+@pytest.mark.parametrize("light", [1.0, 1.3])
+def test_without_flow_what_only_one_layer_clips_meets_at_the_cut(light: float) -> None:
+    """A sky that is bright in one layer and white in the other, over ground of which they show the same or
+    which differs less: no gain makes both agree. Of some 70 levels no step is left."""
+    canvas, x, _ = CANVASES["plane"]
+    sky, layers = np.s_[: canvas.height // 2], []
+    for k, (mask, its) in enumerate(zip(halves(canvas, x), (1.0, light), strict=True)):
+        picture = wall(canvas, 5 * k).astype(float)
+        picture[..., :3] *= 0.6 * its
+        picture[sky][..., :3] += 110 * its + 80 * k
+        picture[..., :3] = np.minimum(picture[..., :3], 255)
+        layers.append(masked(picture.astype(np.uint8), mask))
+    result = merged(layers, canvas, flow=False)[..., 1].astype(float)
+    seen = ndimage.gaussian_filter1d(result[8 : canvas.height // 2 - 8].mean(0), 2)
+    assert seen[:100].mean() < 195 and seen[-100:].mean() > 245
+    assert np.abs(seen[6:] - seen[:-6]).max() < 12
 
 
 @pytest.mark.usefixtures(one_device.__name__)

@@ -56,6 +56,22 @@ def test_masks_that_were_saved_give_the_same_picture(layers: list[str]) -> None:
     assert np.abs(tifffile.imread("out.tif") - first).max() <= 1
 
 
+def test_what_masks_take_out_leaves_no_shadow(layers: list[str]) -> None:
+    """A dark thing that only the second layer shows: bands of frequencies change over where masks do."""
+    y, x = np.mgrid[:HEIGHT, :WIDTH]
+    wall = texture(y, x)
+    wall[..., :3] = 100 + wall[..., :3] // 4
+    picture = wall.copy()
+    picture[25:75, 85:108, :3] = 0
+    write_layer(Path("a.tif"), wall[:, :120], 0, 0, (WIDTH, HEIGHT))
+    write_layer(Path("b.tif"), picture[:, 80:], 80, 0, (WIDTH, HEIGHT))
+    for number, own in ((1, x < 118), (2, x >= 118)):
+        tifffile.imwrite(f"mask-{number}.tif", own * np.uint8(255))
+    assert run("--load-masks", *layers) == 0
+    off = tifffile.imread("out.tif")[..., :3].astype(int) - wall[..., :3]
+    assert np.abs(off[:, :112].mean(2)).max() < 12
+
+
 @pytest.mark.parametrize("crop", ["200x100", "150x70+20+15"])
 @pytest.mark.parametrize("samples", ["8 bit", "16 bit", "float", "colour"])
 def test_masks_decide_which_layer_is_seen(layers: list[str], crop: str, samples: str) -> None:

@@ -11,8 +11,9 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from hugin_abflow import joint, working
+from hugin_abflow import joint, multiband, working
 from hugin_abflow.blend import BlendLayer
+from hugin_abflow.colour import Correction
 from hugin_abflow.errors import CommandLineError, LayersMismatchError, LayersMissingError
 from hugin_abflow.guides import Guide
 from hugin_abflow.images import ImageWriter, read_layer
@@ -60,7 +61,7 @@ class MaskedMerge:
             weighted = [
                 _weighted(device, one, given[numbers[id(one.layer)]], prepared) for one in prepared.layers
             ]
-            prepared = replace(prepared, layers=tuple(weighted))
+            prepared = _offset(device, replace(prepared, layers=tuple(weighted)))
         if targets:
             with progress("masks", len(layers)) as advance:
                 for layer, target in zip(layers, targets, strict=True):
@@ -150,7 +151,7 @@ def _painted(device: Device, one: BlendLayer, white: Layer) -> BlendLayer:
     grey = replace(layer, dtype=np.dtype(np.uint16), channels=1, read=read)
     field = one.field.get()
     field[..., :3] = 0
-    return replace(one, layer=grey, field=device.upload(field), gain=None)
+    return replace(one, layer=grey, field=device.upload(field), gain=None, offset=None)
 
 
 def _weighted(device: Device, layer: BlendLayer, mask: Layer, prepared: Prepared) -> BlendLayer:
@@ -167,3 +168,19 @@ def _weighted(device: Device, layer: BlendLayer, mask: Layer, prepared: Prepared
     field = layer.field.get()
     field[..., 3] = reduced.pixels.get()[top : top + height, left : left + width, 0]
     return replace(layer, field=device.upload(field))
+
+
+def _offset(device: Device, prepared: Prepared) -> Prepared:
+    """With offsets for other weights than those they were made for."""
+    blended = [one for one in prepared.layers if one.offset is not None]
+    if not blended:
+        return prepared
+    reduced = [
+        working.reduce_layer(device, one.layer, prepared.grid, lambda units: None, checked=False)
+        for one in blended
+    ]
+    gains = Correction(prepared.gain_grid, prepared.shoulder, tuple(one.gain for one in blended))
+    fields = [one.field for one in blended]
+    found = iter(multiband.offsets(device, reduced, fields, gains, prepared.grid).layers)
+    layers = [one if one.offset is None else replace(one, offset=next(found)) for one in prepared.layers]
+    return replace(prepared, layers=tuple(layers))

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from reference.common import (
+    EXPOSURE_FLOOR,
     Array,
     Numbers,
     canvas_point,
@@ -80,9 +81,13 @@ def position(x: Array, y: Array, displacement: Array, scale: Numbers, lens: Numb
     return there_x - turn * np.rint((there_x - x) / turn), there_y
 
 
-def correct(colour: Array, gain: Array, white: float, shoulder: float) -> Array:
-    """Colour in stored units with its exposure corrected."""
-    return np.where(gain == 0, colour, exposure_shift(colour / white, gain, shoulder) * white)
+def correct(colour: Array, gain: Array, offset: Array, white: float, shoulder: float) -> Array:
+    """Colour in stored units with its exposure corrected, then raised; floats by their logarithms."""
+    c = np.where(gain == 0, colour, exposure_shift(colour / white, gain, shoulder) * white)
+    if white != 1:
+        return c + white * offset
+    raised = c + (np.maximum(c, 0) + EXPOSURE_FLOOR) * (np.exp(offset) - 1)
+    return np.where(offset == 0, c, np.where(c >= 0, np.maximum(raised, 0), raised))
 
 
 def blend_rows(
@@ -120,10 +125,12 @@ def blend_band(
     ways: Sequence[Array],
     lefts: Sequence[int],
     gains: Sequence[Array | None],
+    offsets: Sequence[tuple[int, Array] | None],
     border: Sequence[int],
     lens: Numbers,
     field_border: Sequence[int],
     gain_border: Sequence[int],
+    offset_border: Sequence[int],
     band: Sequence[int],
     origin: Sequence[int],
     shoulder: float,
@@ -133,23 +140,30 @@ def blend_band(
 ) -> Array:
     """Samples of the band, float64 but rounded and within 0..white for integer layers.
 
-    stored, places      rows of each layer and their box. ways, lefts: of `blend_rows`, first column.
+    stored, places      rows of each layer and their box.
+    ways, lefts         of `blend_rows`, first column.
+    offsets             first column, of `blend_rows`.
     """
     columns, rows = pixels(band[2], band[3], band[0], band[1])
     x, y = columns + 0.5, rows + 0.5
     scale = border[0] / field_border[0], border[1] / field_border[1]
     seen = []
-    for pixels_, place, way, left, gain in zip(stored, places, ways, lefts, gains, strict=True):
+    every = zip(stored, places, ways, lefts, gains, offsets, strict=True)
+    for pixels_, place, way, left, gain, offset in every:
         opaque_ = opaque(pixels_, white)
         f = read_line(way, left, x / scale[0], field_border)
-        exposure = np.zeros((*x.shape, 3))
+        exposure, raised = np.zeros((2, *x.shape, 3))
         if gain is not None:
             exposure = read_line(gain, 0, x * gain_border[0] / border[0], gain_border)[..., :3]
+        if offset is not None:
+            start, lines = offset
+            raised = read_line(lines, start, x * offset_border[0] / border[0], offset_border)[..., :3]
         own = take(opaque_, place, columns, rows)
         colour = sample(opaque_, place, *position(x, y, f[..., :3], scale, lens), border, nearest)
         colour = np.where(f[..., :3].any(-1, keepdims=True), colour, own)
-        looks = [correct(c[..., :3], exposure, white, shoulder) for c in (own, colour)]
-        seen.append((own[..., 3] > 0, looks, f[..., 3], colour[..., 3], (exposure != 0).any(-1)))
+        looks = [correct(c[..., :3], exposure, raised, white, shoulder) for c in (own, colour)]
+        some = ((exposure != 0) | (raised != 0)).any(-1)
+        seen.append((own[..., 3] > 0, looks, f[..., 3], colour[..., 3], some))
     count = sum(layer[0].astype(int) for layer in seen)
     reference, corrected, known = np.zeros((*x.shape, 3)), np.zeros(x.shape, bool), np.zeros(x.shape, bool)
     for covered, looks, _, _, exposed in seen:
