@@ -67,6 +67,7 @@ def offsets(
     grids = levels(grid)
     if len(grids) < 2:
         return none(grid, len(layers))
+    device.give_back()
     widths = [_widths(one) for one in grids]
     total = device.zeros(grid.shape)
     for layer, field in zip(layers, fields, strict=True):
@@ -78,9 +79,16 @@ def offsets(
         _finest(device, layer, field, total, correction, k, grid, grids[1], widths[1])
         for k, (layer, field) in enumerate(zip(layers, fields, strict=True))
     ]
+    del total
     _differ(device, finest, widths[1])
     blend = _blend(device, finest, grids[1:], widths[1:])
-    return Offsets(grids[1], tuple((level.box, _offset(device, level, blend)) for level in finest))
+    result = []
+    while finest:  # each makes room for the next one's
+        level = finest.pop(0)
+        result.append((level.box, _offset(device, level, blend)))
+        del level
+        device.give_back()
+    return Offsets(grids[1], tuple(result))
 
 
 def none(grid: Grid, layers: int) -> Offsets:
@@ -131,6 +139,7 @@ def _differ(device: Device, finest: list[_Level], widths: Widths) -> None:
             "multiband", "multiband_differ", level.box[2:], level.colours, level.box, grid.border, mean
         )
         finest[k] = _spread(device, level, widths)
+        device.give_back()  # layers are of different sizes
 
 
 def _blend(
@@ -144,7 +153,7 @@ def _blend(
             _add(device, level, smaller, one)
             level = smaller
         _add(device, level, None, sums[-1])
-        device.give_back()  # the next layer is of another size
+        device.give_back()
     _join(device, sums[-1], grids[-1], None, None)
     for k in reversed(range(len(grids) - 1)):
         _join(device, sums[k], grids[k], sums[k + 1], grids[k + 1])
