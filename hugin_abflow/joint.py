@@ -156,11 +156,12 @@ def prepare(
             flows[index] = consistency.mend(device, pair_flow)
         pairs = [pair for pair, _ in overlaps]
         fields, correction, whole = _align(device, reduced, pairs, flows, masks, grid, settings)
+        if _log.isEnabledFor(logging.INFO):
+            _tell_overlaps(reduced, overlaps, shifts, grid, whole)
+        del masks, overlaps  # what comes takes the most memory
         offsets = multiband.none(grid, len(reduced))
         if settings.exposure and pairs:
             offsets = multiband.offsets(device, reduced, fields, correction, grid)
-        if _log.isEnabledFor(logging.INFO):
-            _tell_overlaps(reduced, overlaps, shifts, grid, whole)
         final = [
             BlendLayer(
                 layer.layer, layer.box, field, geometry.reach(device, layer, field, grid), gain, offset
