@@ -49,7 +49,8 @@ class BlendLayer:
     field   displacement and colour weight, float32 (height, width, 4).
     reach   per row of `field`, the largest vertical displacement, working px.
     gain    on the exposure scale and the colour grid, float32 (height, width, 4); None: no correction.
-    offset  what is added after that (multiband.py), its place on its grid and float32 (height, width, 4).
+    offset  what is added after that (multiband.py), its place on its grid and float32 (height, width, 4);
+            None: nothing.
     """
 
     layer: Layer

@@ -140,7 +140,7 @@ _information = partial(click.option, cls=Option, group="Information")
     "--exposure",
     type=click.Choice(["auto", "off"]),
     default="auto" if _DEFAULTS.exposure else "off",
-    help="Match brightness and colour of the layers. off: leave them as nona made them.",
+    help="Match brightness and colour, and blend low frequencies widely. off: leave both as nona made them.",
 )
 @_blending(
     "--guides",
@@ -183,8 +183,8 @@ _information = partial(click.option, cls=Option, group="Information")
     "--no-flow",
     is_flag=True,
     show_default=False,  # click would write False
-    help="Do not bring the photos together by optical flow: match brightness and colour, and cut where it "
-    "shows least.",
+    help="Do not bring the photos together by optical flow: cut where it shows least, and blend across the "
+    "cuts in bands of frequencies.",
 )
 @_blending(
     "--flow-quality",

@@ -52,7 +52,8 @@ _BOUND = 0.1
 _UNSEEN = 0.003
 # The correction fades out over this share of the canvas's width; a trend hardly does.
 _FADE, _TREND_FADE = 0.12, 1.0
-# All gains shrink towards 0 by this, at most a quarter of an 8-bit level, so that small ones are exactly 0.
+# All gains, and offsets of multiband.py, shrink towards 0 by this, at most a quarter of an 8-bit level, so
+# that small ones are exactly 0.
 NEGLIGIBLE = 1e-3
 
 # Shoulders of the exposure scale that are tried for integer images, and by how much better than the first,
@@ -155,7 +156,7 @@ def correction(
     if ignored is not None:
         counts = ~on_cells(ignored[None], cells, np.logical_or)[0]
         differences = tuple(_weighed(d, counts) for d in differences)
-    if settings.flow:  # without, nobody knows yet where layers will be cut
+    if settings.flow:  # without, layers are not mixed but cut, somewhere
         differences = tuple(_weighed(d, d.mixing + _UNSEEN) for d in differences)
     if not any(np.any(v[..., :3] * v[..., 3:]) for d in differences for v in (d.values, d.beyond)):
         return none

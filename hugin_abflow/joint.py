@@ -133,7 +133,7 @@ def prepare(
     progress: Progress,
     guides: Sequence[Guide] = (),
 ) -> Prepared:
-    """Everything that sees far, at working resolution: flow, coefficients, geometry, colour."""
+    """Everything that sees far, at working resolution: flow, coefficients, geometry, colour, low bands."""
     full = working.full_grid(canvas, layers)
     grid = working.working_grid(full, settings)
     everything = _read(device, layers, grid, progress, settings.cores)
@@ -210,7 +210,7 @@ def _align(
     grid: Grid,
     settings: Settings,
 ) -> tuple[list[Buffer], Correction, npt.NDArray[np.bool_] | None]:
-    """Geometry and colour that make the layers agree, without flow colour alone; where nothing does, one
+    """Geometry and colour that make the layers agree, without flow cuts alone; where nothing does, one
     layer whole. `flows` is emptied. The last is where one layer was taken, on the seam grid; None: nowhere,
     or everywhere, if there is no flow.
 

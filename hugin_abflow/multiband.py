@@ -3,9 +3,9 @@
 Burt and Adelson, "A multiresolution spline with application to image mosaics", 1983: each band of frequencies
 changes over as widely as its waves are long, so that neither steps of brightness nor doubled texture show.
 Blended are the layers' differences from their weighted mean, to which the blend is added: the same where all
-cover all, and nothing where layers agree, however narrow their overlap. What fits on half the working grid is
-calculated there; of finer bands the weighted mean of the full-resolution pass is the blend, and what is added
-to a layer before leaves them as they are.
+cover all, and nothing for layers that agree, however narrow their overlaps. What fits on half the working
+grid is calculated there; of finer bands the weighted mean of the full-resolution pass is the blend, and what
+is added to a layer before leaves them as they are.
 
 Gains (colour.py) come before: an offset cannot restore contrast.
 """
@@ -23,7 +23,7 @@ from hugin_abflow.colour import NEGLIGIBLE, Correction
 from hugin_abflow.opencl import Buffer, Device
 from hugin_abflow.working import Grid, WorkingLayer
 
-# Grids are halved down to this many pixels: the lowest frequencies change over along all of the canvas.
+# The shorter side is halved down to this many pixels: the lowest frequencies change over along all of it.
 _LEAST_SIDE = 4
 # Widths of the spline that rows are smoothed with: below it hardly does anything; columns of a turn.
 _LEAST_SPREAD, _MOST_SPREAD = 0.7, 1 / 3

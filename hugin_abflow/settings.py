@@ -33,7 +33,8 @@ class Settings:
                         or what moves as things do that stand still when the camera moves; "on" all
                         that is found; what repeats (grids, tiles) and who walks may mislead it. "off":
                         no search.
-    exposure            match exposure and colour of the layers where they overlap, and spread it smoothly.
+    exposure            match exposure and colour of the layers where they overlap, spread it smoothly, and
+                        blend low frequencies widely.
     highlights          take what one layer shows clipped from another that does not.
     seam                take from one layer, whole, what flow cannot explain (people who moved, occlusions).
     transition_strain   how much changing over from one layer's geometry to the next may stretch it, where

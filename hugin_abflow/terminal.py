@@ -221,6 +221,7 @@ def interruptible() -> Iterator[None]:
         if time.monotonic() - last < 2.0:
             return  # an impatient second Ctrl-C would break off the tidying up
         last = time.monotonic()
+        sys.unraisablehook = lambda unraisable: None  # what was being made may complain as it goes, at length
         raise KeyboardInterrupt
 
     names = ("SIGINT", "SIGTERM", "SIGHUP")  # Windows has no SIGHUP

@@ -205,7 +205,7 @@ __kernel void multiband_join(__global float4 *sum,           /* (grid.y, grid.x)
 }
 
 /* What a level of a layer has to be raised by to be the blend, exactly 0 where that is negligible. Beside the layer
-   as much as around: offsets are read between pixels. */
+   as much as around, over two pixels: its last ones at full resolution are read between these. */
 __kernel void multiband_offset(__global const float4 *level, /* (box.w, box.z) */
                                int4 box, int4 grid,          /* place, run size; its grid */
                                __global const float4 *blend, /* (grid.y, grid.x), joined */
@@ -215,10 +215,11 @@ __kernel void multiband_offset(__global const float4 *level, /* (box.w, box.z) *
     const int x = get_global_id(0), y = get_global_id(1);
     if (x >= box.z || y >= box.w)
         return;
-    const int reach = level[y * box.z + x].w > 0.0f ? 0 : 1;
+    const int valid = level[y * box.z + x].w > 0.0f;
     float4 sum = (float4)(0.0f);
-    for (int j = -reach; j <= reach; ++j)
-        for (int i = -reach; i <= reach; ++i) {
+    for (int reach = valid ? 0 : 1; reach <= (valid ? 0 : 2) && sum.w == 0.0f; ++reach)
+        for (int k = 0; k < (2 * reach + 1) * (2 * reach + 1); ++k) {
+            const int i = k % (2 * reach + 1) - reach, j = k / (2 * reach + 1) - reach;
             int2 p = (int2)(x + box.x + i, y + box.y + j);
             const int at = grid_border(&p, grid) ? box_index(p, box) : -1;
             if (at < 0 || level[at].w == 0.0f)

@@ -174,12 +174,14 @@ def multiband_offset(
     some = (valid & (there[..., 3] > 0))[..., None]
     raised = np.where(some, there[..., :3].astype(np.float64) - level[..., :3], 0.0)
     known = np.concatenate([raised, some * 1.0], -1)
-    around = np.zeros_like(known)
-    for j in (-1, 0, 1):
-        for i in (-1, 0, 1):
-            around += take(known, box, *grid_border(x + i, y + j, grid))
-    beside = _mean(around[..., :3], around[..., 3])[..., :3]
-    offset = np.where(valid[..., None], raised, beside)
+    offset, found = raised, valid
+    for reach in (1, 2):
+        around = np.zeros_like(known)
+        for j in range(-reach, reach + 1):
+            for i in range(-reach, reach + 1):
+                around += take(known, box, *grid_border(x + i, y + j, grid))
+        offset = np.where(found[..., None], offset, _mean(around[..., :3], around[..., 3])[..., :3])
+        found = found | (around[..., 3] > 0)
     result = np.zeros((*valid.shape, 4))
     result[..., :3] = np.sign(offset) * np.maximum(np.abs(offset) - negligible, 0)
     return result
