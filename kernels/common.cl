@@ -331,9 +331,8 @@ static inline float4 layer_sample(__global const float4 *layer, int4 box, float2
     return sum.w > 0.999f ? sum : (float4)(0.0f);
 }
 
-/* Where a layer is sampled for working pixel p. */
-static inline float2 layer_position(int2 p, float3 d, float4 lens) {
-    const float2 q = (float2)(p.x + 0.5f, p.y + 0.5f);
+/* Where a layer is sampled for position q of the working grid. */
+static inline float2 layer_position(float2 q, float3 d, float4 lens) {
     if (d.x == 0.0f && d.y == 0.0f && d.z == 0.0f)
         return q;
     return canvas_position(canvas_point(q, lens) + d, lens);
@@ -346,8 +345,9 @@ static inline bool layer_pair(__global const float4 *layer_a, __global const flo
     const int at_a = box_index(p, box_a), at_b = box_index(p, box_b);
     if (at_a < 0 || at_b < 0 || layer_a[at_a].w == 0.0f || layer_b[at_b].w == 0.0f)
         return false;
-    *a = layer_sample(layer_a, box_a, layer_position(p, field_a[at_a].xyz, lens), border);
-    *b = layer_sample(layer_b, box_b, layer_position(p, field_b[at_b].xyz, lens), border);
+    const float2 q = (float2)(p.x + 0.5f, p.y + 0.5f);
+    *a = layer_sample(layer_a, box_a, layer_position(q, field_a[at_a].xyz, lens), border);
+    *b = layer_sample(layer_b, box_b, layer_position(q, field_b[at_b].xyz, lens), border);
     return a->w != 0.0f && b->w != 0.0f;
 }
 

@@ -75,9 +75,7 @@ __kernel void multiband_finest(__global const float4 *layer, __global const floa
             if (all > 0.0f && layer[at].w > 0.0f)
                 way += (i ? t.x : 1.0f - t.x) * (j ? t.y : 1.0f - t.y) * (float4)(field[at].xyz, field[at].w / all);
         }
-    const bool moved = way.x != 0.0f || way.y != 0.0f || way.z != 0.0f;
-    const float2 there = moved ? canvas_position(canvas_point(q, lens) + way.xyz, lens) : q;
-    float4 seen = layer_sample(layer, box, there, border);
+    float4 seen = layer_sample(layer, box, layer_position(q, way.xyz, lens), border);
     const bool valid = seen.w > 0.0f;
     if (valid && colours.x > 0) {
         int4 cell;
@@ -104,6 +102,31 @@ __kernel void multiband_differ(__global float4 *level,      /* (box.w, box.z): c
         level[at] = c.w > 0.0f ? (float4)(level[at].xyz - c.xyz, 1.0f) : (float4)(0.0f);
 }
 
+/* Sums over pixels of a level, each with its weight: of what is valid, of shares, of all that the grid has. */
+typedef struct {
+    float4 colours;
+    float share, all;
+} multiband_sums;
+
+static inline void multiband_tap(multiband_sums *sums, float t, int2 p, int4 grid, __global const float4 *level,
+                                 __global const float *share, int4 box) {
+    if (!grid_border(&p, grid))
+        return;
+    sums->all += t;
+    const int at = box_index(p, box);
+    if (at < 0)
+        return;
+    sums->colours += t * level[at].w * (float4)(level[at].xyz, 1.0f);
+    sums->share += t * share[at];
+}
+
+/* Their means: colours over what is valid, shares over all of the grid. */
+static inline void multiband_mean(const multiband_sums *sums, __global float4 *level, __global float *share) {
+    const float4 sum = sums->colours;
+    *level = sum.w > MULTIBAND_NOTHING ? sum / sum.w : (float4)(0.0f);
+    *share = sums->share / sums->all;
+}
+
 /* The next coarser level of a layer: colours over what is valid, shares over all of the grid. */
 __kernel void multiband_reduce(__global const float4 *level, __global const float *share, /* (box.w, box.z) */
                                int4 box, int4 fine,               /* place on the fine grid; the grid */
@@ -120,25 +143,14 @@ __kernel void multiband_reduce(__global const float4 *level, __global const floa
     float across[MULTIBAND_TAPS];
     for (int i = 0; i < MULTIBAND_TAPS; ++i)
         across[i] = multiband_spline((first.x + i + 0.5f - q.x) / ratio.x);
-    float4 sum = (float4)(0.0f);
-    float own = 0.0f, all = 0.0f;
+    multiband_sums sums = {(float4)(0.0f), 0.0f, 0.0f};
     for (int j = first.y; j <= last.y; ++j) {
         const float down = multiband_spline((j + 0.5f - q.y) / ratio.y);
-        for (int i = first.x; i <= last.x; ++i) {
-            int2 p = (int2)(i, j);
-            if (!grid_border(&p, fine))
-                continue;
-            const float t = down * across[i - first.x];
-            const int at = box_index(p, box);
-            all += t;
-            if (at < 0)
-                continue;
-            sum += t * level[at].w * (float4)(level[at].xyz, 1.0f);
-            own += t * share[at];
-        }
+        for (int i = first.x; i <= last.x; ++i)
+            multiband_tap(&sums, down * across[i - first.x], (int2)(i, j), fine, level, share, box);
     }
-    smaller[y * smaller_box.z + x] = sum.w > MULTIBAND_NOTHING ? sum / sum.w : (float4)(0.0f);
-    smaller_share[y * smaller_box.z + x] = own / all;
+    const int at = y * smaller_box.z + x;
+    multiband_mean(&sums, smaller + at, smaller_share + at);
 }
 
 /* Smooth a level along its rows, which shrink towards a pole: on the sphere it is as smooth in all directions then,
@@ -153,22 +165,10 @@ __kernel void multiband_spread(__global const float4 *level, __global const floa
         return;
     const float wide = widths[y + box.y];
     const int reach = (int)(1.5f * wide);
-    float4 sum = (float4)(0.0f);
-    float own = 0.0f, all = 0.0f;
-    for (int i = -reach; i <= reach; ++i) {
-        int2 p = (int2)(x + box.x + i, y + box.y);
-        if (!grid_border(&p, grid))
-            continue;
-        const float t = multiband_spline(i / wide);
-        const int there = box_index(p, box);
-        all += t;
-        if (there < 0)
-            continue;
-        sum += t * level[there].w * (float4)(level[there].xyz, 1.0f);
-        own += t * share[there];
-    }
-    spread[at] = sum.w > MULTIBAND_NOTHING ? sum / sum.w : (float4)(0.0f);
-    spread_share[at] = own / all;
+    multiband_sums sums = {(float4)(0.0f), 0.0f, 0.0f};
+    for (int i = -reach; i <= reach; ++i)
+        multiband_tap(&sums, multiband_spline(i / wide), (int2)(x + box.x + i, y + box.y), grid, level, share, box);
+    multiband_mean(&sums, spread + at, spread_share + at);
 }
 
 /* Add what a level of a layer shows beyond the next coarser one to the blend, by its share. */
