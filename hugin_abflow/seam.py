@@ -5,16 +5,17 @@ layers that differ although exposure is corrected. In each connected region of s
 to one layer: the one that the softmax favours, with cuts between layers, and at the layers' own
 borders, where they show least. This is a labelling of least energy,
 
-    sum_cells r (1 - s_k)  +  sum_neighbours c (r + r') / 2 [k != k']  +  sum_borders c r
+    sum_cells r (1 - s_k)  +  sum_neighbours c (t + t') / 2 [k != k']  +  sum_borders c t
 
-with r the residual, s_k the share of the softmax and c the price of a cut, found by graph cuts (alpha
-expansion: Boykov, Veksler, Zabih, "Fast approximate energy minimization via graph cuts", 2001). Regions keep
-to themselves: elsewhere the softmax stays as it is, and the transition lies where the layers agree. What is
+with r the residual of low frequencies, t that of all, s_k the share of the softmax and c the price of a cut,
+found by graph cuts (alpha expansion: Boykov, Veksler, Zabih, "Fast approximate energy minimization via graph
+cuts", 2001). A cut through somebody who is as bright as what is behind shows in t alone. Regions keep to
+themselves: elsewhere the softmax stays as it is, and the transition lies where the layers agree. What is
 clipped in one photo only is no such difference: it is brighter in the other by an unknown amount, and changes
 over best where it does so slowly.
 
 Where there is no flow, layers are not aligned, and each overlap is such a region, whole: on finer cells, with
-the mean square of the difference in place of r, since fine texture is as much in the way of a cut, and with
+the mean square of the difference in place of r and t, since fine texture is as much in the way, and with
 narrow transitions; multiband.py blends low frequencies across them.
 """
 
@@ -22,6 +23,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import cv2
@@ -41,12 +43,13 @@ _CELL = 8
 _FINE_CELL = 4
 # Cells over which differences are averaged: texture that is a little off is no reason to cut.
 _SIGMA = 1.0
-# Residual, of full scale, that makes a region one layer's, and that of its outskirts.
+# Residual of low frequencies, of full scale, that makes a region one layer's, and that of its outskirts.
+# Where that of all frequencies reaches the first there are outskirts as well.
 _STRONG, _WEAK = 0.2, 0.045
 # Strong cells, of the equator's size, that a region has at least: fewer are an edge that is a pixel off.
 _LEAST = 6.0
 # Price of a cut, in cells: what is cut off must be favoured by the softmax over this depth.
-_CUT = 20.0
+_CUT = 10.0
 # The same without flow, where the softmax has little to say: overlaps are some hundred cells wide.
 _FINE_CUT = 120.0
 # Residual of layers that agree, without flow: of two cuts that nobody sees the shorter one is taken.
@@ -55,6 +58,19 @@ _SHORTER = 0.005
 _FORBIDDEN = 1e4
 # Capacities are integers; residuals are around 1.
 _UNIT = 1000
+
+
+@dataclass(frozen=True)
+class Residuals:
+    """How far aligned, corrected layers differ, both float64 (height, width) on the seam grid: the largest of
+    any pair and channel, 0 where no two lie.
+
+    mean    r: of their low frequencies.
+    rms     t: of all.
+    """
+
+    mean: npt.NDArray[np.float64]
+    rms: npt.NDArray[np.float64]
 
 
 def seam_grid(grid: Grid) -> Grid:
@@ -69,37 +85,36 @@ def residuals(
     pairs: Sequence[Pair],
     correction: Correction,
     grid: Grid,
-) -> npt.NDArray[np.float64]:
-    """r: how far low frequencies of aligned, corrected layers differ, (height, width) on the seam grid: the
-    largest of any pair and channel, 0 where no two lie.
-    """
+) -> Residuals:
+    """What flow and exposure do not explain."""
     cells = seam_grid(grid)
-    largest = np.zeros(cells.shape)
+    mean, square = np.zeros(cells.shape), np.zeros(cells.shape)
     for pair in pairs:
-        found = _difference(device, layers, fields, pair, correction, grid, cells)
-        share = found[..., 3]
-        mean = _smooth(np.dstack([found[..., :3] * share[..., None], share]), cells.wraps)
-        mean = np.abs(mean[..., :3]).max(-1) / np.where(share > 0, mean[..., 3], 1)
-        largest = np.maximum(largest, mean * (share > 0))
-    return largest
+        found = _differences(device, layers, fields, pair, correction, grid, cells)
+        share = found[..., 4:]
+        smooth = _smooth(np.concatenate([found[..., :4] * share, share], -1), cells.wraps)
+        smooth = (share > 0) * smooth[..., :4] / np.where(share > 0, smooth[..., 4:], 1)
+        mean = np.maximum(mean, np.abs(smooth[..., :3]).max(-1))
+        square = np.maximum(square, smooth[..., 3])
+    return Residuals(mean, np.sqrt(square))
 
 
-def regions(residual: npt.NDArray[np.float64], grid: Grid) -> npt.NDArray[np.bool_]:
-    """Where layers differ too much to be blended, by `residuals`, of the same shape."""
+def regions(residual: Residuals, grid: Grid) -> npt.NDArray[np.bool_]:
+    """Where layers differ too much to be blended, of the same shape."""
     found = _regions(residual, seam_grid(grid))
-    return np.logical_or.reduce(found) if found else np.zeros(residual.shape, bool)
+    return np.logical_or.reduce(found) if found else np.zeros(residual.mean.shape, bool)
 
 
 def cut(
     device: Device,
     layers: Sequence[WorkingLayer],
     fields: Sequence[Buffer],
-    residual: npt.NDArray[np.float64],
+    residual: Residuals,
     whole: npt.NDArray[np.bool_],
     masks: Masks,
     grid: Grid,
 ) -> None:
-    """Give each cell of the regions `whole` to one layer, by `residuals`: the others lose their colour weight
+    """Give each cell of the regions `whole` to one layer: the others lose their colour weight
     there (fields[...].w, in place).
     """
     cells = seam_grid(grid)
@@ -119,12 +134,12 @@ def divide(
 ) -> None:
     """Give each cell of every overlap of layers that are not aligned to one layer, as `cut` does."""
     cells = grid.coarser(_FINE_CELL)
-    residual = np.zeros(cells.shape)
+    square = np.zeros(cells.shape)
     for pair in pairs:
-        found = _difference(device, layers, fields, pair, correction, grid, cells, squared=True)
-        residual = np.maximum(residual, np.where(found[..., 3] > 0, _SHORTER + found[..., :3].max(-1), 0))
-    whole = residual > 0
-    owner = _owners(layers, fields, residual, whole, masks, grid, cells, _FINE_CUT)
+        found = _differences(device, layers, fields, pair, correction, grid, cells, math.inf)
+        square = np.maximum(square, np.where(found[..., 4] > 0, _SHORTER + found[..., 3], 0))
+    whole = square > 0
+    owner = _owners(layers, fields, Residuals(square, square), whole, masks, grid, cells, _FINE_CUT)
     yields = [(whole & (owner != k)).astype(np.float32) for k in range(len(layers))]
     _yield(device, layers, fields, yields, grid, cells)
 
@@ -132,7 +147,7 @@ def divide(
 def _owners(
     layers: Sequence[WorkingLayer],
     fields: Sequence[Buffer],
-    residual: npt.NDArray[np.float64],
+    residual: Residuals,
     whole: npt.NDArray[np.bool_],
     masks: Masks,
     grid: Grid,
@@ -171,7 +186,7 @@ def _yield(
             )
 
 
-def _difference(
+def _differences(
     device: Device,
     layers: Sequence[WorkingLayer],
     fields: Sequence[Buffer],
@@ -179,22 +194,25 @@ def _difference(
     correction: Correction,
     grid: Grid,
     cells: Grid,
-    squared: bool = False,
+    clipped: float | None = None,
 ) -> npt.NDArray[np.float64]:
-    """Of two corrected layers, (height, width, 4): per cell the mean of their difference where neither is
-    clipped, or of its square anywhere, in r, g, b, and the share of the pixels that tell.
+    """Of two corrected layers, (height, width, 5): per cell the mean of their difference in r, g, b and the
+    largest mean square of these, where neither is brighter than `clipped` (default: where neither is
+    clipped), and the share of the pixels that tell.
     """
     none = device.zeros((*correction.grid.shape, 4))
-    difference = device.empty((*cells.shape, 4))
+    difference, square = device.empty((*cells.shape, 4)), device.empty(cells.shape)
     sides: list[Any] = []
     for k in (pair.a, pair.b):
         sides += [layers[k].pixels, fields[k], layers[k].box, correction.gains[k] or none]
-    clipped = math.inf if squared else clipping(layers[pair.a].layer)
+    if clipped is None:
+        clipped = clipping(layers[pair.a].layer)
     device.run(
         "seam", "seam_difference", cells.border[:2], *sides, grid.border, grid.lens,
-        correction.grid.border, cells.border, correction.shoulder, clipped, int(squared), difference,
+        correction.grid.border, cells.border, correction.shoulder, clipped, difference, square,
     )  # fmt: skip
-    return difference.get().astype(np.float64)
+    mean = difference.get()
+    return np.dstack([mean[..., :3], square.get(), mean[..., 3]]).astype(np.float64)
 
 
 def _smooth(values: npt.NDArray[np.float64], wraps: bool) -> npt.NDArray[np.float64]:
@@ -210,13 +228,14 @@ def _padded(values: npt.NDArray[Any], by: int, wraps: bool) -> npt.NDArray[Any]:
     return np.pad(values, ((0, 0), (by, by), *beyond), mode="wrap" if wraps else "constant")
 
 
-def _regions(residual: npt.NDArray[np.float64], cells: Grid) -> list[npt.NDArray[np.bool_]]:
-    """Connected cells of weak residual that hold enough of strong residual, grown by a cell."""
-    weak = _padded((residual > _WEAK).astype(np.uint8), 1, cells.wraps)
+def _regions(residual: Residuals, cells: Grid) -> list[npt.NDArray[np.bool_]]:
+    """Connected outskirts that hold enough of strong residual, grown by a cell."""
+    weak = (residual.mean > _WEAK) | (residual.rms > _STRONG)
+    weak = _padded(weak.astype(np.uint8), 1, cells.wraps)
     grown = np.asarray(cv2.dilate(weak, np.ones((3, 3), np.uint8)))[1:-1, 1:-1] > 0
     latitude = cells.lens[2] - (np.arange(cells.height) + 0.5) * cells.lens[3]
     area = np.cos(latitude)[:, None] if cells.lens[1] else 1.0
-    strong = (residual > _STRONG) * area
+    strong = (residual.mean > _STRONG) * area
     return [region for region in _connected(grown, cells.wraps) if strong[region].sum() >= _LEAST]
 
 
@@ -237,7 +256,7 @@ def _connected(mask: npt.NDArray[np.bool_], wraps: bool) -> list[npt.NDArray[np.
 def label(
     rows: npt.NDArray[np.intp],
     columns: npt.NDArray[np.intp],
-    residual: npt.NDArray[np.float64],
+    residual: Residuals,
     shares: npt.NDArray[np.float64],
     cover: npt.NDArray[np.bool_],
     wraps: bool,
@@ -245,27 +264,27 @@ def label(
 ) -> npt.NDArray[np.intp]:
     """Which layer each cell (rows, columns) of a region is taken from: the least energy found.
 
-    residual: (height, width). shares, cover: shares of the softmax and coverage (layers, height, width).
+    shares, cover: shares of the softmax and coverage (layers, height, width).
     cut_price: of a cut, in cells.
     """
     candidates = np.flatnonzero(cover[:, rows, columns].any(1))
     if candidates.size < 2:
         return np.full(rows.size, candidates[0] if candidates.size else 0)
-    weight = residual[rows, columns]
+    weight, rough = residual.mean[rows, columns], residual.rms[rows, columns]
     present = cover[candidates][:, rows, columns]
     price = np.where(present, weight * (1 - shares[candidates][:, rows, columns]), _FORBIDDEN)
-    number = np.full(residual.shape, -1)
+    number = np.full(residual.mean.shape, -1)
     number[rows, columns] = np.arange(rows.size)
     links = []
     for down, right in ((0, 1), (1, 0), (0, -1), (-1, 0)):
-        inside, there = _neighbours(rows + down, columns + right, residual.shape, wraps)
+        inside, there = _neighbours(rows + down, columns + right, residual.mean.shape, wraps)
         # a layer's own border is a cut as well, where the union goes on
-        price += cut_price * weight * (inside & cover[:, *there].any(0) & ~cover[candidates][:, *there])
+        price += cut_price * rough * (inside & cover[:, *there].any(0) & ~cover[candidates][:, *there])
         if down + right > 0:
             linked = np.flatnonzero(inside & (number[there] >= 0))
             links.append(np.stack([linked, number[there][linked]]))
     first, second = np.concatenate(links, 1)
-    between = cut_price * (weight[first] + weight[second]) / 2
+    between = cut_price * (rough[first] + rough[second]) / 2
     current = np.full(rows.size, np.argmin(price.sum(1)))
     for _ in range(1 if candidates.size == 2 else 2):
         for alpha in range(candidates.size):

@@ -8,7 +8,7 @@ static inline float3 seam_look(float3 c, float3 gain, float shoulder) {
 }
 
 /* Mean difference a - b of two aligned, corrected layers over the pixels of a cell (every second one in x and y)
-   that both show unclipped, or the mean of its square, and the share of these. */
+   that both show unclipped, the share of these, and the mean square of the channel that differs most. */
 __kernel void seam_difference(__global const float4 *layer_a, __global const float4 *field_a, int4 box_a,
                               __global const float4 *gain_a, /* (colours.y, colours.x) */
                               __global const float4 *layer_b, __global const float4 *field_b, int4 box_b,
@@ -17,8 +17,8 @@ __kernel void seam_difference(__global const float4 *layer_a, __global const flo
                               int4 colours, int4 cells,    /* grid of the gains; seam grid, run size */
                               float shoulder,              /* of the exposure scale */
                               float clipped,               /* brighter samples are not used */
-                              int squared,                 /* 1: texture that is a little off counts as well */
-                              __global float4 *difference) /* (cells.y, cells.x): r, g, b, share */
+                              __global float4 *difference, /* (cells.y, cells.x): r, g, b, share */
+                              __global float *square)      /* (cells.y, cells.x) */
 {
     const int cx = get_global_id(0), cy = get_global_id(1);
     if (cx >= cells.x || cy >= cells.y)
@@ -27,7 +27,7 @@ __kernel void seam_difference(__global const float4 *layer_a, __global const flo
     const int top = cy * border.y / cells.y, bottom = (cy + 1) * border.y / cells.y;
     /* gains are smooth: the cell's centre will do */
     const int g = (2 * cy + 1) * colours.y / (2 * cells.y) * colours.x + (2 * cx + 1) * colours.x / (2 * cells.x);
-    float3 sum = (float3)(0.0f);
+    float3 sum = (float3)(0.0f), squares = sum;
     float n = 0.0f, tried = 0.0f;
     for (int y = top; y < bottom; y += 2)
         for (int x = left; x < right; x += 2) {
@@ -37,10 +37,13 @@ __kernel void seam_difference(__global const float4 *layer_a, __global const flo
                 any(a.xyz > clipped) || any(b.xyz > clipped))
                 continue;
             const float3 d = seam_look(a.xyz, gain_a[g].xyz, shoulder) - seam_look(b.xyz, gain_b[g].xyz, shoulder);
-            sum += squared ? d * d : d;
+            sum += d;
+            squares += d * d;
             n += 1.0f;
         }
-    difference[cy * cells.x + cx] = n > 0.0f ? (float4)(sum / n, n / tried) : (float4)(0.0f);
+    const int at = cy * cells.x + cx;
+    difference[at] = n > 0.0f ? (float4)(sum / n, n / tried) : (float4)(0.0f);
+    square[at] = n > 0.0f ? GREATEST(squares.x, GREATEST(squares.y, squares.z)) / n : 0.0f;
 }
 
 /* Take a layer's colour weight away where it yields: bilinear from the seam grid. A trace is left, so that a

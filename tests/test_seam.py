@@ -44,10 +44,8 @@ def test_twin_of_yield_reads_scipys_zoom() -> None:
 
 @pytest.mark.parametrize("name", list(GRIDS))
 @pytest.mark.parametrize("shoulder", [0.0, 0.5, 1.0])
-@pytest.mark.parametrize(("clipped", "squared"), [(0.8, 0), (math.inf, 0), (math.inf, 1)])
-def test_difference_equals_its_twin(
-    device: Device, name: str, shoulder: float, clipped: float, squared: int
-) -> None:
+@pytest.mark.parametrize("clipped", [0.8, math.inf])
+def test_difference_equals_its_twin(device: Device, name: str, shoulder: float, clipped: float) -> None:
     grid = GRIDS[name]
     cells, colours = grid.resized(10, 7).border, grid.resized(5, 3).border
     sides: list = []
@@ -59,16 +57,18 @@ def test_difference_equals_its_twin(
             field[..., 2] = 0
         gain = np.random.default_rng(9 + k).normal(size=(3, 5, 4)).astype(np.float32)
         sides += [pixels, field, box, gain]
-    out = device.empty((7, 10, 4))
+    out, square = device.empty((7, 10, 4)), device.empty((7, 10))
     uploaded = [device.upload(one) if isinstance(one, np.ndarray) else one for one in sides]
     device.run(
         "seam", "seam_difference", (10, 7), *uploaded, grid.border, grid.lens, colours, cells, shoulder,
-        clipped, squared, out,
+        clipped, out, square,
     )  # fmt: skip
-    expected = seam_difference(*sides, grid.border, grid.lens, colours, cells, shoulder, clipped, squared)
+    expected, squares = seam_difference(*sides, grid.border, grid.lens, colours, cells, shoulder, clipped)
     assert (expected[..., 3] > 0).mean() > 0.4
+    assert (squares > 1.5 * np.square(expected[..., :3]).max(-1)).any()
     # a pixel more or less at a mask's rim is one of some ten of a cell
     assert_close(out.get(), expected, 10 * POSITION, decisions=0.05)
+    assert_close(square.get(), squares, 10 * POSITION, decisions=0.05)
 
 
 @pytest.mark.parametrize("name", list(GRIDS))
@@ -95,21 +95,21 @@ def test_yield_equals_its_twin(device: Device, name: str) -> None:
 
 def energies(labels, rows, columns, residual, shares, cover, wraps) -> np.ndarray:
     """The sum in seam.py for each of the labellings (n, cells), cell by cell."""
-    height, width = residual.shape
+    height, width = residual.mean.shape
     number = {(y, x): k for k, (y, x) in enumerate(zip(rows.tolist(), columns.tolist(), strict=True))}
     total = np.zeros(len(labels))
     for (y, x), k in number.items():
         chosen = labels[:, k]
-        r = residual[y, x]
+        r, t = residual.mean[y, x], residual.rms[y, x]
         total += np.where(cover[chosen, y, x], r * (1 - shares[chosen, y, x]), seam._FORBIDDEN)
         for down, right in ((0, 1), (1, 0), (0, -1), (-1, 0)):
             v, u = y + down, x + right
             if not 0 <= v < height or not (wraps or 0 <= u < width):
                 continue
             u %= width
-            total += seam._CUT * r * (cover[:, v, u].any() & ~cover[chosen, v, u])
+            total += seam._CUT * t * (cover[:, v, u].any() & ~cover[chosen, v, u])
             if (v, u) in number and down + right > 0:
-                pair = seam._CUT * (r + residual[v, u]) / 2
+                pair = seam._CUT * (t + residual.rms[v, u]) / 2
                 total += pair * (chosen != labels[:, number[v, u]])
     return total
 
@@ -128,9 +128,8 @@ def problems(draw, layers: int, most: int):
         if beside.any():
             region.flat[random.choice(np.flatnonzero(beside))] = True
     # from all alike to a few cells that count for all
-    residual = random.random((height, width)) ** draw(st.sampled_from([0.1, 1, 4])) * draw(
-        st.sampled_from([0.5, 3])
-    )
+    low, rough = random.random((2, height, width)) ** draw(st.sampled_from([0.1, 1, 4]))
+    residual = seam.Residuals(*(draw(st.sampled_from([0.5, 3])) * v for v in (low, np.maximum(low, rough))))
     shares = random.random((layers, height, width)) ** draw(st.sampled_from([0.2, 1, 20]))
     shares /= np.maximum(shares.sum(0), 1e-9)
     cover = random.random((layers, height, width)) < draw(st.sampled_from([0.4, 0.8, 1]))
@@ -149,7 +148,7 @@ def least_and_found(problem, layers: int) -> tuple[float, float, float]:
     assert found.shape == rows.shape
     assert cover[found, rows, columns].all()  # no layer is taken where it is not
     everything = np.array(list(product(range(layers), repeat=rows.size)))
-    assert residual.max() <= 3  # so that _FORBIDDEN forbids
+    assert residual.mean.max() <= 3  # so that _FORBIDDEN forbids
     least = energies(everything, *problem).min()
     return least, energies(found[None], *problem)[0], 5 * rows.size / seam._UNIT
 
@@ -170,11 +169,16 @@ def test_of_three_layers_nearly_the_least_energy_is_found(problem) -> None:
     assert found <= 1.05 * least + rounding
 
 
+def alike(residual: np.ndarray) -> seam.Residuals:
+    """Layers that differ by low frequencies alone."""
+    return seam.Residuals(residual, residual)
+
+
 def test_a_lone_layer_is_taken_even_where_it_is_not() -> None:
     """Nothing else could be."""
     rows, columns = np.array([0, 0, 1]), np.array([0, 1, 1])
     cover = np.zeros((3, 2, 2), bool)
-    shares, residual = np.full((3, 2, 2), 1 / 3), np.ones((2, 2))
+    shares, residual = np.full((3, 2, 2), 1 / 3), alike(np.ones((2, 2)))
     assert seam.label(rows, columns, residual, shares, cover, False).shape == (3,)
     cover[2, 0, 0] = True
     assert seam.label(rows, columns, residual, shares, cover, False).tolist() == [2, 2, 2]
@@ -201,17 +205,32 @@ def test_a_cut_runs_through_the_least_residual(shift: int, wraps: bool) -> None:
     """Not where the coefficients are equal, which is up to three cells beside; across the border, too."""
     residual, shares, expected = valley(shift)
     rows, columns = (v.ravel() for v in np.mgrid[0:15, 0:40])
-    found = seam.label(rows, columns, residual, shares, np.ones((2, 15, 40), bool), wraps).reshape(15, 40)
+    everywhere = np.ones((2, 15, 40), bool)
+    found = seam.label(rows, columns, alike(residual), shares, everywhere, wraps).reshape(15, 40)
     assert 0.3 < expected.mean() < 0.6
     assert np.array_equal(found, expected)
     assert not np.array_equal(found, shares.argmax(0))
+
+
+def test_no_cut_runs_through_what_is_as_bright_as_the_other() -> None:
+    """Low frequencies agree along the middle, where the coefficients are equal; what is there does not. The
+    cut goes round it, where both agree in both."""
+    rows, columns = (v.ravel() for v in np.mgrid[0:15, 0:30])
+    mean, rms = np.full((15, 30), 0.3), np.full((15, 30), 0.4)
+    mean[:, 14:16] = 0.01
+    mean[:, 22:24] = rms[:, 22:24] = 0.02
+    share = np.clip(np.arange(30) / 29, 0, 1) * np.ones((15, 1))
+    shares, everywhere = np.stack([1 - share, share]), np.ones((2, 15, 30), bool)
+    for residual, first in ((alike(mean), 15), (seam.Residuals(mean, rms), 23)):
+        found = seam.label(rows, columns, residual, shares, everywhere, False).reshape(15, 30)
+        assert np.array_equal(found, np.arange(30) >= first * np.ones((15, 1)))
 
 
 def test_a_border_counts_as_a_cut() -> None:
     """A favoured layer that ends where its region does gives way to one that goes on beyond; where both end
     there is no cut to be seen."""
     rows, columns = (v.ravel() for v in np.mgrid[0:6, 0:7])
-    residual, cover = np.ones((6, 12)), np.ones((2, 6, 12), bool)
+    residual, cover = alike(np.ones((6, 12))), np.ones((2, 6, 12), bool)
     shares = np.stack([np.full((6, 12), 0.2), np.full((6, 12), 0.8)])
     for ends, taken in (((), 1), ((1,), 0), ((0, 1), 1)):
         cover[list(ends), :, 7:] = False
@@ -246,15 +265,26 @@ def test_a_region_is_strong_and_takes_its_outskirts() -> None:
     cells = plane(480, 320).resized(60, 40)
     residual = np.zeros((40, 60))
     residual[5:12, 5:20] = 0.5 * (seam._WEAK + seam._STRONG)
-    assert seam._regions(residual, cells) == []  # weak alone
+    assert seam._regions(alike(residual), cells) == []  # weak alone
     residual[6:8, 7:9] = 2.0
     residual[20, 30:35] = 2.0
-    assert seam._regions(residual, cells) == []  # 4 cells here, 5 there: edges
+    assert seam._regions(alike(residual), cells) == []  # 4 cells here, 5 there: edges
     residual[8, 7:10] = 2.0
-    (region,) = seam._regions(residual, cells)
+    (region,) = seam._regions(alike(residual), cells)
     expected = np.zeros((40, 60), bool)
     expected[4:13, 4:21] = True
     assert np.array_equal(region, expected)
+
+
+def test_texture_that_differs_joins_a_region_but_makes_none() -> None:
+    """Two arms of a coat, and between them a shirt as bright as the wall."""
+    cells = plane(480, 320).resized(60, 40)
+    mean, rms = np.zeros((40, 60)), np.zeros((40, 60))
+    rms[5:12, 5:20] = 1.1 * seam._STRONG
+    assert seam._regions(seam.Residuals(mean, rms), cells) == []
+    mean[5:12, [5, 19]] = 2 * seam._STRONG
+    assert len(seam._regions(alike(mean), cells)) == 2
+    assert len(seam._regions(seam.Residuals(mean, rms), cells)) == 1
 
 
 def test_a_region_across_the_border_is_one() -> None:
@@ -262,10 +292,10 @@ def test_a_region_across_the_border_is_one() -> None:
     residual[5:9, 58:] = residual[5:8, :1] = 2.0  # neither side is enough alone
     residual[7:9, 58:] = 0.5 * (seam._WEAK + seam._STRONG)
     cells = plane(480, 320, wraps=True).resized(60, 40)
-    (region,) = seam._regions(residual, cells)
+    (region,) = seam._regions(alike(residual), cells)
     assert region[:, [57, 58, 59, 0, 1]].any(0).all()
     assert region.sum() == 6 * 4 + 5
-    assert seam._regions(residual, plane(480, 320).resized(60, 40)) == []
+    assert seam._regions(alike(residual), plane(480, 320).resized(60, 40)) == []
 
 
 def test_cells_near_a_pole_count_by_their_area() -> None:
@@ -274,7 +304,7 @@ def test_cells_near_a_pole_count_by_their_area() -> None:
     for row in (0, 14):
         residual = np.zeros((30, 60))
         residual[row : row + 2, 10:20] = 2.0
-        found.append(len(seam._regions(residual, cells)))
+        found.append(len(seam._regions(alike(residual), cells)))
     assert found == [0, 1]
 
 

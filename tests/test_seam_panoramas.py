@@ -125,6 +125,29 @@ def test_what_only_one_layer_shows_leaves_a_faint_halo(name: str, who: int) -> N
 
 @pytest.mark.usefixtures(one_device.__name__)
 @pytest.mark.parametrize("name", ["plane", "across the border"])
+@pytest.mark.parametrize("who", [0, 1])
+def test_somebody_who_wears_the_walls_brightness_is_not_cut_in_two(name: str, who: int) -> None:
+    """Down the middle of a large disc, where the coefficients are equal, go fine checks that are as bright as
+    the wall in the mean."""
+    radius = 2 * RADIUS
+    layers, canvas, away, plain = scene(name, who)
+    rows, columns = pixel_places(canvas.height, canvas.width)
+    across = (columns - CANVASES[name][1] + canvas.width // 2) % canvas.width - canvas.width // 2
+    checks = np.where((rows // 3 + columns // 3) % 2 < 1, 60, -60)
+    bright = ndimage.gaussian_filter(plain.astype(float), (8, 8, 0), mode="wrap") + checks[..., None]
+    shown = plain.copy()
+    shown[away < radius, :3] = DISC
+    middle = (away < radius) & (np.abs(across) < 24)
+    shown[middle, :3] = np.rint(bright[middle, :3])
+    layers[who] = masked(shown, halves(canvas, CANVASES[name][1])[who])
+    result = merged(layers, canvas, exposure=False)
+    different = (away < radius - 2) & (off(shown, plain) > 30)
+    there = off(result, shown)[different] < off(result, plain)[different]
+    assert there.mean() > 0.98 or there.mean() < 0.02
+
+
+@pytest.mark.usefixtures(one_device.__name__)
+@pytest.mark.parametrize("name", ["plane", "across the border"])
 def test_without_seam_it_is_half_transparent(name: str) -> None:
     layers, canvas, away, plain = scene(name, 0)
     result = merged(layers, canvas, seam=False, transition_strain=0)

@@ -24,10 +24,9 @@ def seam_difference(
     cells: Sequence[int],
     shoulder: float,
     clipped: float,
-    squared: int,
-) -> Array:
-    """Mean corrected difference a - b, or its square's, of every cell's pixels, every other one in x and y,
-    and their share; samples brighter than `clipped` are left out."""
+) -> tuple[Array, Array]:
+    """Mean corrected difference a - b of every cell's pixels, every other one in x and y, with their share,
+    and the largest channel's mean square; samples brighter than `clipped` are left out."""
     columns, rows = pixels(border[0], border[1])
     gain_row = (2 * np.arange(cells[1]) + 1) * colours[1] // (2 * cells[1])
     gain_column = (2 * np.arange(cells[0]) + 1) * colours[0] // (2 * cells[0])
@@ -43,15 +42,16 @@ def seam_difference(
         here = gain[gain_row[cell[1]][:, None], gain_column[cell[0]][None], :3].astype(np.float64)
         shifted = exposure_shift(seen[..., :3], here, shoulder)
         looks.append(shifted if shoulder else np.sqrt(np.maximum(shifted, 0)))
-    result = np.zeros((cells[1], cells[0], 4))
+    result, square = np.zeros((cells[1], cells[0], 4)), np.zeros((cells[1], cells[0]))
     for j, i in np.ndindex(cells[1], cells[0]):
         left, right = (k * border[0] // cells[0] for k in (i, i + 1))
         top, bottom = (k * border[1] // cells[1] for k in (j, j + 1))
         part = np.s_[top:bottom:2, left:right:2]
-        values = (looks[0] - looks[1])[part][usable[part]] ** (2 if squared else 1)
+        values = (looks[0] - looks[1])[part][usable[part]]
         if len(values):
             result[j, i] = [*values.mean(0), len(values) / usable[part].size]
-    return result
+            square[j, i] = (values**2).mean(0).max()
+    return result, square
 
 
 def seam_yield(
