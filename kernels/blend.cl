@@ -11,11 +11,16 @@
 
 #if SAMPLES > 2
 #define BLEND_TWO 8
+#define BLEND_FOUR 16
+#define BLEND_ALPHAS s37bf
 #else
 #define BLEND_TWO 4
+#define BLEND_FOUR 8
+#define BLEND_ALPHAS s1357
 #endif
 
 typedef PIXEL_VECTOR(PIXEL, BLEND_TWO) blend_pixels; /* two as stored */
+typedef PIXEL_VECTOR(PIXEL, BLEND_FOUR) blend_row;   /* four */
 
 /* One layer as a band needs it: 64 bytes, made by hugin_abflow/blend.py. */
 typedef struct {
@@ -92,42 +97,16 @@ static inline float8 blend_taps(__global const pixel_stored *stored, __global co
     return BLEND_EACH(valid) ? c : (float8)(0.0f);
 }
 
-/* Four taps of two rows each, weighted; the least sample of each kind in them. */
-static inline float8 blend_across(__global const pixel_stored *p, __global const pixel_stored *q, float4 weights,
-                                  float8 *least) {
-    const float8 a = blend_colours((blend_pixels)(p[0], q[0])), b = blend_colours((blend_pixels)(p[1], q[1]));
-    const float8 c = blend_colours((blend_pixels)(p[2], q[2])), d = blend_colours((blend_pixels)(p[3], q[3]));
-    const float8 low = LEAST(LEAST(a, b), LEAST(c, d));
-    *least = LEAST(low, *least);
-    return weights.x * a + weights.y * b + weights.z * c + weights.w * d;
+/* Four pixels of a row as stored. */
+static inline blend_row blend_four(__global const pixel_stored *p) {
+    return (blend_row)(p[0], p[1], p[2], p[3]);
 }
 
-/* Bicubic sample at position q; next to the mask's rim bilinear over the valid taps, whose share is w. */
-static float4 blend_sample(__global const pixel_stored *stored, __global const blend_layer *layer, float2 q,
-                           int4 border, int nearest) {
-    int2 corner = floor_int2(nearest ? q : q - 0.5f);
-    if (nearest)
-        return grid_border(&corner, border) ? blend_tap(stored, layer, corner) : (float4)(0.0f);
-    const float2 t = q - 0.5f - convert_float2(corner);
+/* Sample next to what a layer does not show: bicubic if that is not among the taps, else bilinear over the valid ones,
+   whose share is w. corner: the pixel up and left of the position, t: how far from there. */
+static float4 blend_rim(__global const pixel_stored *stored, __global const blend_layer *layer, int2 corner, float2 t,
+                        int4 border) {
     const float4 wx = cubic_taps(t.x, BLEND_SLOPE), wy = cubic_taps(t.y, BLEND_SLOPE);
-    const int4 place = layer->place;
-    const int2 first = corner - 1 - place.xy;
-    if (first.x >= 0 && first.y >= 0 && first.x + 3 < place.z && first.y + 3 < place.w) {
-        /* nearly all samples: every tap is stored, no border rule is needed */
-        __global const pixel_stored *r0 = blend_line(stored, layer, first.y) + first.x;
-        __global const pixel_stored *r1 = blend_line(stored, layer, first.y + 1) + first.x;
-        __global const pixel_stored *r2 = blend_line(stored, layer, first.y + 2) + first.x;
-        __global const pixel_stored *r3 = blend_line(stored, layer, first.y + 3) + first.x;
-        float8 least = (float8)(WHITE);
-        const float8 upper = blend_across(r0, r1, wx, &least), lower = blend_across(r2, r3, wx, &least);
-        if (least.s3 >= 0.5f * WHITE && least.s7 >= 0.5f * WHITE) {
-            float4 sum = wy.x * upper.lo;
-            sum += wy.y * upper.hi;
-            sum += wy.z * lower.lo;
-            sum += wy.w * lower.hi;
-            return (float4)(sum.xyz, 1.0f);
-        }
-    }
     const float ax[4] = {wx.x, wx.y, wx.z, wx.w}, ay[4] = {wy.x, wy.y, wy.z, wy.w};
     float4 cubic = (float4)(0.0f), linear = (float4)(0.0f);
     int missing = 0;
@@ -143,6 +122,36 @@ static float4 blend_sample(__global const pixel_stored *stored, __global const b
     if (missing == 0)
         return (float4)(cubic.xyz, 1.0f);
     return linear.w > 0.0f ? (float4)(linear.xyz / linear.w, linear.w) : (float4)(0.0f);
+}
+
+/* Sample at position q. */
+static inline float4 blend_sample(__global const pixel_stored *stored, __global const blend_layer *layer, float2 q,
+                                  int4 border, int nearest) {
+    int2 corner = floor_int2(nearest ? q : q - 0.5f);
+    if (nearest)
+        return grid_border(&corner, border) ? blend_tap(stored, layer, corner) : (float4)(0.0f);
+    const float2 t = q - 0.5f - convert_float2(corner);
+    const int4 place = layer->place;
+    const int2 first = corner - 1 - place.xy;
+    if (first.x >= 0 && first.y >= 0 && first.x + 3 < place.z && first.y + 3 < place.w) {
+        /* nearly all samples: every tap is stored, no border rule is needed */
+        const blend_row r0 = blend_four(blend_line(stored, layer, first.y) + first.x);
+        const blend_row r1 = blend_four(blend_line(stored, layer, first.y + 1) + first.x);
+        const blend_row r2 = blend_four(blend_line(stored, layer, first.y + 2) + first.x);
+        const blend_row r3 = blend_four(blend_line(stored, layer, first.y + 3) + first.x);
+        const blend_row least = LEAST(LEAST(r0, r1), LEAST(r2, r3));
+        const int4 valid = convert_float4(least.BLEND_ALPHAS) >= 0.5f * WHITE;
+        if (valid.x & valid.y & valid.z & valid.w) {
+            const float4 wx = cubic_taps(t.x, BLEND_SLOPE), wy = cubic_taps(t.y, BLEND_SLOPE);
+            const float8 left = wy.x * blend_colours(r0.lo) + wy.y * blend_colours(r1.lo) +
+                                wy.z * blend_colours(r2.lo) + wy.w * blend_colours(r3.lo);
+            const float8 right = wy.x * blend_colours(r0.hi) + wy.y * blend_colours(r1.hi) +
+                                 wy.z * blend_colours(r2.hi) + wy.w * blend_colours(r3.hi);
+            const float4 sum = wx.x * left.lo + wx.y * left.hi + wx.z * right.lo + wx.w * right.hi;
+            return (float4)(sum.xyz, 1.0f);
+        }
+    }
+    return blend_rim(stored, layer, corner, t, border);
 }
 
 /* Values of coarse arrays at the heights of a band's rows, linear between their rows; beyond an array, its rim.

@@ -381,7 +381,7 @@ static inline float3 exposure_shift(float3 c, float3 gain, float shoulder) {
 /* Weights of the four taps around fraction t by cubic convolution (Keys, "Cubic convolution interpolation for
    digital image processing", 1981): exactly (0, 1, 0, 0) at t = 0. a: slope at the kernel's first zero. */
 static inline float4 cubic_taps(float t, float a) {
-    const float t2 = t * t, t3 = t2 * t;
-    return (float4)(a * (t3 - 2.0f * t2 + t), (a + 2.0f) * t3 - (a + 3.0f) * t2 + 1.0f,
-                    -(a + 2.0f) * t3 + (2.0f * a + 3.0f) * t2 - a * t, a * (t2 - t3));
+    const float4 third = (float4)(a, a + 2.0f, -a - 2.0f, -a);
+    const float4 second = (float4)(-2.0f * a, -a - 3.0f, 2.0f * a + 3.0f, a);
+    return (float4)(0.0f, 1.0f, 0.0f, 0.0f) + t * ((float4)(a, 0.0f, -a, 0.0f) + t * (second + t * third));
 }
