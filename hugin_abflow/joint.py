@@ -234,7 +234,7 @@ def _align(
         strict = correct(exposure, regions, strict=True)
         device.give_back()
         residual = seam.residuals(device, layers, fields, pairs, strict, grid)
-        found = seam.regions(residual, grid)
+        found = seam.regions(residual, grid, aligned=settings.flow)
         grown = found if regions is None else found | regions
         if not grown.any() or (regions is not None and np.array_equal(grown, regions)):
             break

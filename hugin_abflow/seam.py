@@ -48,7 +48,8 @@ _SIGMA = 1.0
 _STRONG, _WEAK = 0.2, 0.045
 # Strong cells, of the equator's size, that a region has at least: fewer are an edge that is a pixel off.
 _LEAST = 6.0
-# Price of a cut, in cells: what is cut off must be favoured by the softmax over this depth.
+# Price of a cut, in cells: what is cut off must be favoured by the softmax over this depth, or more where t
+# exceeds r.
 _CUT = 10.0
 # The same without flow, where the softmax has little to say: overlaps are some hundred cells wide.
 _FINE_CUT = 120.0
@@ -66,7 +67,7 @@ class Residuals:
     any pair and channel, 0 where no two lie.
 
     mean    r: of their low frequencies.
-    rms     t: of all.
+    rms     t: of all. In `divide` both are the mean square, on finer cells.
     """
 
     mean: npt.NDArray[np.float64]
@@ -99,9 +100,11 @@ def residuals(
     return Residuals(mean, np.sqrt(square))
 
 
-def regions(residual: Residuals, grid: Grid) -> npt.NDArray[np.bool_]:
-    """Where layers differ too much to be blended, of the same shape."""
-    found = _regions(residual, seam_grid(grid))
+def regions(residual: Residuals, grid: Grid, aligned: bool = True) -> npt.NDArray[np.bool_]:
+    """Where layers differ too much to be blended, of the same shape; unless they are aligned, texture differs
+    everywhere and tells nothing.
+    """
+    found = _regions(residual if aligned else Residuals(residual.mean, residual.mean), seam_grid(grid))
     return np.logical_or.reduce(found) if found else np.zeros(residual.mean.shape, bool)
 
 

@@ -97,13 +97,13 @@ static inline float8 blend_taps(__global const pixel_stored *stored, __global co
     return BLEND_EACH(valid) ? c : (float8)(0.0f);
 }
 
-/* Four pixels of a row as stored. */
-static inline blend_row blend_four(__global const pixel_stored *p) {
-    return (blend_row)(p[0], p[1], p[2], p[3]);
+/* Four pixels of a row as stored; handed on by its address, as charts are in common.cl. */
+static inline void blend_four(__global const pixel_stored *p, blend_row *row) {
+    *row = (blend_row)(p[0], p[1], p[2], p[3]);
 }
 
-/* Sample next to what a layer does not show: bicubic if that is not among the taps, else bilinear over the valid ones,
-   whose share is w. corner: the pixel up and left of the position, t: how far from there. */
+/* Sample where taps may be missing or go across the canvas's border: bicubic if all are there, else bilinear over the
+   valid ones, whose share is w. corner: the pixel up and left of the position, t: how far from there. */
 static float4 blend_rim(__global const pixel_stored *stored, __global const blend_layer *layer, int2 corner, float2 t,
                         int4 border) {
     const float4 wx = cubic_taps(t.x, BLEND_SLOPE), wy = cubic_taps(t.y, BLEND_SLOPE);
@@ -135,10 +135,11 @@ static inline float4 blend_sample(__global const pixel_stored *stored, __global 
     const int2 first = corner - 1 - place.xy;
     if (first.x >= 0 && first.y >= 0 && first.x + 3 < place.z && first.y + 3 < place.w) {
         /* nearly all samples: every tap is stored, no border rule is needed */
-        const blend_row r0 = blend_four(blend_line(stored, layer, first.y) + first.x);
-        const blend_row r1 = blend_four(blend_line(stored, layer, first.y + 1) + first.x);
-        const blend_row r2 = blend_four(blend_line(stored, layer, first.y + 2) + first.x);
-        const blend_row r3 = blend_four(blend_line(stored, layer, first.y + 3) + first.x);
+        blend_row r0, r1, r2, r3;
+        blend_four(blend_line(stored, layer, first.y) + first.x, &r0);
+        blend_four(blend_line(stored, layer, first.y + 1) + first.x, &r1);
+        blend_four(blend_line(stored, layer, first.y + 2) + first.x, &r2);
+        blend_four(blend_line(stored, layer, first.y + 3) + first.x, &r3);
         const blend_row least = LEAST(LEAST(r0, r1), LEAST(r2, r3));
         const int4 valid = convert_float4(least.BLEND_ALPHAS) >= 0.5f * WHITE;
         if (valid.x & valid.y & valid.z & valid.w) {

@@ -129,7 +129,8 @@ def problems(draw, layers: int, most: int):
             region.flat[random.choice(np.flatnonzero(beside))] = True
     # from all alike to a few cells that count for all
     low, rough = random.random((2, height, width)) ** draw(st.sampled_from([0.1, 1, 4]))
-    residual = seam.Residuals(*(draw(st.sampled_from([0.5, 3])) * v for v in (low, np.maximum(low, rough))))
+    scale = draw(st.sampled_from([0.5, 3]))
+    residual = seam.Residuals(scale * low, scale * np.maximum(low, rough))
     shares = random.random((layers, height, width)) ** draw(st.sampled_from([0.2, 1, 20]))
     shares /= np.maximum(shares.sum(0), 1e-9)
     cover = random.random((layers, height, width)) < draw(st.sampled_from([0.4, 0.8, 1]))
@@ -148,7 +149,7 @@ def least_and_found(problem, layers: int) -> tuple[float, float, float]:
     assert found.shape == rows.shape
     assert cover[found, rows, columns].all()  # no layer is taken where it is not
     everything = np.array(list(product(range(layers), repeat=rows.size)))
-    assert residual.mean.max() <= 3  # so that _FORBIDDEN forbids
+    assert max(residual.mean.max(), residual.rms.max()) <= 3  # so that _FORBIDDEN forbids
     least = energies(everything, *problem).min()
     return least, energies(found[None], *problem)[0], 5 * rows.size / seam._UNIT
 
@@ -237,6 +238,34 @@ def test_a_border_counts_as_a_cut() -> None:
         assert (seam.label(rows, columns, residual, shares, cover, False) == taken).all()
 
 
+def test_a_border_is_priced_by_all_frequencies() -> None:
+    """The same, where a border that differs in low frequencies alone is just worth it."""
+    rows, columns = (v.ravel() for v in np.mgrid[0:6, 0:19])
+    mean, cover = np.ones((6, 24)), np.ones((2, 6, 24), bool)
+    cover[1, :, 19:] = False
+    shares = np.stack([np.full((6, 24), 0.2), np.full((6, 24), 0.8)])
+    for rms, taken in ((1.0, 1), (2.0, 0)):
+        residual = seam.Residuals(mean, rms * mean)
+        assert (seam.label(rows, columns, residual, shares, cover, False) == taken).all()
+
+
+# Residuals
+
+
+def test_a_cell_of_which_little_is_seen_tells_as_much_less(monkeypatch: pytest.MonkeyPatch) -> None:
+    found = np.zeros((9, 12, 5))
+    found[..., 4] = 1
+    found[4, 6] = 0.5, -0.6, 0.1, 0.4, 0.1
+    found[4, 7] = 0
+    monkeypatch.setattr(seam, "_differences", lambda *_: found)
+    residual = seam.residuals(None, [], [], [None], None, plane(96, 72))
+    y, x = np.mgrid[0:9, 0:12]
+    weight = np.exp(-0.5 * ((y - 4) ** 2 + (x - 6) ** 2)) * found[..., 4]
+    assert np.isclose(residual.mean[4, 6], 0.6 * 0.1 / weight.sum(), rtol=0.01)
+    assert np.isclose(residual.rms[4, 6], np.sqrt(0.4 * 0.1 / weight.sum()), rtol=0.01)
+    assert residual.mean[4, 7] == residual.rms[4, 7] == 0
+
+
 # Regions
 
 
@@ -285,6 +314,8 @@ def test_texture_that_differs_joins_a_region_but_makes_none() -> None:
     mean[5:12, [5, 19]] = 2 * seam._STRONG
     assert len(seam._regions(alike(mean), cells)) == 2
     assert len(seam._regions(seam.Residuals(mean, rms), cells)) == 1
+    for aligned in (True, False):  # between the arms, where texture tells
+        assert seam.regions(seam.Residuals(mean, rms), plane(480, 320), aligned)[8, 12] == aligned
 
 
 def test_a_region_across_the_border_is_one() -> None:

@@ -219,7 +219,8 @@ def test_what_is_clipped_in_one_layer_changes_over_as_ever(device: Device) -> No
 def test_identical_layers_have_no_regions(device: Device, monkeypatch: pytest.MonkeyPatch) -> None:
     """They are no pair, so that nothing is measured; weights and places are the same to the bit."""
     asked = []
-    monkeypatch.setattr(seam, "regions", lambda *a, found=seam.regions: asked.append(found(*a)) or asked[-1])
+    find = seam.regions
+    monkeypatch.setattr(seam, "regions", lambda *a, **k: asked.append(find(*a, **k)) or asked[-1])
     layers, canvas, *_ = scene("across the border", None)
     with_, without = (prepared(device, layers, canvas, seam=s) for s in (True, False))
     assert len(asked) == 1 and asked[0].shape == (26, 60) and not asked[0].any()
