@@ -91,7 +91,8 @@ def residuals(
     cells = seam_grid(grid)
     mean, square = np.zeros(cells.shape), np.zeros(cells.shape)
     for pair in pairs:
-        found = _differences(device, layers, fields, pair, correction, grid, cells)
+        clipped = clipping(layers[pair.a].layer)
+        found = _differences(device, layers, fields, pair, correction, grid, cells, clipped)
         share = found[..., 4:]
         smooth = _smooth(np.concatenate([found[..., :4] * share, share], -1), cells.wraps)
         smooth = (share > 0) * smooth[..., :4] / np.where(share > 0, smooth[..., 4:], 1)
@@ -117,8 +118,8 @@ def cut(
     masks: Masks,
     grid: Grid,
 ) -> None:
-    """Give each cell of the regions `whole` to one layer: the others lose their colour weight
-    there (fields[...].w, in place).
+    """Give each cell of the regions `whole` to one layer: the others lose their colour weight there
+    (fields[...].w, in place).
     """
     cells = seam_grid(grid)
     owner = _owners(layers, fields, residual, whole, masks, grid, cells, _CUT)
@@ -197,19 +198,17 @@ def _differences(
     correction: Correction,
     grid: Grid,
     cells: Grid,
-    clipped: float | None = None,
+    clipped: float,
 ) -> npt.NDArray[np.float64]:
     """Of two corrected layers, (height, width, 5): per cell the mean of their difference in r, g, b and the
-    largest mean square of these, where neither is brighter than `clipped` (default: where neither is
-    clipped), and the share of the pixels that tell.
+    largest mean square of these, where neither is brighter than `clipped`, and the share of the pixels that
+    tell.
     """
     none = device.zeros((*correction.grid.shape, 4))
     difference, square = device.empty((*cells.shape, 4)), device.empty(cells.shape)
     sides: list[Any] = []
     for k in (pair.a, pair.b):
         sides += [layers[k].pixels, fields[k], layers[k].box, correction.gains[k] or none]
-    if clipped is None:
-        clipped = clipping(layers[pair.a].layer)
     device.run(
         "seam", "seam_difference", cells.border[:2], *sides, grid.border, grid.lens,
         correction.grid.border, cells.border, correction.shoulder, clipped, difference, square,

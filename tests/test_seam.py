@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from itertools import product
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -258,7 +259,8 @@ def test_a_cell_of_which_little_is_seen_tells_as_much_less(monkeypatch: pytest.M
     found[4, 6] = 0.5, -0.6, 0.1, 0.4, 0.1
     found[4, 7] = 0
     monkeypatch.setattr(seam, "_differences", lambda *_: found)
-    residual = seam.residuals(None, [], [], [None], None, plane(96, 72))
+    layers = [SimpleNamespace(layer=SimpleNamespace(dtype=np.dtype(np.uint8)))] * 2
+    residual = seam.residuals(None, layers, [], [seam.Pair(0, 1)], None, plane(96, 72))
     y, x = np.mgrid[0:9, 0:12]
     weight = np.exp(-0.5 * ((y - 4) ** 2 + (x - 6) ** 2)) * found[..., 4]
     assert np.isclose(residual.mean[4, 6], 0.6 * 0.1 / weight.sum(), rtol=0.01)
