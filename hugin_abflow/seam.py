@@ -35,7 +35,7 @@ from hugin_abflow.coefficient import Masks, on_cells
 from hugin_abflow.colour import Correction, clipping
 from hugin_abflow.geometry import Pair
 from hugin_abflow.opencl import Buffer, Device
-from hugin_abflow.working import Grid, WorkingLayer
+from hugin_abflow.working import Grid, WorkingLayer, connected
 
 # Working pixels per cell of the seam grid.
 _CELL = 8
@@ -243,16 +243,8 @@ def _regions(residual: Residuals, cells: Grid) -> list[npt.NDArray[np.bool_]]:
 
 def _connected(mask: npt.NDArray[np.bool_], wraps: bool) -> list[npt.NDArray[np.bool_]]:
     """The connected parts of a mask."""
-    count, found = cv2.connectedComponents(mask.astype(np.uint8), connectivity=8)
-    labels = np.asarray(found)
-    if wraps:  # parts that meet across the border, at a corner too, are one
-        height = labels.shape[0]
-        for down in (-1, 0, 1):
-            for row in range(max(0, -down), height - max(0, down)):
-                first, last = labels[row, 0], labels[row + down, -1]
-                if first and last and first != last:
-                    labels[labels == last] = first
-    return [labels == k for k in np.unique(labels[mask])] if count > 1 else []
+    labels = connected(mask, wraps)
+    return [labels == k for k in np.unique(labels[mask])]
 
 
 def label(

@@ -14,6 +14,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 from zlib import crc32
 
+import cv2
 import numpy as np
 import numpy.typing as npt
 
@@ -109,6 +110,19 @@ class Grid:
         lon, dlon, lat, dlat = self.lens
         lens = (lon, dlon * self.width / width, lat, dlat * self.height / height)
         return replace(self, width=width, height=height, lens=lens)
+
+
+def connected(mask: npt.NDArray[np.bool_], wraps: bool) -> npt.NDArray[np.int32]:
+    """The connected parts of a mask over a grid, numbered from 1 on, not all numbers in use; 0 elsewhere."""
+    labels = np.asarray(cv2.connectedComponents(mask.astype(np.uint8), connectivity=8)[1], np.int32)
+    if wraps:  # parts that meet across the border, at a corner too, are one
+        height = labels.shape[0]
+        for down in (-1, 0, 1):
+            for row in range(max(0, -down), height - max(0, down)):
+                first, last = labels[row, 0], labels[row + down, -1]
+                if first and last and first != last:
+                    labels[labels == last] = first
+    return labels
 
 
 @dataclass(frozen=True)
