@@ -14,8 +14,9 @@ import numpy as np
 import numpy.typing as npt
 
 from hugin_abflow.opencl import Device
+from hugin_abflow.projection import EQUIRECTANGULAR, Eye
 from hugin_abflow.pyramid import Level
-from hugin_abflow.working import Grid, WorkingLayer, directions
+from hugin_abflow.working import Grid, WorkingLayer
 
 # Chart pixels around the overlap, so that flow is smooth across its border.
 _MARGIN = 16
@@ -29,7 +30,8 @@ _FLOOR = 0.05
 @dataclass(frozen=True)
 class Chart:
     """transform: the 16 numbers of common.cl; width, height px; wraps: columns are periodic; coarse: pixels
-    of the working grid per pixel, 1 or 2.
+    of the working grid per pixel, 1 or 2; eye: in what directions it shows its places, on a sphere in axes of
+    its own; None: not known.
     """
 
     transform: npt.NDArray[np.float32]
@@ -37,16 +39,11 @@ class Chart:
     height: int
     wraps: bool
     coarse: int = 1
+    eye: Eye | None = None
 
     def around(self, grid: Grid) -> float:
         """The width of the canvas of `grid` in px of the chart."""
         return grid.circumference * float(self.transform[9])
-
-    def bearings(self, places: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
-        """Unit vectors (n, 3) in which positions (n, 2) on a sphere's chart are seen, in its own axes."""
-        t = self.transform.astype(np.float64)
-        lon, lat = (places[:, 0] - t[11]) / t[9], (t[12] - places[:, 1]) / t[10]
-        return directions(lon, lat)
 
     @property
     def spherical(self) -> bool:
@@ -96,6 +93,15 @@ def _plane(overlap: npt.NDArray[np.bool_], grid: Grid) -> Chart:
     width = max(1, round(width / _WRAP_MULTIPLE)) * _WRAP_MULTIPLE
     transform[9], transform[12] = width / grid.width, -top
     return Chart(transform, width, int(bottom - top), True)
+
+
+def _eye(chart: Chart, grid: Grid) -> Eye | None:
+    """Of a plane's chart."""
+    across, down, left, top = chart.transform[9:13].astype(np.float64)
+    across, down = across * grid.width / grid.region.width, down * grid.height / grid.region.height
+    return grid.eye and grid.eye.on(
+        across, down, grid.region.left - left / across, grid.region.top - top / down
+    )
 
 
 def _axes(points: npt.NDArray[np.float64], weights: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
@@ -154,7 +160,8 @@ def _sphere(overlap: npt.NDArray[np.bool_], mask_grid: Grid, scale: float) -> Ch
     transform = np.zeros(16, np.float32)
     transform[:9] = (turn @ axes).ravel()
     transform[9:14] = across, scale, width / 2, north * scale, 1
-    return Chart(transform, width, math.ceil((north - south) * scale), wraps)
+    eye = Eye(EQUIRECTANGULAR, across, scale, width / 2, north * scale)
+    return Chart(transform, width, math.ceil((north - south) * scale), wraps, eye=eye)
 
 
 def pair_chart(overlap: npt.NDArray[np.bool_], mask_grid: Grid, grid: Grid, coarse: int = 1) -> Chart:
@@ -169,6 +176,7 @@ def pair_chart(overlap: npt.NDArray[np.bool_], mask_grid: Grid, grid: Grid, coar
         rows = np.arange(height) * mask_grid.height // height
         columns = np.arange(width) * mask_grid.width // width
         found = _plane(overlap[rows][:, columns], grid)
+        found = replace(found, eye=_eye(found, grid))
     return replace(found, coarse=coarse)
 
 

@@ -401,7 +401,7 @@ def _flows(
         for (pair, _), its_chart in zip(overlaps, charts, strict=True):
             its_layers = (layers[pair.a], layers[pair.b])
             image_a, image_b = (chart.sample(device, layer, grid, its_chart) for layer in its_layers)
-            bearings = its_chart.bearings if its_chart.spherical else None
+            bearings = its_chart.eye.bearings if its_chart.eye else None
             found = flow.pair_flow(device, image_a, image_b, parameters, reach=reach, bearings=bearings)
             first, second = numbers[pair.a], numbers[pair.b]
             its_guides = guides.get((min(first, second), max(first, second)))

@@ -16,6 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from hugin_abflow.errors import ImageReadError, LayersMismatchError
+from hugin_abflow.projection import EQUIRECTANGULAR
 
 _log = logging.getLogger(__name__)
 
@@ -65,6 +66,7 @@ class Canvas:
     spherical   equirectangular: rows are latitudes, columns longitudes; flow and distances are
                 calculated on the sphere. Other projections are planes.
     hfov        horizontal field of view in degrees (scale of the sphere: width / hfov px per degree).
+    projection  Hugin's number of it (p-line f); -1: not known.
     """
 
     width: int
@@ -73,6 +75,7 @@ class Canvas:
     wraps: bool = False
     spherical: bool = False
     hfov: float = 0.0
+    projection: int = -1
 
     @classmethod
     def plane(cls, width: int, height: int, wraps: bool = False) -> Canvas:
@@ -82,7 +85,7 @@ class Canvas:
     @classmethod
     def sphere(cls, width: int, height: int, hfov: float = 360.0) -> Canvas:
         """An equirectangular canvas without crop; it wraps if `hfov` is 360 degrees."""
-        return cls(width, height, Box(0, 0, width, height), hfov == 360.0, True, hfov)
+        return cls(width, height, Box(0, 0, width, height), hfov == 360.0, True, hfov, EQUIRECTANGULAR)
 
 
 @dataclass(frozen=True)

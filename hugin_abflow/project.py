@@ -9,8 +9,9 @@ from pathlib import Path, PureWindowsPath
 from hugin_abflow import pto
 from hugin_abflow.errors import ProjectError
 from hugin_abflow.layer import Box, Canvas
+from hugin_abflow.projection import EQUIRECTANGULAR
 
-EQUIRECTANGULAR, SINUSOIDAL = 2, 7
+SINUSOIDAL = 7
 
 # Output projections whose columns are meridians, so that at 360 degrees the right border continues in
 # the left one, row by row: cylindrical, equirectangular, Mercator, Lambert's cylindrical equal-area,
@@ -177,7 +178,8 @@ def _canvas(file: Path, panorama: pto.Panorama) -> Canvas:
             )
     wrapping = projection in WRAPPING
     hfov = min(panorama.hfov, 360.0) if wrapping else panorama.hfov  # as Hugin does
-    return Canvas(width, height, crop, wrapping and hfov == 360.0, projection == EQUIRECTANGULAR, hfov)
+    spherical = projection == EQUIRECTANGULAR
+    return Canvas(width, height, crop, wrapping and hfov == 360.0, spherical, hfov, projection)
 
 
 def _projection(number: int) -> str:

@@ -21,6 +21,7 @@ import numpy.typing as npt
 from hugin_abflow.layer import Box, Canvas, Layer, bounding_box
 from hugin_abflow.opencl import Buffer, Device
 from hugin_abflow.progress import Advance
+from hugin_abflow.projection import Eye, directions
 from hugin_abflow.settings import Settings
 
 # Rows of a layer that are decoded and uploaded at a time.
@@ -35,14 +36,6 @@ _MOST_ROWS = 32_000
 PIXEL = {"uint8": ("uchar", 255.0), "uint16": ("ushort", 65535.0), "float32": ("float", 1.0)}
 
 
-def directions(
-    longitudes: npt.NDArray[np.float64], latitudes: npt.NDArray[np.float64]
-) -> npt.NDArray[np.float64]:
-    """Unit vectors (n, 3) to places (n,) on a sphere, radians (kernels/common.cl)."""
-    level = np.cos(latitudes)
-    return np.stack([level * np.sin(longitudes), level * np.cos(longitudes), np.sin(latitudes)], 1)
-
-
 @dataclass(frozen=True)
 class Grid:
     """A pixel grid over the region.
@@ -52,6 +45,7 @@ class Grid:
     wraps, poles     border rules (kernels/common.cl); poles: bit 0 at the top, bit 1 at the bottom.
     lens        (lon of x = 0, radians per column, lat of y = 0, radians per row); zeros on a plane.
     canvas_width    of the whole canvas, full-resolution px; 0: the region's.
+    eye         of a plane, on the whole canvas; None: not known.
     """
 
     region: Box
@@ -61,6 +55,7 @@ class Grid:
     poles: int
     lens: tuple[float, float, float, float]
     canvas_width: int = 0
+    eye: Eye | None = None
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -144,15 +139,17 @@ def full_grid(canvas: Canvas, layers: Sequence[Layer]) -> Grid:
     region = bounding_box(layers)
     if canvas.wraps:
         region = replace(region, left=0, right=canvas.width)
-    lens, poles = (0.0, 0.0, 0.0, 0.0), 0
-    if canvas.spherical:
+    lens, poles, eye = (0.0, 0.0, 0.0, 0.0), 0, None
+    if not canvas.spherical:
+        eye = Eye.of(canvas.projection, canvas.width, canvas.height, canvas.hfov)
+    else:
         step = math.radians(canvas.hfov) / canvas.width
         left, top = region.left - canvas.width / 2, canvas.height / 2 - region.top
         lens = (left * step, step, top * step, step)
         if canvas.wraps and canvas.width % 2 == 0:
             poles += abs(lens[2] - math.pi / 2) < step / 2
             poles += 2 * (abs(lens[2] - region.height * step + math.pi / 2) < step / 2)
-    return Grid(region, region.width, region.height, canvas.wraps, poles, lens, canvas.width)
+    return Grid(region, region.width, region.height, canvas.wraps, poles, lens, canvas.width, eye)
 
 
 def working_grid(full: Grid, settings: Settings) -> Grid:

@@ -142,7 +142,7 @@ def test_bearings_are_what_positions_are_of(name: str) -> None:
     found = pair_chart(mask, grid, grid)
     rng = np.random.default_rng(5)
     places = rng.uniform((1, 1), (found.width - 1, found.height - 1), (50, 2))
-    points = found.bearings(places) @ found.transform[:9].reshape(3, 3).astype(np.float64)
+    points = found.eye.bearings(places) @ found.transform[:9].reshape(3, 3).astype(np.float64)
     assert np.allclose(np.linalg.norm(points, axis=1), 1)
     assert np.allclose(found.positions(points), places, atol=1e-3)
 
