@@ -1,34 +1,43 @@
 """Flow that leads back to where it started is trusted; elsewhere it is filled (kernels/consistency.cl).
 
 A flow from a to b and the flow from b to a undo each other where both are right. Where they do not
-(occlusions, people who moved, surfaces without texture), flow is taken from the trusted flow around, near
-before far: a pyramid of trust-weighted means, from which every level fills the finer one.
+(occlusions, surfaces without texture), and where something moved by itself (movers.py), flow is taken from
+the trusted flow around, near before far: a pyramid of trust-weighted means, from which every level fills the
+finer one.
 """
 
 from __future__ import annotations
 
 from dataclasses import replace
 
+import numpy as np
+
 from hugin_abflow.geometry import PairFlow
+from hugin_abflow.movers import CELL, Mask, Movers
 from hugin_abflow.opencl import Buffer, Device
 
 # Pixels between start and return that leave a quarter of the trust.
 _TOLERANCE = 1.5
 
 
-def mend(device: Device, pair: PairFlow) -> PairFlow:
-    """The pair's flows, filled where they disagree."""
+def mend(device: Device, pair: PairFlow, moved: Movers | None = None) -> PairFlow:
+    """The pair's flows, filled where they disagree and where things moved by themselves."""
     wraps = pair.chart.wraps
-    forward = _fill(device, trust(device, pair.forward, pair.backward, wraps), wraps)
-    backward = _fill(device, trust(device, pair.backward, pair.forward, wraps), wraps)
+    first, second = (moved.first, moved.second) if moved else (None, None)
+    forward = _fill(device, trust(device, pair.forward, pair.backward, wraps, first), wraps)
+    backward = _fill(device, trust(device, pair.backward, pair.forward, wraps, second), wraps)
     return replace(pair, forward=forward, backward=backward)
 
 
-def trust(device: Device, flow: Buffer, back: Buffer, wraps: bool) -> Buffer:
-    """float32 (height, width, 4): flow in px, trust 0..1, and an unused 0."""
+def trust(device: Device, flow: Buffer, back: Buffer, wraps: bool, moved: Mask | None = None) -> Buffer:
+    """float32 (height, width, 4): flow in px, trust 0..1, and an unused 0. moved: cells that have none."""
     trusted = device.empty((*flow.shape[:2], 4))
     grid = _grid(flow, wraps)
-    device.run("consistency", "consistency_trust", grid[:2], flow, back, grid, _TOLERANCE, trusted)
+    distrusted = device.upload(np.zeros((1, 1), np.uint8) if moved is None else moved.astype(np.uint8))
+    cells = (*distrusted.shape[::-1], CELL, 0)
+    device.run(
+        "consistency", "consistency_trust", grid[:2], flow, back, grid, _TOLERANCE, distrusted, cells, trusted
+    )
     return trusted
 
 

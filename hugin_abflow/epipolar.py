@@ -46,12 +46,34 @@ def along(u: Points, v: Points, direction: Points) -> npt.NDArray[np.float64]:
     return cosines
 
 
+def across(u: Points, v: Points, direction: Points) -> npt.NDArray[np.float64]:
+    """How far (n), as the sine of an angle, motion from u to v leads away from that of still things, if the
+    camera moved so; all of it where it points the other way.
+    """
+    motion = v - (u * v).sum(1, keepdims=True) * u  # along the sphere: however long, it has one direction
+    expected = (u @ direction)[:, None] * u - direction
+    expected /= np.maximum(np.linalg.norm(expected, axis=1, keepdims=True), _NO_MOTION)
+    share = np.maximum((motion * expected).sum(1, keepdims=True), 0)
+    return np.asarray(np.linalg.norm(motion - share * expected, axis=1))
+
+
+def known_move(u: Points, v: Points) -> Points | None:
+    """The camera's `move` that motion from u to v (n, 3) tells, if most of it is that of still things."""
+    u, v = (points[:: max(1, len(points) // _MOST)] for points in (u, v))
+    if len(u) < _LEAST:
+        return None
+    direction = move(u, v)
+    return direction if _still(u, v, direction) else None
+
+
 def parallax(known: tuple[Points, Points], found: tuple[Points, Points]) -> bool:
     """Whether the motion in `found` is that of still things, for the camera's move that `known` tells; not so
     if it tells none. Each is where points are seen from the first and from the second place.
     """
-    u, v = (points[:: max(1, len(points) // _MOST)] for points in known)
-    if len(u) < _LEAST or not len(found[0]):
-        return False
-    direction = move(u, v)
-    return all(float((along(*points, direction) > _ALONG).mean()) >= _MOSTLY for points in ((u, v), found))
+    direction = known_move(*known) if len(found[0]) else None
+    return direction is not None and _still(*found, direction)
+
+
+def _still(u: Points, v: Points, direction: Points) -> bool:
+    """Whether most of what moves from u to v stands still, if the camera moved so."""
+    return float((along(u, v, direction) > _ALONG).mean()) >= _MOSTLY

@@ -112,6 +112,32 @@ class Start:
     pulls: tuple[Pull | None, Pull | None] = (None, None)
 
 
+@dataclass(frozen=True)
+class Refused:
+    """Flow that a search found, but that does not explain much and is not known to be of what stands still.
+
+    flows   both ways, float32 (2, height, width, 2), px of `level`.
+    """
+
+    level: int
+    flows: npt.NDArray[np.float32]
+
+    def finest(self, width: int, height: int) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.float32]]:
+        """Both ways on the finest level's grid, px."""
+        times = 1 << self.level
+        wide = np.repeat(np.repeat(self.flows * np.float32(times), times, 1), times, 2)[:, :height, :width]
+        return wide[0], wide[1]
+
+
+@dataclass(frozen=True)
+class Solution:
+    """Flow from a to b and back, float32 (height, width, 2) px, and what was found besides."""
+
+    forward: Buffer
+    backward: Buffer
+    refused: tuple[Refused, ...] = ()
+
+
 def _features(device: Device, pairs: Sequence[tuple[Level, Level]], parameters: FlowParameters) -> Buffer:
     """Features of images, float32 (images, height, width, 4). Each is given by its level and the next coarser
     one: the local mean is smooth enough to be taken from there.
@@ -208,7 +234,7 @@ def _better(
     level: int,
     bearings: Bearings | None,
     parameters: FlowParameters,
-) -> list[Buffer]:
+) -> tuple[list[Buffer], list[Refused]]:
     """Of flows without and with what was searched, those that are left after a level: in the end one."""
     how, last = parameters.search, level <= parameters.decide_on
     plain, found = (_misfit(device, features, one, grid, parameters) for one in flows)
@@ -217,17 +243,17 @@ def _better(
     distance = how.apart * 2.0 ** (parameters.decide_on - level)
     apart = common & (((ways[1] - ways[0]) ** 2).sum(-1) > distance**2)
     if not apart.any():
-        return flows[:1]
+        return flows[:1], []
     kept = flows[1:] if last else flows
     gained = found[common].mean() <= (how.gain if last else how.hope) * plain[common].mean()
     if gained and (not last or apart.sum() >= how.widely * common.sum()):
-        return kept
+        return kept, []
     if bearings and found[apart].mean() <= how.gain_apart * plain[apart].mean():
         textured = (features.get()[..., 1:3] ** 2).sum(-1) > how.textured**2
         known = _seen(bearings, ways[0], common & ~apart & textured, level)
         if epipolar.parallax(known, _seen(bearings, ways[1], apart, level)):
-            return kept
-    return flows[:1]
+            return kept, []
+    return flows[:1], [Refused(level, ways[1])]
 
 
 def _seen(
@@ -276,6 +302,14 @@ def _together(device: Device, parts: Sequence[Buffer]) -> Buffer:
 
 
 def pair_flow(
+    device: Device, a: Level, b: Level, parameters: FlowParameters | None = None, start: Start | None = None
+) -> tuple[Buffer, Buffer]:
+    """What `solve` finds: flow from a to b and from b to a."""
+    solution = solve(device, a, b, parameters, start)
+    return solution.forward, solution.backward
+
+
+def solve(
     device: Device,
     a: Level,
     b: Level,
@@ -283,13 +317,13 @@ def pair_flow(
     start: Start | None = None,
     reach: float | None = None,
     bearings: Bearings | None = None,
-) -> tuple[Buffer, Buffer]:
-    """Flow from a to b and from b to a: two float32 (height, width, 2) in px of the grid.
+) -> Solution:
+    """Flow from a to b and from b to a, in px of the grid.
 
     a, b: log brightness with masks, 0 outside them. start: nothing else is searched. reach: the largest
     motion that is searched, px, 0: none; if it is None, `parameters.reach` of the longer side. It is less
     where the masks overlap little: in a small corner of a floor of tiles every tile fits. bearings: what
-    direction a place on the grid is seen in, on a sphere. Raises `DeviceError` if the device fails.
+    direction a place on the grid is seen in, if that is known. Raises `DeviceError` if the device fails.
 
     What is found beyond warping's reach is kept if the images are clearly more alike by it, since where
     patterns repeat much fits a little, and if it is no thing that moved by itself: somebody who walked would
@@ -305,6 +339,7 @@ def pair_flow(
         reach = min(reach, parameters.overlap * math.sqrt(common))
         searched = search.reaches(reach, count, parameters.search, finest=parameters.decide_on)
     pyramids = [pyramid.build(device, image, count + 1) for image in (a, b)]
+    refused: list[Refused] = []
     flows: list[Buffer] = []  # without what a search found, and with it, as long as both may be taken
     for level in reversed(range(count)):
         features = _features(device, [(p[level], p[level + 1]) for p in pyramids], parameters)
@@ -321,9 +356,10 @@ def pair_flow(
         pulls = start.pulls if start else (None, None)
         flows = [_refine(device, features, one, grid, level, parameters, pulls) for one in flows]
         if len(flows) > 1:
-            flows = _better(device, features, flows, grid, level, bearings, parameters)
+            flows, dropped = _better(device, features, flows, grid, level, bearings, parameters)
+            refused += dropped
     forward, backward = _apart(device, flows[0])
-    return forward, backward
+    return Solution(forward, backward, tuple(refused))
 
 
 def _expand(device: Device, flows: Buffer, grid: Grid) -> Buffer:

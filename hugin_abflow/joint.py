@@ -7,7 +7,7 @@ import logging
 import threading
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from functools import partial
@@ -29,6 +29,7 @@ from hugin_abflow import (
     guidance,
     highlights,
     memory,
+    movers,
     multiband,
     quality,
     seam,
@@ -42,6 +43,7 @@ from hugin_abflow.errors import DeviceError, SettingsError
 from hugin_abflow.geometry import Pair, PairFlow
 from hugin_abflow.guides import Guide, by_pair
 from hugin_abflow.layer import Canvas, Layer
+from hugin_abflow.movers import Movers
 from hugin_abflow.opencl import Buffer, Device, DeviceMemoryError
 from hugin_abflow.progress import Progress
 from hugin_abflow.settings import Settings
@@ -146,22 +148,23 @@ def prepare(
     overlaps = _overlaps(device, reduced, masks)
     _check_memory(device, reduced, overlaps, masks, grid, settings)
     its_guides = by_pair(guides if settings.guides else ())
-    flows, shifts = (
+    flows, shifts, moving = (
         _flows(device, reduced, masks, grid, overlaps, progress, settings, its_guides, numbers)
         if settings.flow
-        else ([], [])
+        else ([], [], [])
     )
     with progress("align", 1) as advance:
         for index, pair_flow in enumerate(flows):  # one by one: they are large
-            flows[index] = consistency.mend(device, pair_flow)
+            flows[index] = consistency.mend(device, pair_flow, moving[index])
+        moved = _moved(flows, moving, grid)
         pairs = [pair for pair, _ in overlaps]
-        fields, correction, whole = _align(device, reduced, pairs, flows, masks, grid, settings)
+        fields, correction, whole = _align(device, reduced, pairs, flows, moved, masks, grid, settings)
         if _log.isEnabledFor(logging.INFO):
             _tell_overlaps(reduced, overlaps, shifts, grid, whole)
         del masks, overlaps  # what comes takes the most memory
         offsets = multiband.none(grid, len(reduced))
         if settings.exposure and pairs:
-            offsets = multiband.offsets(device, reduced, fields, correction, grid)
+            offsets = multiband.offsets(device, reduced, fields, correction, grid, moved)
         final = [
             BlendLayer(
                 layer.layer, layer.box, field, geometry.reach(device, layer, field, grid), gain, offset
@@ -206,6 +209,7 @@ def _align(
     layers: Sequence[WorkingLayer],
     pairs: Sequence[Pair],
     flows: list[PairFlow],
+    moved: seam.Cells | None,
     masks: Masks,
     grid: Grid,
     settings: Settings,
@@ -234,7 +238,7 @@ def _align(
         strict = correct(exposure, regions, strict=True)
         device.give_back()
         residual = seam.residuals(device, layers, fields, pairs, strict, grid)
-        found = seam.regions(residual, grid, aligned=settings.flow)
+        found = seam.regions(residual, grid, aligned=settings.flow, moved=moved)
         grown = found if regions is None else found | regions
         if not grown.any() or (regions is not None and np.array_equal(grown, regions)):
             break
@@ -247,7 +251,7 @@ def _align(
         whole = regions
         with ThreadPoolExecutor(1, "gains") as beside:  # solved on one core: the device cuts meanwhile
             gains = beside.submit(correct, settings, regions)
-            seam.cut(device, layers, fields, residual, regions, masks, grid)
+            seam.cut(device, layers, fields, residual, regions, masks, grid, moved)
             return fields, gains.result(), whole
     return fields, correct(settings, regions), whole
 
@@ -385,8 +389,8 @@ def _flows(
     settings: Settings,
     guides: Mapping[tuple[int, int], Sequence[Guide]],
     numbers: Sequence[int],
-) -> tuple[list[PairFlow], list[figures.Parallax]]:
-    """Flow of every pair of layers, on the pair's own chart, and figures of it if somebody listens.
+) -> tuple[list[PairFlow], list[figures.Parallax], list[Movers | None]]:
+    """Flow of every pair of layers, on the pair's own chart; figures of it, if somebody listens; and movers.
 
     overlaps    the pairs, and where they overlap on the grid of `masks`.
     guides      of each two layers, by their numbers; numbers: what guides call each of `layers`.
@@ -396,22 +400,45 @@ def _flows(
     largest = _REACH * (grid.canvas_width or grid.region.width) * grid.width / grid.region.width
     reach = largest / coarse if settings.large_motion != "off" else 0.0
     result, shifts = [], []
-    with ThreadPoolExecutor(1, "chart") as beside, progress("flow", len(overlaps)) as advance:
-        charts = beside.map(lambda overlap: chart.pair_chart(overlap[1], masks.grid, grid, coarse), overlaps)
+    moving: list[Future[Movers | None]] = []
+    with (
+        ThreadPoolExecutor(1, "chart") as drawing,
+        ThreadPoolExecutor(1, "movers") as looking,
+        progress("flow", len(overlaps)) as advance,
+    ):
+        charts = drawing.map(lambda overlap: chart.pair_chart(overlap[1], masks.grid, grid, coarse), overlaps)
         for (pair, _), its_chart in zip(overlaps, charts, strict=True):
             its_layers = (layers[pair.a], layers[pair.b])
             image_a, image_b = (chart.sample(device, layer, grid, its_chart) for layer in its_layers)
             bearings = its_chart.eye.bearings if its_chart.eye else None
-            found = flow.pair_flow(device, image_a, image_b, parameters, reach=reach, bearings=bearings)
+            solved = flow.solve(device, image_a, image_b, parameters, reach=reach, bearings=bearings)
+            found = (solved.forward, solved.backward)
             first, second = numbers[pair.a], numbers[pair.b]
-            its_guides = guides.get((min(first, second), max(first, second)))
+            its_guides = guides.get((min(first, second), max(first, second)), ())
+            placed = guidance.on_chart(its_guides, first, its_chart, grid)
             if its_guides:
-                placed = guidance.on_chart(its_guides, first, its_chart, grid)
                 found = guidance.lead(device, (image_a, image_b), found, placed, its_chart.around(grid))
+            if settings.seam and settings.movers:
+                views = (movers.View.of(image_a), movers.View.of(image_b))
+                arrays = (found[0].get(), found[1].get())
+                vouched = (placed.at_a, placed.at_b)
+                moving.append(looking.submit(movers.find, its_chart, arrays, views, vouched, solved.refused))
+                if len(moving) > 1:
+                    moving[-2].result()  # arrays of one pair are kept beside the next one's
             result.append(PairFlow(pair.a, pair.b, its_chart, *found))
             if _log.isEnabledFor(logging.INFO):
                 shifts.append(figures.parallax(device, result[-1], (image_a, image_b), grid))
             advance(1)
         device.finish()  # kernels are only queued: the last pair's time would be told as that of what follows
+        moved = [job.result() for job in moving] or [None] * len(result)
     device.give_back()
-    return result, shifts
+    return result, shifts, moved
+
+
+def _moved(flows: Sequence[PairFlow], moving: Sequence[Movers | None], grid: Grid) -> seam.Cells | None:
+    """Where on the seam grid something moved by itself between any two layers; None: nowhere."""
+    cells = seam.seam_grid(grid)
+    places = [
+        movers.on_canvas(one, flow.chart, cells) for flow, one in zip(flows, moving, strict=True) if one
+    ]
+    return np.logical_or.reduce(places) if places else None

@@ -15,6 +15,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -62,8 +63,12 @@ def offsets(
     fields: Sequence[Buffer],
     correction: Correction,
     grid: Grid,
+    moved: npt.NDArray[np.bool_] | None = None,
 ) -> Offsets:
-    """Those that make of the weighted mean of the layers a multi-band blend. fields: of geometry.py."""
+    """Those that make of the weighted mean of the layers a multi-band blend. fields: of geometry.py.
+
+    moved: cells of the region, as many as there may be, in which something moved by itself.
+    """
     grids = levels(grid)
     if len(grids) < 2:
         return none(grid, len(layers))
@@ -80,7 +85,7 @@ def offsets(
         for k, (layer, field) in enumerate(zip(layers, fields, strict=True))
     ]
     del total
-    _differ(device, finest, widths[1])
+    _differ(device, finest, widths[1], np.zeros((1, 1)) if moved is None else moved)
     blend = _blend(device, finest, grids[1:], widths[1:])
     result = []
     while finest:  # each makes room for the next one's
@@ -127,17 +132,19 @@ def _finest(
     return _spread(device, level, widths)
 
 
-def _differ(device: Device, finest: list[_Level], widths: Widths) -> None:
-    """Have each entry be how it differs from the weighted mean of all."""
+def _differ(device: Device, finest: list[_Level], widths: Widths, moved: npt.NDArray[Any]) -> None:
+    """Have each entry be how it differs from the weighted mean of all; not where something moved."""
     grid = finest[0].grid
+    alone, cells = device.upload(moved, np.float32), (*moved.shape[::-1], *grid.border[2:])
     mean = device.zeros((*grid.shape, 4))
     for level in finest:
         _add(device, level, None, mean)
     _join(device, mean, grid, None, None)
     for k, level in enumerate(finest):
         device.run(
-            "multiband", "multiband_differ", level.box[2:], level.colours, level.box, grid.border, mean
-        )
+            "multiband", "multiband_differ", level.box[2:], level.colours, level.box, grid.border, mean,
+            alone, cells,
+        )  # fmt: skip
         finest[k] = _spread(device, level, widths)
         device.give_back()  # layers are of different sizes
 

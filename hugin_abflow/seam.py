@@ -57,8 +57,13 @@ _FINE_CUT = 120.0
 _SHORTER = 0.005
 # No layer is taken where it is not.
 _FORBIDDEN = 1e4
+# How much more a region may cost if that shows what moved by itself once, from a layer that has most of it.
+_ONCE, _MOSTLY = 2.0, 0.5
 # Capacities are integers; residuals are around 1.
 _UNIT = 1000
+
+
+Cells = npt.NDArray[np.bool_]  # (height, width) on the seam grid
 
 
 @dataclass(frozen=True)
@@ -101,11 +106,12 @@ def residuals(
     return Residuals(mean, np.sqrt(square))
 
 
-def regions(residual: Residuals, grid: Grid, aligned: bool = True) -> npt.NDArray[np.bool_]:
+def regions(residual: Residuals, grid: Grid, aligned: bool = True, moved: Cells | None = None) -> Cells:
     """Where layers differ too much to be blended, of the same shape; unless they are aligned, texture differs
-    everywhere and tells nothing.
+    everywhere and tells nothing. moved: cells that belong to a region whatever the layers show there.
     """
-    found = _regions(residual if aligned else Residuals(residual.mean, residual.mean), seam_grid(grid))
+    told = residual if aligned else Residuals(residual.mean, residual.mean)
+    found = _regions(told, seam_grid(grid), np.zeros(residual.mean.shape, bool) if moved is None else moved)
     return np.logical_or.reduce(found) if found else np.zeros(residual.mean.shape, bool)
 
 
@@ -114,15 +120,16 @@ def cut(
     layers: Sequence[WorkingLayer],
     fields: Sequence[Buffer],
     residual: Residuals,
-    whole: npt.NDArray[np.bool_],
+    whole: Cells,
     masks: Masks,
     grid: Grid,
+    moved: Cells | None = None,
 ) -> None:
     """Give each cell of the regions `whole` to one layer: the others lose their colour weight there
-    (fields[...].w, in place).
+    (fields[...].w, in place). A region of which cells moved is cut in two only if that is much better.
     """
     cells = seam_grid(grid)
-    owner = _owners(layers, fields, residual, whole, masks, grid, cells, _CUT)
+    owner = _owners(layers, fields, residual, whole, masks, grid, cells, _CUT, moved)
     yields = [_soften((whole & (owner != k)).astype(np.float32), cells.wraps) for k in range(len(layers))]
     _yield(device, layers, fields, yields, grid, cells)
 
@@ -157,6 +164,7 @@ def _owners(
     grid: Grid,
     cells: Grid,
     cut_price: float,
+    moved: Cells | None = None,
 ) -> npt.NDArray[np.intp]:
     """The layer of each cell, (height, width): in the regions `whole` the one it is taken from, elsewhere the
     one that the softmax favours, -1 where none is.
@@ -169,7 +177,8 @@ def _owners(
     owner = np.where(cover.any(0), (shares * cover).argmax(0), -1)
     for region in _connected(whole, cells.wraps):
         rows, columns = np.nonzero(region)
-        owner[rows, columns] = label(rows, columns, residual, shares, cover, cells.wraps, cut_price)
+        once = moved is not None and bool(moved[region].any())
+        owner[rows, columns] = label(rows, columns, residual, shares, cover, cells.wraps, cut_price, once)
     return owner
 
 
@@ -230,15 +239,19 @@ def _padded(values: npt.NDArray[Any], by: int, wraps: bool) -> npt.NDArray[Any]:
     return np.pad(values, ((0, 0), (by, by), *beyond), mode="wrap" if wraps else "constant")
 
 
-def _regions(residual: Residuals, cells: Grid) -> list[npt.NDArray[np.bool_]]:
-    """Connected outskirts that hold enough of strong residual, grown by a cell."""
-    weak = (residual.mean > _WEAK) | (residual.rms > _STRONG)
+def _regions(residual: Residuals, cells: Grid, moved: Cells) -> list[Cells]:
+    """Connected outskirts that hold enough of strong residual, or anything that moved, grown by a cell."""
+    weak = (residual.mean > _WEAK) | (residual.rms > _STRONG) | moved
     weak = _padded(weak.astype(np.uint8), 1, cells.wraps)
     grown = np.asarray(cv2.dilate(weak, np.ones((3, 3), np.uint8)))[1:-1, 1:-1] > 0
     latitude = cells.lens[2] - (np.arange(cells.height) + 0.5) * cells.lens[3]
     area = np.cos(latitude)[:, None] if cells.lens[1] else 1.0
     strong = (residual.mean > _STRONG) * area
-    return [region for region in _connected(grown, cells.wraps) if strong[region].sum() >= _LEAST]
+    return [
+        region
+        for region in _connected(grown, cells.wraps)
+        if strong[region].sum() >= _LEAST or moved[region].any()
+    ]
 
 
 def _connected(mask: npt.NDArray[np.bool_], wraps: bool) -> list[npt.NDArray[np.bool_]]:
@@ -255,11 +268,14 @@ def label(
     cover: npt.NDArray[np.bool_],
     wraps: bool,
     cut_price: float = _CUT,
+    once: bool = False,
 ) -> npt.NDArray[np.intp]:
     """Which layer each cell (rows, columns) of a region is taken from: the least energy found.
 
     shares, cover: shares of the softmax and coverage (layers, height, width).
     cut_price: of a cut, in cells.
+    once: one layer is taken, as far as it goes, if that is not much worse. Somebody may stand there twice,
+    and a cut between his two places, or where these overlap, is as cheap as one beside him.
     """
     candidates = np.flatnonzero(cover[:, rows, columns].any(1))
     if candidates.size < 2:
@@ -283,7 +299,25 @@ def label(
     for _ in range(1 if candidates.size == 2 else 2):
         for alpha in range(candidates.size):
             current = _expand(current, alpha, price, first, second, between)
+    if once:
+        somewhere = np.where(present.any(0), price, 0.0)
+        alone = [np.where(one, k, current) for k, one in enumerate(present) if one.mean() > _MOSTLY]
+        energies = [_energy(one, somewhere, first, second, between) for one in (current, *alone)]
+        if alone and min(energies[1:]) <= _ONCE * energies[0]:
+            current = alone[int(np.argmin(energies[1:]))]
     return candidates[current]
+
+
+def _energy(
+    labels: npt.NDArray[np.intp],
+    price: npt.NDArray[np.float64],
+    first: npt.NDArray[np.intp],
+    second: npt.NDArray[np.intp],
+    between: npt.NDArray[np.float64],
+) -> float:
+    """What a labelling costs."""
+    own = np.take_along_axis(price, labels[None], 0).sum()
+    return float(own + between[labels[first] != labels[second]].sum())
 
 
 def _neighbours(

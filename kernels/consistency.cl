@@ -1,11 +1,14 @@
 /* Where the two flows of a pair do not lead back to the start they are not to be trusted; there flow is filled
    from where it is. */
 
-/* Trust in a flow, 1 / (1 + (e / tolerance)^2)^2 with e = |F_ab(q) + F_ba(q + F_ab(q))|. */
+/* Trust in a flow, 1 / (1 + (e / tolerance)^2)^2 with e = |F_ab(q) + F_ba(q + F_ab(q))|; none in that of what
+   moved by itself. */
 __kernel void consistency_trust(__global const float2 *flow, /* (grid.y, grid.x) F_ab, px */
                                 __global const float2 *back, /* (grid.y, grid.x) F_ba, px */
                                 int4 grid,                   /* width, height, wraps, 0; run size */
                                 float tolerance,             /* px that leave a quarter of the trust */
+                                __global const uchar *moved, /* (cells.y, cells.x): what moved by itself */
+                                int4 cells,                  /* width, height, px of the chart per cell, 0 */
                                 __global float4 *trusted)    /* (grid.y, grid.x) F_ab, trust, 0 */
 {
     const int x = get_global_id(0), y = get_global_id(1);
@@ -20,7 +23,8 @@ __kernel void consistency_trust(__global const float2 *flow, /* (grid.y, grid.x)
         q.x = LIMITED(q.x, 0.5f, grid.x - 0.5f);
     const float2 e = (f + bilinear_flow(back, q, grid)) / tolerance;
     const float c = 1.0f / (1.0f + square2(e));
-    trusted[at] = (float4)(f, c * c, 0.0f);
+    const int column = LEAST(x / cells.z, cells.x - 1), row = LEAST(y / cells.z, cells.y - 1);
+    trusted[at] = (float4)(f, moved[row * cells.x + column] ? 0.0f : c * c, 0.0f);
 }
 
 /* Halve: the mean flow, weighted by trust, and the mean trust; taps as in pyramid_reduce. */

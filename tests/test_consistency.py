@@ -15,11 +15,14 @@ from tolerances import POSITION, SUM, assert_close
 from hugin_abflow import consistency
 from hugin_abflow.chart import Chart, pair_chart
 from hugin_abflow.geometry import PairFlow
+from hugin_abflow.movers import CELL, Movers
 from hugin_abflow.opencl import Device
 from hugin_abflow.working import Grid
 
 SIZES = [(77, 53), (64, 31), (5, 3), (1, 7), (1, 1)]
 WRAPS = [False, True]
+# Cells of which none moved, as the kernel takes them.
+NOTHING = np.zeros((1, 1), bool), (1, 1, CELL, 0)
 
 
 def smooth_flow(seed: int, width: int, height: int, most: float, wraps: bool) -> np.ndarray:
@@ -29,6 +32,14 @@ def smooth_flow(seed: int, width: int, height: int, most: float, wraps: bool) ->
         random, (5, 5, 0), mode=("nearest", "wrap" if wraps else "nearest", "nearest")
     )
     return (flow * most / max(np.abs(flow).max(), 1e-9)).astype(np.float32)
+
+
+def moved_cells(seed: int, width: int, height: int) -> np.ndarray:
+    """A random mask of the cells of a chart; one of them at least is set."""
+    rows, columns = (max(1, (n + CELL // 2 - 1) // CELL) for n in (height, width))
+    cells = np.random.default_rng(seed).random((rows, columns)) < 0.3
+    cells[-1, seed % columns] = True
+    return cells
 
 
 def random_trusted(seed: int, width: int, height: int) -> np.ndarray:
@@ -54,7 +65,7 @@ def read_at(values: np.ndarray, x: np.ndarray, y: np.ndarray, wraps: bool, by: i
 @pytest.mark.parametrize("wraps", WRAPS)
 def test_twin_of_trust_is_the_formula(wraps: bool) -> None:
     flow, back = (smooth_flow(k, 77, 53, 6.0, wraps).astype(np.float64) for k in (0, 1))
-    trusted = twin.consistency_trust(flow, back, (77, 53, int(wraps), 0), 1.5)
+    trusted = twin.consistency_trust(flow, back, (77, 53, int(wraps), 0), 1.5, *NOTHING)
     columns, rows = common.pixels(77, 53)
     there = columns + 0.5 + flow[..., 0], rows + 0.5 + flow[..., 1]
     u, v = (read_at(back[..., k], *there, wraps) for k in (0, 1))
@@ -62,17 +73,34 @@ def test_twin_of_trust_is_the_formula(wraps: bool) -> None:
     assert np.allclose(trusted[..., 2], 1 / (1 + squared / 1.5**2) ** 2)
     assert np.array_equal(trusted[..., :2], flow)
     off = np.array([[[1.5, 0.0]]])  # 1.5 px from the start: a quarter
-    assert twin.consistency_trust(off, 0 * off, (1, 1, 0, 0), 1.5)[0, 0, 2] == pytest.approx(0.25)
+    assert twin.consistency_trust(off, 0 * off, (1, 1, 0, 0), 1.5, *NOTHING)[0, 0, 2] == pytest.approx(0.25)
+
+
+@pytest.mark.parametrize("size", SIZES)
+def test_twin_of_trust_has_none_in_what_moved(size: tuple[int, int]) -> None:
+    """Pixel by pixel, on cells of the size that movers.py makes, as many as have a pixel in their middle."""
+    moved, still = moved_cells(4, *size), np.zeros((size[1], size[0], 2))
+    rows, columns = moved.shape
+    grid, cells = (*size, 0, 0), (columns, rows, CELL, 0)
+    trusted = twin.consistency_trust(still, still, grid, 1.5, moved, cells)
+    for y, x in np.ndindex(trusted.shape[:2]):
+        its = moved[min(y // CELL, rows - 1), min(x // CELL, columns - 1)]
+        assert trusted[y, x, 2] == (0 if its else 1)
 
 
 @pytest.mark.parametrize("size", SIZES)
 @pytest.mark.parametrize("wraps", WRAPS)
 def test_trust_equals_its_twin(device: Device, size: tuple[int, int], wraps: bool) -> None:
     flow, back = (smooth_flow(k, *size, 6.0, wraps) for k in (2, 3))
-    kernel = consistency.trust(device, device.upload(flow), device.upload(back), wraps).get()
-    expected = twin.consistency_trust(flow, back, (*size, int(wraps), 0), consistency._TOLERANCE)
-    assert np.array_equal(kernel[..., :2], flow)
-    assert_close(kernel, expected, POSITION)
+    for moved in (None, moved_cells(5, *size), moved_cells(6, *size)):
+        kernel = consistency.trust(device, device.upload(flow), device.upload(back), wraps, moved).get()
+        given = NOTHING if moved is None else (moved, (*moved.shape[::-1], CELL, 0))
+        expected = twin.consistency_trust(flow, back, (*size, int(wraps), 0), consistency._TOLERANCE, *given)
+        assert np.array_equal(kernel[..., :2], flow)
+        assert_close(kernel, expected, POSITION)
+        none = expected[..., 2] == 0
+        assert np.array_equal(kernel[..., 2] == 0, none)
+        assert none.any() == (moved is not None and bool(moved.any()))
 
 
 @pytest.mark.parametrize("wraps", WRAPS)
@@ -155,11 +183,11 @@ def mended(
     grid: Grid,
     forward: np.ndarray,
     backward: np.ndarray,
-    found: Chart | None = None,
+    moved: Movers | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:
     flows = (device.upload(flow.astype(np.float32)) for flow in (forward, backward))
-    pair = PairFlow(0, 1, found or chart_of(grid), *flows)
-    result = consistency.mend(device, pair)
+    pair = PairFlow(0, 1, chart_of(grid), *flows)
+    result = consistency.mend(device, pair, moved)
     assert (result.a, result.b, result.chart) == (0, 1, pair.chart)
     return result.forward.get(), result.backward.get()
 
@@ -228,6 +256,26 @@ def test_a_patch_of_wrong_flow_is_filled_from_around(device: Device, centre: tup
     assert np.abs(results[0] - forward)[disc].max() < LEFT
     assert np.abs(results[0] - forward)[~disc].max() < LEFT
     assert np.abs(results[1] - backward).max() < LEFT
+
+
+@pytest.mark.parametrize("name", ["cylinder", "sphere"])
+@pytest.mark.parametrize("column", [0, 15])
+def test_flow_of_what_moved_is_filled_from_around(device: Device, name: str, column: int) -> None:
+    """It leads there and back exactly, each way from the place where that photo shows it, across the border
+    too; what is around stands still."""
+    found = chart_of(CANVASES[name])
+    places, flows = [], []
+    for at, way in ((column, 7 * CELL), (column + 7, -7 * CELL)):
+        cells = np.zeros((found.height // CELL, found.width // CELL), bool)
+        cells[4:9, np.arange(at - 2, at + 3) % cells.shape[1]] = True
+        there = np.zeros((found.height, found.width, 2))
+        there[: CELL * cells.shape[0]][np.kron(cells, np.ones((CELL, CELL), bool))] = way, 0
+        places.append(cells)
+        flows.append(there)
+    filled = mended(device, CANVASES[name], *flows, Movers(*places))
+    assert max(np.abs(flow).max() for flow in filled) < LEFT
+    for kept, flow in zip(mended(device, CANVASES[name], *flows), flows, strict=True):
+        assert np.array_equal(kept[flow[..., 0] != 0], flow[flow[..., 0] != 0])
 
 
 def test_near_flow_counts_before_far(device: Device) -> None:

@@ -53,6 +53,50 @@ def test_what_walks_is_no_parallax(direction: tuple[float, float, float], expect
     assert epipolar.parallax(known, (u, unit(u + 0.2 * np.array(direction)))) is expected
 
 
+def test_still_points_are_not_led_away() -> None:
+    """Whatever their distance; for them all of their motion is along, and nothing of it for another move."""
+    move = unit(np.array([0.3, -0.5, 0.2]))
+    u, v = seen(1, 300, 0.1 * move, np.array([0, 1.0, 0]))
+    motion = np.linalg.norm(v - u, axis=1)
+    assert motion.max() > 0.04
+    assert epipolar.across(u, v, move).max() < 1e-9
+    assert epipolar.across(u, u, move).max() < 1e-12
+    assert np.allclose(epipolar.across(v, u, move), motion, rtol=0.01)
+
+
+@settings(max_examples=40, deadline=None)
+@given(seed=st.integers(0, 10_000), size=st.floats(1e-4, 0.05), turn=st.floats(-np.pi, np.pi))
+def test_what_leads_away_is_told_in_radians(seed: int, size: float, turn: float) -> None:
+    """A step at an angle to the motion of still things: its sine, or all of it beyond a right angle."""
+    rng = np.random.default_rng(seed)
+    move = unit(rng.normal(size=3))
+    u = unit(rng.normal(size=(100, 3)))
+    u = u[np.abs(u @ move) < 0.95]
+    still = unit(unit(u - 1e-3 * move) - u)
+    beside = np.cross(u, still)
+    v = unit(u + size * (np.cos(turn) * still + np.sin(turn) * beside))
+    expected = size * (abs(np.sin(turn)) if abs(turn) < np.pi / 2 else 1)
+    assert np.allclose(epipolar.across(u, v, move), expected, atol=2 * size**2 + 1e-3 * size)
+
+
+def test_a_move_is_known_where_most_things_stand_still() -> None:
+    """Not where nothing moves, where a third walks, or where few points are; of more than enough some do."""
+    move = unit(np.array([0.3, -0.5, 0.2]))
+    u, v = seen(1, 45_000, 0.1 * move, np.array([0, 1.0, 0]))
+    rng = np.random.default_rng(2)
+    v_lost = unit(u + 0.03 * rng.normal(size=u.shape))
+    for share, expected in ((0.1, True), (0.33, False)):
+        walks = rng.random(len(u)) < share
+        found = epipolar.known_move(u, np.where(walks[:, None], v_lost, v))
+        assert (found is not None) == expected
+        assert found is None or found @ move > np.cos(np.radians(3))
+    assert epipolar.known_move(u, u) is None
+    assert epipolar.known_move(u[:199], v[:199]) is None
+    for count in (200, 19_999, 20_001, 40_000):
+        found = epipolar.known_move(u[:count], v[:count])
+        assert found is not None and found @ move > np.cos(np.radians(3))
+
+
 def test_an_unknown_move_proves_nothing() -> None:
     """All moves at random, or hardly anything is known."""
     rng = np.random.default_rng(4)
@@ -62,3 +106,11 @@ def test_an_unknown_move_proves_nothing() -> None:
     assert not epipolar.parallax((u, unit(u + 0.05 * rng.normal(size=u.shape))), found)
     assert not epipolar.parallax((u[:150], v[:150]), found)
     assert not epipolar.parallax((u, v), (u[:0], v[:0]))
+
+
+def test_what_stands_still_does_not_leave_its_way_however_near_it_is() -> None:
+    """By up to an eighth of a turn: on the sphere its way is an arc, and a chord would leave it."""
+    move = unit(np.array([0.3, -0.5, 0.2]))
+    u, v = seen(6, 500, 0.7 * move, np.array([0, 1.0, 0]), nearest=0.75)
+    assert np.arccos((u * v).sum(1)).max() > 0.8
+    assert epipolar.across(u, v, move).max() < 1e-9

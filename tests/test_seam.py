@@ -9,8 +9,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from grids import GRIDS, patches, plane, random_layer, sphere
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given
+from labels import alike, energies, many, problems
 from reference.seam import seam_difference, seam_yield
 from scipy import ndimage
 from tolerances import POSITION, SUM, assert_close
@@ -18,6 +18,7 @@ from tolerances import POSITION, SUM, assert_close
 from hugin_abflow import seam
 from hugin_abflow.coefficient import on_cells
 from hugin_abflow.opencl import Device
+from hugin_abflow.working import Grid
 
 WRAPS = [False, True]
 
@@ -94,55 +95,6 @@ def test_yield_equals_its_twin(device: Device, name: str) -> None:
 # Labels of least energy
 
 
-def energies(labels, rows, columns, residual, shares, cover, wraps) -> np.ndarray:
-    """The sum in seam.py for each of the labellings (n, cells), cell by cell."""
-    height, width = residual.mean.shape
-    number = {(y, x): k for k, (y, x) in enumerate(zip(rows.tolist(), columns.tolist(), strict=True))}
-    total = np.zeros(len(labels))
-    for (y, x), k in number.items():
-        chosen = labels[:, k]
-        r, t = residual.mean[y, x], residual.rms[y, x]
-        total += np.where(cover[chosen, y, x], r * (1 - shares[chosen, y, x]), seam._FORBIDDEN)
-        for down, right in ((0, 1), (1, 0), (0, -1), (-1, 0)):
-            v, u = y + down, x + right
-            if not 0 <= v < height or not (wraps or 0 <= u < width):
-                continue
-            u %= width
-            total += seam._CUT * t * (cover[:, v, u].any() & ~cover[chosen, v, u])
-            if (v, u) in number and down + right > 0:
-                pair = seam._CUT * (t + residual.rms[v, u]) / 2
-                total += pair * (chosen != labels[:, number[v, u]])
-    return total
-
-
-@st.composite
-def problems(draw, layers: int, most: int):
-    """A connected region of at most `most` cells on a small grid; each is covered by one layer at least."""
-    height, width = draw(st.integers(1, 5)), draw(st.integers(1, 5))
-    wraps = draw(st.booleans())
-    random = np.random.default_rng(draw(st.integers(0, 2**32 - 1)))
-    region = np.zeros((height, width), bool)
-    region[random.integers(height), random.integers(width)] = True
-    for _ in range(draw(st.integers(1, most)) - 1):
-        beside = np.pad(region, ((0, 0), (1, 1)), "wrap" if wraps else "constant")
-        beside = ndimage.binary_dilation(beside)[:, 1:-1] & ~region
-        if beside.any():
-            region.flat[random.choice(np.flatnonzero(beside))] = True
-    # from all alike to a few cells that count for all
-    low, rough = random.random((2, height, width)) ** draw(st.sampled_from([0.1, 1, 4]))
-    scale = draw(st.sampled_from([0.5, 3]))
-    residual = seam.Residuals(scale * low, scale * np.maximum(low, rough))
-    shares = random.random((layers, height, width)) ** draw(st.sampled_from([0.2, 1, 20]))
-    shares /= np.maximum(shares.sum(0), 1e-9)
-    cover = random.random((layers, height, width)) < draw(st.sampled_from([0.4, 0.8, 1]))
-    cover[random.integers(layers), region & ~cover.any(0)] = True
-    rows, columns = np.nonzero(region)
-    return rows, columns, residual, shares, cover, wraps
-
-
-many = settings(max_examples=150, deadline=None, derandomize=True)
-
-
 def least_and_found(problem, layers: int) -> tuple[float, float, float]:
     """Least energy of all labellings, that of `label`, and what integer capacities may cost."""
     rows, columns, residual, _, cover, _ = problem
@@ -169,11 +121,6 @@ def test_of_three_layers_nearly_the_least_energy_is_found(problem) -> None:
     least, found, rounding = least_and_found(problem, 3)
     assert least <= found + 1e-9
     assert found <= 1.05 * least + rounding
-
-
-def alike(residual: np.ndarray) -> seam.Residuals:
-    """Layers that differ by low frequencies alone."""
-    return seam.Residuals(residual, residual)
 
 
 def test_a_lone_layer_is_taken_even_where_it_is_not() -> None:
@@ -271,6 +218,11 @@ def test_a_cell_of_which_little_is_seen_tells_as_much_less(monkeypatch: pytest.M
 # Regions
 
 
+def regions(residual: seam.Residuals, cells: Grid) -> list[np.ndarray]:
+    """Each of them, where nothing moved."""
+    return seam._regions(residual, cells, np.zeros(cells.shape, bool))
+
+
 @pytest.mark.parametrize("wraps", WRAPS)
 def test_connected_parts_are_those_of_a_flood(wraps: bool) -> None:
     count = 0
@@ -296,12 +248,12 @@ def test_a_region_is_strong_and_takes_its_outskirts() -> None:
     cells = plane(480, 320).resized(60, 40)
     residual = np.zeros((40, 60))
     residual[5:12, 5:20] = 0.5 * (seam._WEAK + seam._STRONG)
-    assert seam._regions(alike(residual), cells) == []  # weak alone
+    assert regions(alike(residual), cells) == []  # weak alone
     residual[6:8, 7:9] = 2.0
     residual[20, 30:35] = 2.0
-    assert seam._regions(alike(residual), cells) == []  # 4 cells here, 5 there: edges
+    assert regions(alike(residual), cells) == []  # 4 cells here, 5 there: edges
     residual[8, 7:10] = 2.0
-    (region,) = seam._regions(alike(residual), cells)
+    (region,) = regions(alike(residual), cells)
     expected = np.zeros((40, 60), bool)
     expected[4:13, 4:21] = True
     assert np.array_equal(region, expected)
@@ -312,10 +264,10 @@ def test_texture_that_differs_joins_a_region_but_makes_none() -> None:
     cells = plane(480, 320).resized(60, 40)
     mean, rms = np.zeros((40, 60)), np.zeros((40, 60))
     rms[5:12, 5:20] = 1.1 * seam._STRONG
-    assert seam._regions(seam.Residuals(mean, rms), cells) == []
+    assert regions(seam.Residuals(mean, rms), cells) == []
     mean[5:12, [5, 19]] = 2 * seam._STRONG
-    assert len(seam._regions(alike(mean), cells)) == 2
-    assert len(seam._regions(seam.Residuals(mean, rms), cells)) == 1
+    assert len(regions(alike(mean), cells)) == 2
+    assert len(regions(seam.Residuals(mean, rms), cells)) == 1
     for aligned in (True, False):  # between the arms, where texture tells
         assert seam.regions(seam.Residuals(mean, rms), plane(480, 320), aligned)[8, 12] == aligned
 
@@ -325,10 +277,10 @@ def test_a_region_across_the_border_is_one() -> None:
     residual[5:9, 58:] = residual[5:8, :1] = 2.0  # neither side is enough alone
     residual[7:9, 58:] = 0.5 * (seam._WEAK + seam._STRONG)
     cells = plane(480, 320, wraps=True).resized(60, 40)
-    (region,) = seam._regions(alike(residual), cells)
+    (region,) = regions(alike(residual), cells)
     assert region[:, [57, 58, 59, 0, 1]].any(0).all()
     assert region.sum() == 6 * 4 + 5
-    assert seam._regions(alike(residual), plane(480, 320).resized(60, 40)) == []
+    assert regions(alike(residual), plane(480, 320).resized(60, 40)) == []
 
 
 def test_cells_near_a_pole_count_by_their_area() -> None:
@@ -337,7 +289,7 @@ def test_cells_near_a_pole_count_by_their_area() -> None:
     for row in (0, 14):
         residual = np.zeros((30, 60))
         residual[row : row + 2, 10:20] = 2.0
-        found.append(len(seam._regions(alike(residual), cells)))
+        found.append(len(regions(alike(residual), cells)))
     assert found == [0, 1]
 
 

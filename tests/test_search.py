@@ -218,7 +218,8 @@ def test_what_makes_images_no_more_alike_is_dropped(
     """A search that offers nonsense: only where it is always believed the flow is not what it is without."""
     a, whole = texture(36, 371, 217), np.ones((217, 371))
     images = [on_device(device, image, whole) for image in (a, np.roll(a, 2, 1))]
-    without = flow.pair_flow(device, *images, reach=0.0)
+    solved = flow.solve(device, *images, reach=0.0)
+    without = (solved.forward, solved.backward)
 
     def nonsense(_: Device, __: Buffer, stacked: Buffer, *___: object) -> Buffer:
         return device.upload(stacked.get() + np.float32(9))
@@ -270,9 +271,16 @@ def test_a_small_thing_that_moves_as_near_things_do_is_found(device: Device, by:
 
     (a, in_a), (b, _) = view(0, 0), view(by, 3)
     images = [on_device(device, image, np.ones(a.shape)) for image in (a, b)]
-    forward, _ = flow.pair_flow(device, *images, bearings=bearings)
-    inside = forward.get()[ndimage.binary_erosion(in_a, iterations=6)]
+    solved, inner = flow.solve(device, *images, bearings=bearings), ndimage.binary_erosion(in_a, iterations=6)
+    inside = solved.forward.get()[inner]
     assert ((np.linalg.norm(inside - (by, 0), axis=-1) < 1).mean() > 0.9) == kept
+    assert (not solved.refused) == kept
+    for refused in solved.refused[:1]:  # who walked is told from it
+        forward, backward = refused.finest(371, 217)
+        assert forward.shape == backward.shape == (217, 371, 2)
+        assert (np.linalg.norm(forward[inner] - (by, 0), axis=-1) < 2).mean() > 0.75
+        there = np.roll(inner, by, 1)
+        assert (np.linalg.norm(backward[there] + (by, 0), axis=-1) < 2).mean() > 0.75
 
 
 def test_a_narrow_overlap_shows_all_of_its_motion(device: Device) -> None:

@@ -9,6 +9,7 @@ from scipy import ndimage
 
 from hugin_abflow import joint
 from hugin_abflow.layer import Box, Canvas, Layer
+from hugin_abflow.settings import Settings
 
 pytestmark = pytest.mark.usefixtures(one_device.__name__)
 
@@ -55,7 +56,7 @@ def flows(monkeypatch):
 
     def remember(device, layers, masks, grid, *rest):
         found = original(device, layers, masks, grid, *rest)
-        ((pair,), _) = found
+        ((pair,), *_) = found
         assert (pair.a, pair.b) == (0, 1)
         seen.append((layers[0].layer, layers[1].layer, pair, grid))
         return found
@@ -221,6 +222,20 @@ def test_three_layers_are_code_1_twice(flows):
     names = {tuple(sorted((one.name, other.name))) for one, other, _, _ in flows}
     assert names == {("layer 1", "layer 2"), ("layer 0", "layer 1+layer 2")}
     check(result, iterate(flows, PLANE))
+
+
+@pytest.mark.parametrize("count", [2, 3])
+def test_a_mosaic_of_several_places_has_no_movers(monkeypatch, count):
+    """What stands still moves otherwise for each of them."""
+    seen, original = [], joint._flows
+
+    def remember(*given):
+        seen.append(next(one for one in given if isinstance(one, Settings)).movers)
+        return original(*given)
+
+    monkeypatch.setattr(joint, "_flows", remember)
+    merged(layers_of(PLANE, three_masks()[:count]), PLANE, merge="sequential")
+    assert seen == [count == 2] * (count - 1)
 
 
 def test_order_given_by_the_caller_does_not_matter_to_which_come_first(flows):

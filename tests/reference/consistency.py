@@ -9,8 +9,12 @@ import numpy as np
 from reference.common import Array, bilinear, pixels
 
 
-def consistency_trust(flow: Array, back: Array, grid: Sequence[int], tolerance: float) -> Array:
-    """Flow, and how far going there and back again ends at the start; (height, width, 4)."""
+def consistency_trust(
+    flow: Array, back: Array, grid: Sequence[int], tolerance: float, moved: Array, cells: Sequence[int]
+) -> Array:
+    """Flow, and how far going there and back again ends at the start, (height, width, 4); nothing of it is
+    believed under cells that moved, the last of which go on to the border.
+    """
     columns, rows = pixels(grid[0], grid[1])
     x, y = columns + 0.5 + flow[..., 0], rows + 0.5 + flow[..., 1]
     y = np.clip(y, 0.5, grid[1] - 0.5)
@@ -19,6 +23,9 @@ def consistency_trust(flow: Array, back: Array, grid: Sequence[int], tolerance: 
     returned, share = bilinear(back, grid, x, y)
     away = np.linalg.norm(flow + returned / share[..., None], axis=-1)
     trust = (1 + (away / tolerance) ** 2) ** -2
+    under = np.kron(moved, np.ones((cells[2], cells[2])))
+    beyond = [(0, max(0, wanted - there)) for wanted, there in zip(grid[1::-1], under.shape, strict=True)]
+    trust[np.pad(under, beyond, mode="edge")[: grid[1], : grid[0]] > 0] = 0
     return np.dstack([flow, trust, np.zeros_like(trust)])
 
 

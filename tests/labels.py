@@ -1,0 +1,64 @@
+"""Label problems of seam.py, at random, and what a labelling costs."""
+
+from __future__ import annotations
+
+import numpy as np
+from hypothesis import settings
+from hypothesis import strategies as st
+from scipy import ndimage
+
+from hugin_abflow import seam
+
+
+def energies(labels, rows, columns, residual, shares, cover, wraps) -> np.ndarray:
+    """The sum in seam.py for each of the labellings (n, cells), cell by cell."""
+    height, width = residual.mean.shape
+    number = {(y, x): k for k, (y, x) in enumerate(zip(rows.tolist(), columns.tolist(), strict=True))}
+    total = np.zeros(len(labels))
+    for (y, x), k in number.items():
+        chosen = labels[:, k]
+        r, t = residual.mean[y, x], residual.rms[y, x]
+        total += np.where(cover[chosen, y, x], r * (1 - shares[chosen, y, x]), seam._FORBIDDEN)
+        for down, right in ((0, 1), (1, 0), (0, -1), (-1, 0)):
+            v, u = y + down, x + right
+            if not 0 <= v < height or not (wraps or 0 <= u < width):
+                continue
+            u %= width
+            total += seam._CUT * t * (cover[:, v, u].any() & ~cover[chosen, v, u])
+            if (v, u) in number and down + right > 0:
+                pair = seam._CUT * (t + residual.rms[v, u]) / 2
+                total += pair * (chosen != labels[:, number[v, u]])
+    return total
+
+
+@st.composite
+def problems(draw, layers: int, most: int):
+    """A connected region of at most `most` cells on a small grid; each is covered by one layer at least."""
+    height, width = draw(st.integers(1, 5)), draw(st.integers(1, 5))
+    wraps = draw(st.booleans())
+    random = np.random.default_rng(draw(st.integers(0, 2**32 - 1)))
+    region = np.zeros((height, width), bool)
+    region[random.integers(height), random.integers(width)] = True
+    for _ in range(draw(st.integers(1, most)) - 1):
+        beside = np.pad(region, ((0, 0), (1, 1)), "wrap" if wraps else "constant")
+        beside = ndimage.binary_dilation(beside)[:, 1:-1] & ~region
+        if beside.any():
+            region.flat[random.choice(np.flatnonzero(beside))] = True
+    # from all alike to a few cells that count for all
+    low, rough = random.random((2, height, width)) ** draw(st.sampled_from([0.1, 1, 4]))
+    scale = draw(st.sampled_from([0.5, 3]))
+    residual = seam.Residuals(scale * low, scale * np.maximum(low, rough))
+    shares = random.random((layers, height, width)) ** draw(st.sampled_from([0.2, 1, 20]))
+    shares /= np.maximum(shares.sum(0), 1e-9)
+    cover = random.random((layers, height, width)) < draw(st.sampled_from([0.4, 0.8, 1]))
+    cover[random.integers(layers), region & ~cover.any(0)] = True
+    rows, columns = np.nonzero(region)
+    return rows, columns, residual, shares, cover, wraps
+
+
+many = settings(max_examples=150, deadline=None, derandomize=True)
+
+
+def alike(residual: np.ndarray) -> seam.Residuals:
+    """Layers that differ by low frequencies alone."""
+    return seam.Residuals(residual, residual)

@@ -1,0 +1,68 @@
+"""What moved, from charts to cells of the canvas."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from reference import common
+from scenes import CANVAS, CHARTS
+from scipy import ndimage
+
+from hugin_abflow import movers
+from hugin_abflow.chart import pair_chart
+from hugin_abflow.layer import Box
+from hugin_abflow.movers import CELL, Movers
+from hugin_abflow.working import Grid
+
+
+def check_on_canvas(grid: Grid, at: int) -> None:
+    """Each cell of a canvas, by what its centre shows; rows 50 to 130 around column `at` are the overlap."""
+    overlap = np.zeros(grid.shape, bool)
+    overlap[50:130, np.arange(at - 60, at + 60) % grid.width] = True
+    chart = pair_chart(overlap, grid, grid)
+    assert not chart.wraps
+    empty = np.zeros(((chart.height + 1) // CELL, (chart.width + 1) // CELL), bool)
+    first, second = empty.copy(), empty.copy()
+    rows, columns = (n // 2 for n in empty.shape)
+    first[rows - 9 : rows - 2, columns - 5 : columns + 6] = True
+    second[rows + 1 : rows + 4, columns + 2 : columns + 9] = True
+    cells = grid.resized(round(grid.width / 7.9), 23)
+    found = movers.on_canvas(Movers(first, second), chart, cells)
+    assert found.shape == cells.shape
+    x, y = (n + 0.5 for n in common.pixels(cells.width, cells.height))
+    u, v = common.chart_position(common.canvas_point(x, y, cells.lens), chart.transform)
+    u, v = np.floor(u / CELL).astype(int), np.floor(v / CELL).astype(int)
+    inside = (u >= 0) & (u < empty.shape[1]) & (v >= 0) & (v < empty.shape[0])
+    there = np.zeros(cells.shape, bool)
+    there[inside] = (first | second)[v[inside], u[inside]]
+    expected = np.pad(there, ((0, 0), (1, 1)), mode="wrap" if grid.wraps else "constant")
+    expected = ndimage.binary_dilation(expected, np.ones((3, 3)))[:, 1:-1]
+    assert 20 < expected.sum() < 200
+    assert np.array_equal(found, expected)
+    assert not movers.on_canvas(Movers(empty, empty), chart, cells).any()
+
+
+LENS = (-np.pi, CANVAS.lens[1], np.pi / 2 - 90 * CANVAS.lens[3], CANVAS.lens[3])
+
+
+@pytest.mark.parametrize("longitude", [0.0, *np.linspace(2.8, 3.5, 9)])
+def test_cells_of_the_canvas_are_told_by_what_they_show(longitude: float) -> None:
+    """Of a canvas that is larger than its working grid and whose rows begin below its top, across its border
+    as well."""
+    grid = replace(CANVAS, region=Box(0, 225, 1800, 675), height=180, poles=0, lens=LENS)
+    check_on_canvas(grid, int(360 + longitude / grid.lens[1]) % 720)
+
+
+def test_cells_are_those_of_a_region_of_the_canvas() -> None:
+    region, lens = Box(500, 225, 1250, 675), (0.1, *LENS[1:])
+    check_on_canvas(Grid(region, 300, 180, False, 0, lens, 1800), 170)
+
+
+def test_around_the_canvas_every_cell_has_one_of_the_chart() -> None:
+    chart = CHARTS[True]
+    shape = (chart.height + 1) // CELL, (chart.width + 1) // CELL
+    everywhere = Movers(np.ones(shape, bool), np.zeros(shape, bool))
+    found = movers.on_canvas(everywhere, chart, CANVAS.resized(90, 45))
+    assert found[20:25].all() and not found[:5].any() and not found[-5:].any()

@@ -1,0 +1,122 @@
+"""What moved by itself: shown once, if that is not much worse; and always a region of its own."""
+
+from __future__ import annotations
+
+import numpy as np
+from grids import plane
+from hypothesis import given
+from labels import alike, energies, many, problems
+
+from hugin_abflow import seam
+
+WRAPS = [False, True]
+
+
+def twice(favour: float, beside: float = 0.001) -> tuple[seam.Residuals, np.ndarray]:
+    """Somebody stands on the left in one layer, on the right in the other: residual, and shares, by which
+    each layer is favoured where he stands in it, the second a little more. beside: how they differ there.
+    """
+    places = np.zeros((12, 30), bool)
+    places[2:10, 4:13] = places[2:10, 17:26] = True
+    share = np.where(np.arange(30) < 15, 0.5 - favour, 0.5 + favour) * np.ones((12, 1)) + 0.02
+    return alike(np.where(places, 1.0, beside)), np.stack([1 - share, share])
+
+
+def everywhere(shape: tuple[int, int] = (12, 30)) -> tuple[np.ndarray, np.ndarray]:
+    return tuple(v.ravel() for v in np.indices(shape))
+
+
+def test_what_moved_is_shown_once() -> None:
+    """A cut between his two places is cheapest, and shows him twice; one layer shows him once."""
+    residual, shares = twice(0.15)
+    cover = np.ones((2, 12, 30), bool)
+    for turned, best in ((slice(None), 1), (slice(None, None, -1), 0)):
+        for wraps in WRAPS:
+            problem = (*everywhere(), residual, shares[turned], cover, wraps)
+            found = seam.label(*problem).reshape(12, 30)
+            assert (found[:, 4:13] == 1 - best).all() and (found[:, 17:26] == best).all()
+            assert (seam.label(*problem, once=True) == best).all()
+
+
+def test_a_cut_that_is_much_better_is_kept() -> None:
+    """Each layer shows him where it is favoured by far, as the other has its border there."""
+    residual, shares = twice(0.45)
+    cover = np.ones((2, 12, 30), bool)
+    cut = seam.label(*everywhere(), residual, shares, cover, False)
+    once = seam.label(*everywhere(), residual, shares, cover, False, once=True)
+    problem = (*everywhere(), residual, shares, cover, False)
+    least, *alone = energies(np.stack([cut, 0 * cut, 0 * cut + 1]), *problem)
+    assert min(alone) > seam._ONCE * least
+    assert np.array_equal(once, cut) and 0 < cut.mean() < 1
+
+
+@many
+@given(problem=problems(2, 11))
+def test_one_layer_of_two_is_taken_if_it_costs_no_more_than_twice_as_much(problem) -> None:
+    """One that has more than half of the region, as far as it goes; the other one where it does not."""
+    rows, columns, cover = problem[0], problem[1], problem[4]
+    found, cut = seam.label(*problem, once=True), seam.label(*problem)
+    assert cover[found, rows, columns].all()
+    there = cover[:, rows, columns]
+    if not there.any(1).all():
+        assert np.array_equal(found, cut)
+        return
+    alone = np.array([np.where(there[k], k, 1 - k) for k in (0, 1) if there[k].mean() > 0.5])
+    if not len(alone):
+        assert np.array_equal(found, cut)
+        return
+    costs, least = energies(alone, *problem), energies(cut[None], *problem)[0]
+    rounding = 5 * rows.size / seam._UNIT
+    if costs.min() < seam._ONCE * least - rounding:
+        assert np.isclose(energies(found[None], *problem)[0], costs.min())
+        assert (found == alone).all(1).any()
+    elif costs.min() > seam._ONCE * least + rounding:
+        assert np.array_equal(found, cut)
+
+
+def test_cells_that_no_layer_covers_cost_nothing() -> None:
+    """They would outweigh all else, so that one layer would never be much worse than a cut."""
+    residual, shares = twice(0.45)
+    cover = np.ones((2, 12, 30), bool)
+    cover[:, 11, 20:] = False
+    cut, once = (seam.label(*everywhere(), residual, shares, cover, False, once=o) for o in (False, True))
+    shown = cover.any(0).ravel()
+    assert np.array_equal(cut[shown], once[shown]) and 0 < cut[shown].mean() < 1
+
+
+def test_where_the_one_layer_ends_another_goes_on() -> None:
+    """Those of the cut; no layer is taken where it is not."""
+    residual, shares = twice(0.15)
+    shares = np.concatenate([shares, 0.1 * shares[:1]])
+    shares[2, :, :2] = 0.9
+    cover = np.ones((3, 12, 30), bool)
+    cover[1, :, :3] = False
+    problem = (*everywhere(), residual, shares, cover, False)
+    cut, found = (seam.label(*problem, once=once).reshape(12, 30) for once in (False, True))
+    assert np.array_equal(found[:, :3], cut[:, :3]) and (found[:, 3:] == 1).all()
+    assert (cut[:, 4:13] == 0).all()
+
+
+def test_a_third_layer_in_a_corner_does_not_show_what_moved_twice() -> None:
+    """It goes hardly anywhere: that it is taken there says nothing of the two others elsewhere."""
+    residual, shares = twice(0.15)
+    shares = np.concatenate([shares, 0.1 * shares[:1]])
+    cover = np.ones((3, 12, 30), bool)
+    cover[2, :, 2:] = False
+    found = seam.label(*everywhere(), residual, shares, cover, False, once=True).reshape(12, 30)
+    assert (found[:, 4:13] == 1).all() and (found[:, 17:26] == 1).all()
+
+
+def test_what_moved_makes_a_region_whatever_the_layers_show() -> None:
+    """Small as it is, with what differs around; its flow is gone, so that it would be doubled."""
+    grid, residual, moved = plane(480, 320), np.zeros((40, 60)), np.zeros((40, 60), bool)
+    moved[6:8, 7:9] = True
+    for aligned in (True, False):
+        found = seam.regions(alike(residual), grid, aligned, moved)
+        assert np.argwhere(found).tolist() == [[y, x] for y in range(5, 9) for x in range(6, 10)]
+        assert not seam.regions(alike(residual), grid, aligned).any()
+    residual[6:8, 9] = 0.5 * (seam._WEAK + seam._STRONG)
+    residual[30, 30] = 2 * seam._STRONG
+    found = seam.regions(alike(residual), grid, moved=moved)
+    assert np.argwhere(found).tolist() == [[y, x] for y in range(5, 9) for x in range(6, 11)]
+    assert not seam.regions(alike(residual), grid).any()
