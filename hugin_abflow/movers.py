@@ -111,18 +111,17 @@ def find(
     scale = chart.eye.down
     limit = max(_APART, _SPREADS * scale * float(np.percentile(epipolar.across(u, v, direction), 75)))
     found = [np.zeros(way.shown.shape, bool) for way in ways]
+    every = [(index, False, way) for index, way in enumerate(ways)]
     for one in refused:
         wide, gap = one.finest(chart.width, chart.height), _CONSISTENT * max(1.0, 2.0 ** (one.level - 1))
-        ways += [_way(chart, chart.eye, wide, views, index, gap) for index in (0, 1)]
-    for number, way in enumerate(ways):
-        here, there = number % 2, 1 - number % 2
+        every += [(index, True, _way(chart, chart.eye, wide, views, index, gap)) for index in (0, 1)]
+    for index, searched, way in every:
         apart = scale * epipolar.across(way.u, way.v, direction).reshape(way.shown.shape) / limit
-        if number > 1:  # of what a search found only what is certain
+        if searched:  # only what is certain
             apart *= way.believed
-        places = vouched[here], vouched[there]
-        its = _things(way, apart, (views[here], views[there]), places)
-        found[here] |= its
-        found[there] |= _reached(way.ends[its & way.believed], its.shape, chart)
+        its = _things(way, apart, (views[index], views[1 - index]), (vouched[index], vouched[1 - index]))
+        found[index] |= its
+        found[1 - index] |= _reached(way.ends[its & way.believed], its.shape, chart)
     if not any(one.any() for one in found):
         return None
     first, second = (_grown(one, _GROWN, chart.wraps) for one in found)
@@ -196,7 +195,10 @@ def _vouched(things: npt.NDArray[np.int32], way: _Way, starts: Places, ends: Pla
 
 
 def _differs(here: View, there: View, way: _Way, thing: Mask) -> bool:
-    """Whether the photos differ in a thing's place if it moves as what is around, more than they do there."""
+    """Whether the photos differ in a thing's place if it moves as what is around, more than they do there.
+
+    What is across the border of a chart that wraps does not count as around.
+    """
     grown = _grown(thing, _GROWN, wraps=False)
     ring = np.nonzero(_grown(grown, _RING, wraps=False) & ~grown & way.believed)
     its = np.nonzero(thing & way.shown)
