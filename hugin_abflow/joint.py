@@ -419,12 +419,12 @@ def _flows(
             if its_guides:
                 found = guidance.lead(device, (image_a, image_b), found, placed, its_chart.around(grid))
             if settings.seam and settings.movers:
+                if moving:
+                    moving[-1].result()  # one pair's arrays at a time
                 views = (movers.View.of(image_a), movers.View.of(image_b))
                 arrays = (found[0].get(), found[1].get())
                 vouched = (placed.at_a, placed.at_b)
                 moving.append(looking.submit(movers.find, its_chart, arrays, views, vouched, solved.refused))
-                if len(moving) > 1:
-                    moving[-2].result()  # arrays of one pair are kept beside the next one's
             result.append(PairFlow(pair.a, pair.b, its_chart, *found))
             if _log.isEnabledFor(logging.INFO):
                 shifts.append(figures.parallax(device, result[-1], (image_a, image_b), grid))
