@@ -34,7 +34,10 @@ _CONSISTENT = 1.0
 # By how much flow has to miss parallax: chart pixels at the canvas's centre, and times the third quartile of
 # what all flow of the overlap misses it by; lenses and their places are not known exactly.
 _APART, _SPREADS = 3.0, 5.0
-# The share of that which belongs to the thing as well, around what misses it so far.
+# The share of a motion that has to lead elsewhere: a near thing's edge may be matched anywhere along itself,
+# and misses parallax, but goes its way.
+_ELSEWHERE = 0.5
+# The share of the limit that is enough beside what misses parallax so far.
 _WEAK = 0.3
 # Cells of a thing.
 _LEAST = 20
@@ -116,7 +119,10 @@ def find(
         wide, gap = one.finest(chart.width, chart.height), _CONSISTENT * max(1.0, 2.0 ** (one.level - 1))
         every += [(index, True, _way(chart, chart.eye, wide, views, index, gap)) for index in (0, 1)]
     for index, searched, way in every:
-        apart = scale * epipolar.across(way.u, way.v, direction).reshape(way.shown.shape) / limit
+        across = epipolar.across(way.u, way.v, direction)
+        apart = scale * across / limit
+        its_way = across < _ELSEWHERE * np.linalg.norm(way.v - way.u, axis=1)
+        apart = np.where(its_way, np.minimum(apart, 1.0), apart).reshape(way.shown.shape)
         if searched:  # only what is certain
             apart *= way.believed
         its = _things(way, apart, (views[index], views[1 - index]), (vouched[index], vouched[1 - index]))
