@@ -40,10 +40,15 @@ def move(u: Points, v: Points) -> Points:
 
 def along(u: Points, v: Points, direction: Points) -> npt.NDArray[np.float64]:
     """Cosine (n) between the motion from u to v and that of still things, if the camera moved so; 0: none."""
-    expected = (u @ direction)[:, None] * u - direction
+    expected = _expected(u, direction)
     lengths = np.linalg.norm(v - u, axis=1) * np.linalg.norm(expected, axis=1)
     cosines: npt.NDArray[np.float64] = ((v - u) * expected).sum(1) / np.maximum(lengths, _NO_MOTION**2)
     return cosines
+
+
+def _expected(u: Points, direction: Points) -> Points:
+    """Where (n, 3) what stands still goes from u, if the camera moved so; not of length 1."""
+    return (u @ direction)[:, None] * u - direction
 
 
 def across(u: Points, v: Points, direction: Points) -> npt.NDArray[np.float64]:
@@ -51,7 +56,7 @@ def across(u: Points, v: Points, direction: Points) -> npt.NDArray[np.float64]:
     camera moved so; all of it where it points the other way.
     """
     motion = v - (u * v).sum(1, keepdims=True) * u  # along the sphere: however long, it has one direction
-    expected = (u @ direction)[:, None] * u - direction
+    expected = _expected(u, direction)
     expected /= np.maximum(np.linalg.norm(expected, axis=1, keepdims=True), _NO_MOTION)
     share = np.maximum((motion * expected).sum(1, keepdims=True), 0)
     return np.asarray(np.linalg.norm(motion - share * expected, axis=1))

@@ -418,7 +418,7 @@ def _flows(
             placed = guidance.on_chart(its_guides, first, its_chart, grid)
             if its_guides:
                 found = guidance.lead(device, (image_a, image_b), found, placed, its_chart.around(grid))
-            if settings.seam and settings.movers:
+            if settings.seam and settings.movers and its_chart.eye:  # which all of a canvas have, or none
                 if moving:
                     moving[-1].result()  # one pair's arrays at a time
                 views = (movers.View.of(image_a), movers.View.of(image_b))

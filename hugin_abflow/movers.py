@@ -178,15 +178,12 @@ def _way(
     rows, columns = np.indices(flow.shape[:2])
     starts = np.stack([columns, rows], -1).astype(np.float64) * CELL + CELL // 2 + 0.5
     ends = starts + flow
-    column, row = (np.floor(n).astype(int) for n in np.moveaxis(ends, -1, 0))
-    height, width = flows[index].shape[:2]
-    column = column % width if chart.wraps else column
-    inside = (row >= 0) & (row < height) & (column >= 0) & (column < width)
+    inside, (row, column) = _pixels(ends, chart)
     there = np.where(inside, row, 0), np.where(inside, column, 0)
     shown = inside & (views[index].mask[middle] > 0) & (views[1 - index].mask[there] > 0)
     believed = shown & (np.linalg.norm(flow + flows[1 - index][there], axis=-1) < gap)
     seen = eye.bearings(starts.reshape(-1, 2)), eye.bearings(ends.reshape(-1, 2))
-    return _Way(ends, flow, shown, believed, seen[index], seen[1 - index], width * chart.wraps)
+    return _Way(ends, flow, shown, believed, seen[index], seen[1 - index], chart.width * chart.wraps)
 
 
 def _vouched(things: npt.NDArray[np.int32], way: _Way, starts: Places, ends: Places) -> npt.NDArray[np.intp]:
@@ -245,11 +242,16 @@ def _cells(
     places: Places, shape: tuple[int, int], chart: Chart
 ) -> tuple[Mask, tuple[npt.NDArray[np.intp], npt.NDArray[np.intp]]]:
     """Which places (n, 2) px lie on the chart, and the rows and columns of the cells of those."""
-    column, row = np.floor(places).astype(int).T
-    column = column % chart.width if chart.wraps else column
-    inside = (row >= 0) & (row < chart.height) & (column >= 0) & (column < chart.width)
-    at = (np.minimum(n[inside] // CELL, most - 1) for n, most in zip((row, column), shape, strict=True))
+    inside, pixels = _pixels(places, chart)
+    at = (np.minimum(n[inside] // CELL, most - 1) for n, most in zip(pixels, shape, strict=True))
     return inside, (next(at), next(at))
+
+
+def _pixels(places: Places, chart: Chart) -> tuple[Mask, tuple[npt.NDArray[np.intp], npt.NDArray[np.intp]]]:
+    """Which places (..., 2) px lie on the chart, and the rows and columns of all."""
+    column, row = np.moveaxis(np.floor(places).astype(int), -1, 0)
+    column = column % chart.width if chart.wraps else column
+    return (row >= 0) & (row < chart.height) & (column >= 0) & (column < chart.width), (row, column)
 
 
 def _grown(mask: Mask, by: int, wraps: bool) -> Mask:

@@ -140,15 +140,15 @@ def full_grid(canvas: Canvas, layers: Sequence[Layer]) -> Grid:
     if canvas.wraps:
         region = replace(region, left=0, right=canvas.width)
     lens, poles, eye = (0.0, 0.0, 0.0, 0.0), 0, None
-    if not canvas.spherical:
-        eye = Eye.of(canvas.projection, canvas.width, canvas.height, canvas.hfov)
-    else:
+    if canvas.spherical:
         step = math.radians(canvas.hfov) / canvas.width
         left, top = region.left - canvas.width / 2, canvas.height / 2 - region.top
         lens = (left * step, step, top * step, step)
         if canvas.wraps and canvas.width % 2 == 0:
             poles += abs(lens[2] - math.pi / 2) < step / 2
             poles += 2 * (abs(lens[2] - region.height * step + math.pi / 2) < step / 2)
+    else:
+        eye = Eye.of(canvas.projection, canvas.width, canvas.height, canvas.hfov)
     return Grid(region, region.width, region.height, canvas.wraps, poles, lens, canvas.width, eye)
 
 
