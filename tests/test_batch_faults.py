@@ -260,3 +260,31 @@ def test_control_c_reaches_all_and_leaves_nothing(shoot: Path, tmp_path: Path) -
     assert group_is_gone(child.pid) and temporary(shoot) == []
     made = [name for name, record in results(report).items() if record["result"] == "made"]
     assert made and set(made) <= set(whole(shoot))
+
+
+@posix
+def test_a_process_that_an_interruption_does_not_end_is_ended_and_leaves_nothing(tmp_path: Path) -> None:
+    """The pool is gone, and the interruption is lost, as one is that comes while an object is collected."""
+    program = f"""
+import multiprocessing, pathlib, queue, time
+from hugin_abflow import scratch
+from hugin_abflow.batch import worker
+from hugin_abflow.terminal import interruptible
+
+worker.GRACE = 0.3
+pipe, other = multiprocessing.Pipe()
+with interruptible(), scratch.part_beside(pathlib.Path({str(tmp_path / "pano.tif")!r})) as part:
+    print(part.exists(), flush=True)
+    other.close()
+    reader = worker.threading.Thread(target=worker._read, args=(pipe, queue.SimpleQueue(), None))
+    while True:
+        try:
+            if reader.ident is None:
+                reader.start()
+            time.sleep(9)
+        except KeyboardInterrupt:
+            print("lost", flush=True)
+"""
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=60)
+    assert (done.returncode, done.stdout.split(), done.stderr) == (1, ["True", "lost"], "")
+    assert names_in(tmp_path) == []

@@ -22,13 +22,13 @@ from typing import Any, Protocol
 from hugin_abflow import trace
 from hugin_abflow.batch.record import Record
 from hugin_abflow.batch.task import Listener, Task, perform, settings_of
-from hugin_abflow.batch.worker import GO, work
+from hugin_abflow.batch.worker import GO, GRACE, work
 from hugin_abflow.errors import ExitCode
 
 # A project is tried again once if its process dies or its device fails: both may be another project's fault.
 ATTEMPTS = 2
-# Time to tidy up after an interruption, seconds.
-_GRACE = 15.0
+# Time to end after an interruption, seconds; whoever takes longer is ended.
+_GRACE = GRACE + 5.0
 # Seconds until it is asked again for a task where there was none.
 PAUSE = 1.0
 

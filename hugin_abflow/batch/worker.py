@@ -11,13 +11,17 @@ import os
 import queue
 import signal
 import threading
+import time
 from contextlib import nullcontext
 from multiprocessing.connection import Connection
 from typing import Any
 
-from hugin_abflow import memory, trace
+from hugin_abflow import memory, scratch, trace
 from hugin_abflow.batch.task import Task, perform
 from hugin_abflow.terminal import interruptible
+
+# Time that a process has to end by itself once the pool is gone, seconds.
+GRACE = 10.0
 
 
 class _Sender:
@@ -91,7 +95,10 @@ def work(pipe: Connection, level: int, traced: bool, sharers: int) -> None:
 
 
 def _read(pipe: Connection, orders: queue.SimpleQueue[Task | None], turn: _Turn) -> None:
-    """Hand on what the pool sends; when it is gone, end this process as a signal would."""
+    """Hand on what the pool sends; when it is gone, end this process as a signal would, or else at once: an
+    interruption that comes while an object is collected is lost, and one that comes while a lock is held may
+    wait for itself.
+    """
     try:
         while (order := pipe.recv()) is not None:
             if order == GO:
@@ -104,3 +111,6 @@ def _read(pipe: Connection, orders: queue.SimpleQueue[Task | None], turn: _Turn)
             _thread.interrupt_main()
         else:  # which also ends a wait for nona
             signal.pthread_kill(threading.main_thread().ident or 0, signal.SIGTERM)
+        time.sleep(GRACE)
+        scratch.tidy()
+        os._exit(1)
