@@ -183,9 +183,10 @@ def pair_chart(overlap: npt.NDArray[np.bool_], mask_grid: Grid, grid: Grid, coar
 def sample(device: Device, layer: WorkingLayer, grid: Grid, chart: Chart) -> Level:
     """Log brightness of a layer on the chart, with its mask."""
     size = (chart.width, chart.height)
+    four_at_a_time = (-(-chart.width // 4), chart.height)
     level = Level(device.empty(size[::-1]), device.empty(size[::-1]), chart.wraps)
     device.run(
-        "chart", "chart_sample", size, layer.pixels, layer.box, grid.border, grid.lens, chart.transform, size,
-        chart.coarse, _FLOOR, level.image, level.mask,
+        "chart", "chart_sample", four_at_a_time, layer.pixels, layer.box, grid.border, grid.lens,
+        chart.transform, size, chart.coarse, _FLOOR, level.image, level.mask,
     )  # fmt: skip
     return level
