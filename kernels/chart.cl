@@ -99,7 +99,7 @@ __kernel void chart_sample(__global const float4 *layer, /* (box.w, box.z) r, g,
                                         (float2)(px.w, py.w)};
     for (int k = 0; k < CHART_CHUNK && i + k < size.x; ++k) {
         const float brightness = chart_brightness(layer, box, border, places[k], coarse);
-        image[j * size.x + i + k] = brightness < 0.0f ? 0.0f : logarithm1(brightness + floor_value);
+        image[j * size.x + i + k] = brightness < 0.0f ? 0.0f : logarithm(brightness + floor_value);
         mask[j * size.x + i + k] = brightness < 0.0f ? 0.0f : 1.0f;
     }
 }

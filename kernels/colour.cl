@@ -95,7 +95,7 @@ __kernel void colour_misfit(__global const float4 *layer_a, __global const float
             for (int k = 0; k < 3; ++k) {
                 const float u = GREATEST(p[k], EXPOSURE_FLOOR), v = GREATEST(q[k], EXPOSURE_FLOOR);
                 const float m = 0.5f * (u + v);
-                const float4 d = log(u * (1.0f - shoulders * v) / (v * (1.0f - shoulders * u)));
+                const float4 d = logarithm4(u * (1.0f - shoulders * v) / (v * (1.0f - shoulders * u)));
                 const float4 slope = m * (1.0f - shoulders * m); /* of the colour over the scale */
                 weight[k] += slope * slope;
                 first[k] += slope * slope * d;

@@ -65,12 +65,16 @@ EXPONENTIAL(8)
 
 /* The natural logarithm of a normal number above 0, to 1e-7: of its power of two, and of what is left, between the
    roots of 1/2 and 2, by the series of the inverse hyperbolic tangent. */
-static inline float logarithm1(float a) {
-    const int bits = as_int(a) - 0x3f3504f3, power = bits >> 23;
-    const float m = as_float((bits & 0x007fffff) + 0x3f3504f3), t = (m - 1.0f) / (m + 1.0f), t2 = t * t;
-    return (float)power * 0.693147181f +
-           2.0f * t * (1.0f + t2 * (0.333333333f + t2 * (0.2f + t2 * (0.142857143f + t2 * 0.111111111f))));
-}
+#define LOGARITHM(n)                                                                                               \
+    static inline float##n logarithm##n(float##n a) {                                                              \
+        const int##n bits = as_int##n(a) - 0x3f3504f3;                                                             \
+        const float##n m = as_float##n((bits & 0x007fffff) + 0x3f3504f3);                                          \
+        const float##n t = (m - 1.0f) / (m + 1.0f), t2 = t * t;                                                    \
+        const float##n upper = 0.2f + t2 * (0.142857143f + t2 * 0.111111111f);                                     \
+        return convert_float##n(bits >> 23) * 0.693147181f + 2.0f * t * (1.0f + t2 * (0.333333333f + t2 * upper)); \
+    }
+LOGARITHM()
+LOGARITHM(4)
 
 /* Borders of a grid, given as (width, height, wraps, poles): columns are taken modulo the width where the
    grid wraps; a row beyond a pole is the mirrored row half a turn further. Returns false outside. */
@@ -359,7 +363,8 @@ static inline bool layer_pair(__global const float4 *layer_a, __global const flo
 
 static inline float3 exposure_scale(float3 c, float shoulder) {
     const float3 low = GREATEST(c, (float3)(0.0f)) + EXPOSURE_FLOOR;
-    return log(low / (GREATEST(1.0f - shoulder * c, (float3)(0.0f)) + EXPOSURE_FLOOR));
+    const float3 odds = low / (GREATEST(1.0f - shoulder * c, (float3)(0.0f)) + EXPOSURE_FLOOR);
+    return logarithm4(odds.xyzz).xyz;
 }
 
 /* Multiply these odds by 1 + rise, floats by it themselves. Black stays, and an integer image is not raised

@@ -112,16 +112,24 @@ typedef struct {
     float share, all;
 } multiband_sums;
 
+static inline void multiband_take(multiband_sums *sums, float t, int at, __global const float4 *level,
+                                  __global const float *share) {
+    const float4 c = level[at];
+    sums->all += t;
+    sums->colours += t * c.w * (float4)(c.xyz, 1.0f);
+    sums->share += t * share[at];
+}
+
+/* The same of a pixel of the grid, which may lie beside the level. */
 static inline void multiband_tap(multiband_sums *sums, float t, int2 p, int4 grid, __global const float4 *level,
                                  __global const float *share, int4 box) {
     if (!grid_border(&p, grid))
         return;
-    sums->all += t;
     const int at = box_index(p, box);
-    if (at < 0)
-        return;
-    sums->colours += t * level[at].w * (float4)(level[at].xyz, 1.0f);
-    sums->share += t * share[at];
+    if (at >= 0)
+        multiband_take(sums, t, at, level, share);
+    else
+        sums->all += t;
 }
 
 /* Their means: colours over what is valid, shares over all of the grid. */
@@ -148,10 +156,16 @@ __kernel void multiband_reduce(__global const float4 *level, __global const floa
     for (int i = 0; i < MULTIBAND_TAPS; ++i)
         across[i] = multiband_spline((first.x + i + 0.5f - q.x) / ratio.x);
     multiband_sums sums = {(float4)(0.0f), 0.0f, 0.0f};
+    const bool inner = first.x >= box.x && first.y >= box.y && last.x < box.x + box.z && last.y < box.y + box.w;
     for (int j = first.y; j <= last.y; ++j) {
         const float down = multiband_spline((j + 0.5f - q.y) / ratio.y);
-        for (int i = first.x; i <= last.x; ++i)
-            multiband_tap(&sums, down * across[i - first.x], (int2)(i, j), fine, level, share, box);
+        for (int i = first.x; i <= last.x; ++i) {
+            const float t = down * across[i - first.x];
+            if (inner)
+                multiband_take(&sums, t, (j - box.y) * box.z + i - box.x, level, share);
+            else
+                multiband_tap(&sums, t, (int2)(i, j), fine, level, share, box);
+        }
     }
     const int at = y * smaller_box.z + x;
     multiband_mean(&sums, smaller + at, smaller_share + at);
@@ -170,8 +184,14 @@ __kernel void multiband_spread(__global const float4 *level, __global const floa
     const float wide = widths[y + box.y];
     const int reach = (int)(1.5f * wide);
     multiband_sums sums = {(float4)(0.0f), 0.0f, 0.0f};
-    for (int i = -reach; i <= reach; ++i)
-        multiband_tap(&sums, multiband_spline(i / wide), (int2)(x + box.x + i, y + box.y), grid, level, share, box);
+    const bool inner = x >= reach && x + reach < box.z;
+    for (int i = -reach; i <= reach; ++i) {
+        const float t = multiband_spline(i / wide);
+        if (inner)
+            multiband_take(&sums, t, at + i, level, share);
+        else
+            multiband_tap(&sums, t, (int2)(x + box.x + i, y + box.y), grid, level, share, box);
+    }
     multiband_mean(&sums, spread + at, spread_share + at);
 }
 
@@ -222,15 +242,15 @@ __kernel void multiband_offset(__global const float4 *level, /* (box.w, box.z) *
     const int valid = level[y * box.z + x].w > 0.0f;
     float4 sum = (float4)(0.0f);
     for (int reach = valid ? 0 : 1; reach <= (valid ? 0 : 2) && sum.w == 0.0f; ++reach)
-        for (int k = 0; k < (2 * reach + 1) * (2 * reach + 1); ++k) {
-            const int i = k % (2 * reach + 1) - reach, j = k / (2 * reach + 1) - reach;
-            int2 p = (int2)(x + box.x + i, y + box.y + j);
-            const int at = grid_border(&p, grid) ? box_index(p, box) : -1;
-            if (at < 0 || level[at].w == 0.0f)
-                continue;
-            const float4 there = blend[p.y * grid.x + p.x];
-            sum += there.w > 0.0f ? (float4)(there.xyz - level[at].xyz, 1.0f) : (float4)(0.0f);
-        }
+        for (int j = -reach; j <= reach; ++j)
+            for (int i = -reach; i <= reach; ++i) {
+                int2 p = (int2)(x + box.x + i, y + box.y + j);
+                const int at = grid_border(&p, grid) ? box_index(p, box) : -1;
+                if (at < 0 || level[at].w == 0.0f)
+                    continue;
+                const float4 there = blend[p.y * grid.x + p.x];
+                sum += there.w > 0.0f ? (float4)(there.xyz - level[at].xyz, 1.0f) : (float4)(0.0f);
+            }
     const float3 d = sum.w > 0.0f ? sum.xyz / sum.w : (float3)(0.0f);
     const float3 size = MAGNITUDE(d), left = size - negligible;
     offset[y * box.z + x] = (float4)(left > 0.0f ? d * (left / size) : (float3)(0.0f), 0.0f);

@@ -56,7 +56,7 @@ __kernel void transition_sharpen(__global float *blend,           /* (box.w, box
     if (w > 0.0f && w < 1.0f) {
         const float2 ratio = (float2)((float)cells.x / border.x, (float)cells.y / border.y);
         const float n = bilinear_scalar(power, ((float2)(x + box.x, y + box.y) + 0.5f) * ratio, cells);
-        const float exponent = n * logarithm1(w);
+        const float exponent = n * logarithm(w);
         w = exponent > -87.0f ? exponential(exponent) : 0.0f;
     }
     blend[at] = w;
