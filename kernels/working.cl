@@ -19,21 +19,23 @@ __kernel void working_reduce(__global const pixel_stored *rows, /* (box.w, box.z
     const int left = x0 / ratio.y - box.x, right = (x1 - 1) / ratio.y - box.x;
     const int top = y0 / ratio.w - box.y, bottom = (y1 - 1) / ratio.w - box.y;
     bool valid = left >= 0 && top >= 0 && right < box.z && bottom < box.w;
+    /* how much of the outermost columns lies beside the working pixel */
+    const float before = x0 - (left + box.x) * ratio.y, after = (right + box.x + 1) * ratio.y - x1;
     float4 sum = (float4)(0.0f);
-    float total = 0.0f, least = white;
+    float least = white;
     for (int y = top; y <= bottom && valid; ++y) {
-        const float down = LEAST(y1, (y + box.y + 1) * ratio.w) - GREATEST(y0, (y + box.y) * ratio.w);
+        __global const pixel_stored *row = rows + y * box.z;
+        float4 across = (float4)(0.0f);
         for (int x = left; x <= right; ++x) {
-            const float4 c = pixel_samples(rows[y * box.z + x]);
-            const float across = LEAST(x1, (x + box.x + 1) * ratio.y) - GREATEST(x0, (x + box.x) * ratio.y);
-            const float w = down * across;
-            sum += w * c;
-            total += w;
+            const float4 c = pixel_samples(row[x]);
+            across += c;
             least = LEAST(c.w, least);
         }
+        across = ratio.y * across - before * pixel_samples(row[left]) - after * pixel_samples(row[right]);
+        sum += (float)(LEAST(y1, (y + box.y + 1) * ratio.w) - GREATEST(y0, (y + box.y) * ratio.w)) * across;
         valid = least >= 0.5f * white;
     }
-    const float scale = 1.0f / (white * total);
+    const float scale = 1.0f / (white * ratio.x * ratio.z);
     layer[j * out_box.z + i] = valid ? (float4)(sum.xyz * scale, 1.0f) : (float4)(0.0f);
 }
 
