@@ -94,9 +94,9 @@ def exhaustive(
     reach = min(largest, size[0] // 2), min(largest, size[1] // 2)
     count = (2 * reach[0] + 1) * (2 * reach[1] + 1)
     pixel_cost, cost = (device.empty((count, size[1], size[0])) for _ in range(2))
-    every, outside = (size[0], size[1] * count), parameters.outside
-    device.run("search", "search_pixel_cost", every, a, b, grid, reach, outside, pixel_cost)
-    device.run("search", "search_cost", every, pixel_cost, a, grid, count, outside, cost)
+    rows, outside = size[1] * count, parameters.outside
+    device.run("search", "search_pixel_cost", (size[0], rows), a, b, grid, reach, outside, pixel_cost)
+    device.run("search", "search_cost", (-(-size[0] // 8), rows), pixel_cost, grid, count, outside, cost)
     found = [_coupled(device, cost, flows[way], grid, reach, way, parameters) for way in (0, 1)]
     agreed = [device.empty(flow.shape) for flow in flows]
     for way, out in enumerate(agreed):

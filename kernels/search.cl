@@ -39,7 +39,7 @@ static inline float search_misfit(float4 a, float4 b, float outside) {
     return a.w * b.w > 0.0f ? e / (e + 0.5f) : outside;
 }
 
-/* Misfit of each pixel under each displacement. */
+/* Misfit of each pixel under each displacement; -1 where the first image is not known. */
 __kernel void search_pixel_cost(__global const float4 *a, /* (grid.y, grid.x) descriptors */
                                 __global const float4 *b, /* (grid.y, grid.x) of the other image */
                                 int4 grid,                /* run size: (grid.x, grid.y x displacements) */
@@ -51,34 +51,10 @@ __kernel void search_pixel_cost(__global const float4 *a, /* (grid.y, grid.x) de
     const int index = row / grid.y, y = row - index * grid.y, span = 2 * reach.x + 1;
     if (x >= grid.x || index >= span * (2 * reach.y + 1))
         return;
+    const float4 own = a[y * grid.x + x];
     int2 q = (int2)(x, y) + (int2)(index % span, index / span) - reach;
-    cost[row * grid.x + x] =
-        grid_border(&q, grid) ? search_misfit(a[y * grid.x + x], b[q.y * grid.x + q.x], outside) : outside;
-}
-
-/* Mean over the valid of 3 x 3 pixels, under each displacement. */
-__kernel void search_cost(__global const float *pixel_cost, /* (displacements, grid.y, grid.x) */
-                          __global const float4 *a,         /* (grid.y, grid.x) descriptors */
-                          int4 grid,                        /* run size: (grid.x, grid.y x displacements) */
-                          int displacements,
-                          float outside,                    /* cost where none is valid */
-                          __global float *cost)             /* (displacements, grid.y, grid.x) */
-{
-    const int x = get_global_id(0), row = get_global_id(1);
-    const int index = row / grid.y, y = row - index * grid.y;
-    if (x >= grid.x || index >= displacements)
-        return;
-    float sum = 0.0f, weight = 0.0f;
-    for (int j = -1; j <= 1; ++j)
-        for (int i = -1; i <= 1; ++i) {
-            int2 p = (int2)(x + i, y + j);
-            if (!grid_border(&p, grid))
-                continue;
-            const float valid = a[p.y * grid.x + p.x].w;
-            sum += valid * pixel_cost[(index * grid.y + p.y) * grid.x + p.x];
-            weight += valid;
-        }
-    cost[row * grid.x + x] = weight > 0.0f ? sum / weight : outside;
+    const float misfit = grid_border(&q, grid) ? search_misfit(own, b[q.y * grid.x + q.x], outside) : outside;
+    cost[row * grid.x + x] = own.w > 0.0f ? misfit : -1.0f;
 }
 
 /* Costs at columns x to x + 7 of a row; `outside` beyond the grid. */
@@ -91,6 +67,30 @@ static inline float8 search_row(__global const float *row, int x, int4 grid, flo
         lanes[i] = grid_border(&p, grid) ? row[p.x] : outside;
     }
     return vload8(0, lanes);
+}
+
+/* Mean over what is known of 3 x 3 pixels, under each displacement; eight pixels at a time. */
+__kernel void search_cost(__global const float *pixel_cost, /* (displacements, grid.y, grid.x), -1: not known */
+                          int4 grid,                        /* run size: (ceil(grid.x / 8), grid.y x displacements) */
+                          int displacements,
+                          float outside,                    /* cost where none is known */
+                          __global float *cost)             /* (displacements, grid.y, grid.x) */
+{
+    const int x = 8 * get_global_id(0), row = get_global_id(1);
+    const int index = row / grid.y, y = row - index * grid.y, count = LEAST(8, grid.x - x);
+    if (count <= 0 || index >= displacements)
+        return;
+    float8 sum = (float8)(0.0f), weight = (float8)(0.0f);
+    for (int j = y > 0 ? -1 : 0; j <= (y + 1 < grid.y ? 1 : 0); ++j)
+        for (int i = -1; i <= 1; ++i) {
+            const float8 c = search_row(pixel_cost + (row + j) * grid.x, x + i, grid, -1.0f);
+            sum += c >= 0.0f ? c : (float8)(0.0f);
+            weight += c >= 0.0f ? (float8)(1.0f) : (float8)(0.0f);
+        }
+    float mean[8];
+    vstore8(weight > 0.0f ? sum / weight : (float8)(outside), 0, mean);
+    for (int i = 0; i < count; ++i)
+        cost[row * grid.x + x + i] = mean[i];
 }
 
 /* The displacement that costs least, with what it is away from `flow`; eight pixels at a time. */

@@ -66,9 +66,9 @@ def test_costs_equal_their_twins(device: Device, name: str) -> None:
     a, b = descriptors(5, grid)
     count = (2 * REACH[0] + 1) * (2 * REACH[1] + 1)
     pixel_cost, cost = (device.empty((count, grid[1], grid[0])) for _ in range(2))
-    size, sent = (grid[0], grid[1] * count), device.upload(a)
-    device.run("search", "search_pixel_cost", size, sent, device.upload(b), grid, REACH, 0.5, pixel_cost)
-    device.run("search", "search_cost", size, pixel_cost, sent, grid, count, 0.5, cost)
+    rows, sent = grid[1] * count, (device.upload(a), device.upload(b))
+    device.run("search", "search_pixel_cost", (grid[0], rows), *sent, grid, REACH, 0.5, pixel_cost)
+    device.run("search", "search_cost", (-(-grid[0] // 8), rows), pixel_cost, grid, count, 0.5, cost)
     assert_close(pixel_cost.get(), twin.search_pixel_cost(a, b, grid, REACH, 0.5), SUM)
     assert_close(cost.get(), twin.costs(a, b, grid, REACH, 0.5), SUM)
 

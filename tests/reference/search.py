@@ -39,14 +39,15 @@ def misfit(a: Array, b: Array, outside: float) -> Array:
 
 
 def search_pixel_cost(a: Array, b: Array, grid: Sequence[int], reach: Sequence[int], outside: float) -> Array:
-    """(displacements, height, width): misfit of every pixel and what b has there."""
+    """(displacements, height, width): misfit of every pixel and what b has there; -1 where a is not known."""
     x, y = pixels(grid[0], grid[1])
-    return np.stack([misfit(a, on_grid(b, grid, x + u, y + v)[0], outside) for u, v in displacements(reach)])
+    found = [misfit(a, on_grid(b, grid, x + u, y + v)[0], outside) for u, v in displacements(reach)]
+    return np.where(a[..., 3] > 0, np.stack(found), -1.0)
 
 
-def search_cost(pixel_cost: Array, a: Array, grid: Sequence[int], outside: float) -> Array:
-    """(displacements, height, width): mean over those of 3 x 3 pixels that are valid."""
-    known = (a[..., 3] > 0).astype(np.float64)
+def search_cost(pixel_cost: Array, grid: Sequence[int], outside: float) -> Array:
+    """(displacements, height, width): mean over those of 3 x 3 pixels that are known."""
+    known = (pixel_cost[0] >= 0).astype(np.float64)
     weight = windows(known, grid, 1).sum(0)
     sums = np.stack([windows(one * known, grid, 1).sum(0) for one in pixel_cost])
     return np.where(weight > 0, sums / np.maximum(weight, 1), outside)
@@ -54,7 +55,7 @@ def search_cost(pixel_cost: Array, a: Array, grid: Sequence[int], outside: float
 
 def costs(a: Array, b: Array, grid: Sequence[int], reach: Sequence[int], outside: float) -> Array:
     """Both of the above."""
-    return search_cost(search_pixel_cost(a, b, grid, reach, outside), a, grid, outside)
+    return search_cost(search_pixel_cost(a, b, grid, reach, outside), grid, outside)
 
 
 def directed(cost: Array, grid: Sequence[int], reach: Sequence[int], outside: float, backward: int) -> Array:
