@@ -150,13 +150,20 @@ def shown_at(
 
 
 def reach(device: Device, layer: WorkingLayer, field: Buffer, grid: Grid) -> list[float]:
-    """Per row of the layer's box, the largest vertical displacement in working pixels."""
-    rows = device.empty((layer.box[3],))
-    device.run(
-        "geometry", "geometry_reach", (layer.box[3], 1), field, layer.box, int(grid.lens[1] == 0), rows
-    )
-    lengths = rows.get()
-    if grid.lens[1]:  # a vector of length v, added to a unit vector, turns it by asin(v) at most
-        angles = [math.asin(value) if value < 1 else math.pi for value in lengths.tolist()]
-        return [angle / grid.lens[3] for angle in angles]
-    return [float(value) for value in lengths]
+    """Per row of the layer's box, how far from it at most, in working pixels, the rows lie that are sampled
+    between it and the next ones.
+    """
+    found = device.empty((layer.box[3], 2))
+    device.run("geometry", "geometry_reach", (layer.box[3], 1), field, layer.box, grid.lens, found)
+    longest, steepest = found.get().astype(np.float64).T
+    if not grid.lens[1]:
+        return list(longest.tolist())
+    # a vector of length v, added to a unit vector, turns it by asin(v) at most
+    turned = np.arcsin(np.minimum(longest, 1)) + math.pi * (longest >= 1)
+    latitudes = grid.lens[2] - (layer.box[1] + np.arange(len(longest)) + 0.5) * grid.lens[3]
+    # most ways lead to the side; but between pixels they are means of those around, from places of their own:
+    # meridians' directions differ, and what lies between two places of one latitude lies beyond it
+    slack = (1 + 2 * longest) * grid.lens[3] + np.abs(np.tan(latitudes)) * longest**2 / 2
+    far_from_poles = 2 * longest < np.cos(latitudes)
+    angles = np.where(far_from_poles, np.minimum(turned, np.arctan(steepest) + slack), turned)
+    return list((angles / grid.lens[3]).tolist())

@@ -142,33 +142,70 @@ def test_twins_of_the_softmax_are_the_formulas() -> None:
     assert np.allclose(np.array(weights) / sum(weights), expected, rtol=1e-12)
 
 
-@pytest.mark.parametrize("plane_", [0, 1])
-def test_reach_equals_its_twin(device: Device, plane_: int) -> None:
-    field = np.random.default_rng(7).normal(size=(53, 77, 4)).astype(np.float32)
-    rows = device.empty((53,))
-    device.run("geometry", "geometry_reach", (53, 1), device.upload(field), (0, 0, 77, 53), plane_, rows)
-    expected = twin.geometry_reach(field, plane_)
-    by_hand = [max(abs(p[1]) if plane_ else math.hypot(*p[:3]) for p in row) for row in field.tolist()]
-    assert np.allclose(expected, by_hand)
-    assert_close(rows.get(), expected, SUM)
+@pytest.mark.parametrize("name", list(GRIDS))
+def test_reach_equals_its_twin(device: Device, name: str) -> None:
+    grid = GRIDS[name]
+    box = 3, 2, grid.width - 5, grid.height - 3
+    field = np.random.default_rng(7).normal(size=(box[3], box[2], 4)).astype(np.float32) * 0.1
+    field[5, 6, :3] = 0, 0, -9  # down to beside the south pole
+    rows = device.empty((box[3], 2))
+    device.run("geometry", "geometry_reach", (box[3], 1), device.upload(field), box, grid.lens, rows)
+    expected = twin.geometry_reach(field, box, grid.lens)
+    by_hand = [max(math.hypot(*p[:3]) if grid.lens[1] else abs(p[1]) for p in row) for row in field.tolist()]
+    assert np.allclose(expected[:, 0], by_hand)
+    result = rows.get()
+    assert_close(result[:, 0], expected[:, 0], SUM)
+    assert (expected[5, 1] > 5) == (grid.lens[1] > 0)
+    assert np.isinf(expected[5, 1]) or name != "sphere"
+    np.testing.assert_allclose(np.arctan(result[:, 1]), np.arctan(expected[:, 1]), atol=1e-5)
 
 
 def test_reach_on_a_sphere_is_no_less_than_any_rows_way(device: Device) -> None:
     """A mean of chords ends inside the sphere: half a chord turns a direction by half its angle, which is
     more than a chord of that length does. Rows that a band needs must not be missed."""
     grid = sphere(402, 201)
-    columns, rows = common.pixels(402, 201)
-    here = common.canvas_point(columns + 0.5, rows + 0.5, grid.lens)
+    here, rows = centres(grid)
     south = np.array([0, 0, -1]) - here * -here[..., 2:]
     turned = here * math.cos(0.8) + south / np.linalg.norm(south, axis=-1, keepdims=True) * math.sin(0.8)
-    way = 0.5 * (turned - here)
-    field = np.concatenate([way, np.ones((201, 402, 1))], -1).astype(np.float32)
-    layer = on_device(device, np.ones((201, 402, 4)))
-    reach = geometry.reach(device, layer, device.upload(field), grid)
-    _, y = common.canvas_position(here + field[..., :3], grid.lens)
-    moved = np.abs(y - rows - 0.5).max(1)
+    reach, moved = reached(device, grid, 0.5 * (turned - here), here, rows)
     assert moved[60] == pytest.approx(0.4 / grid.lens[3], rel=1e-3)
-    assert (moved <= np.array(reach) + POSITION).all()
+    assert (moved <= reach + POSITION).all()
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_reach_holds_between_pixels_and_is_short_for_ways_to_the_side(device: Device, seed: int) -> None:
+    """Displacements of each pixel of their own, 8 px to the side: half a pixel further their mean counts."""
+    grid = sphere(402, 201)
+    here, rows = centres(grid)
+    random = np.random.default_rng(seed)
+    east = np.stack([-here[..., 1], here[..., 0], np.zeros(rows.shape)], -1)
+    east /= np.linalg.norm(east, axis=-1, keepdims=True)
+    way = 8 * grid.lens[1] * random.uniform(-1, 1, (*rows.shape, 1)) * east
+    reach, moved = reached(device, grid, way, here, rows)
+    assert (moved <= reach + POSITION).all()
+    assert reach[30:170].max() < 3.5 and reach[100] < 1.5
+    columns, between = common.pixels(401, 200)
+    place = common.canvas_point(columns + 1, between + 1, grid.lens)
+    mean = (way[1:, 1:] + way[1:, :-1] + way[:-1, 1:] + way[:-1, :-1]) / 4
+    _, y = common.canvas_position(place + mean, grid.lens)
+    assert (np.abs(y - between - 1).max(1) <= np.maximum(reach[1:], reach[:-1]) + POSITION).all()
+
+
+def centres(grid: Grid) -> tuple[np.ndarray, np.ndarray]:
+    """The points of a grid's pixels, and their rows."""
+    columns, rows = common.pixels(grid.width, grid.height)
+    return common.canvas_point(columns + 0.5, rows + 0.5, grid.lens), rows
+
+
+def reached(
+    device: Device, grid: Grid, way: np.ndarray, here: np.ndarray, rows: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Of each row what `reach` says, and how many rows its pixels are moved at most."""
+    field = np.concatenate([way, np.ones((*rows.shape, 1))], -1).astype(np.float32)
+    layer = on_device(device, np.ones(field.shape))
+    found = geometry.reach(device, layer, device.upload(field), grid)
+    _, y = common.canvas_position(here + field[..., :3], grid.lens)
+    return np.array(found), np.abs(y - rows - 0.5).max(1)
 
 
 def pair(device: Device, a: int, b: int, found: Chart, forward: np.ndarray, backward: np.ndarray) -> PairFlow:

@@ -79,6 +79,14 @@ def geometry_softmax(field: Array, blend: Array, rim: Array, box: Sequence[int],
     return result
 
 
-def geometry_reach(field: Array, plane: int) -> Array:
-    """The longest displacement of each row: (height,)."""
-    return (np.abs(field[..., 1]) if plane else np.linalg.norm(field[..., :3], axis=-1)).max(1)
+def geometry_reach(field: Array, box: Sequence[int], lens: Numbers) -> Array:
+    """The longest way of each row, and the tangent of its largest change of latitude: (height, 2)."""
+    if not lens[1]:
+        return np.stack([np.abs(field[..., 1]).max(1), np.zeros(len(field))], -1)
+    x, y = pixels(box[2], box[3], box[0], box[1])
+    here = canvas_point(x + 0.5, y + 0.5, lens)
+    there = here + field[..., :3]
+    latitudes = [np.arctan2(p[..., 2], np.hypot(p[..., 0], p[..., 1])) for p in (here, there)]
+    change = np.abs(latitudes[1] - latitudes[0])
+    tangent = np.where(change < np.pi / 2, np.tan(change), np.inf)
+    return np.stack([np.linalg.norm(field[..., :3], axis=-1).max(1), tangent.max(1)], -1)
