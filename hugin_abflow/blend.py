@@ -47,7 +47,7 @@ class BlendLayer:
 
     box     place of `field` on the working grid: left, top, width, height.
     field   displacement and colour weight, float32 (height, width, 4).
-    reach   per row of `field`, the largest vertical displacement, working px.
+    reach   per row of `field`, how far from it at most rows are sampled, working px (geometry.py).
     gain    on the exposure scale and the colour grid, float32 (height, width, 4); None: no correction.
     offset  what is added after that (multiband.py), its place on its grid and float32 (height, width, 4);
             None: nothing.

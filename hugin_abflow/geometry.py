@@ -150,8 +150,8 @@ def shown_at(
 
 
 def reach(device: Device, layer: WorkingLayer, field: Buffer, grid: Grid) -> list[float]:
-    """Per row of the layer's box, how far from it at most, in working pixels, the rows lie that are sampled
-    between it and the next ones.
+    """Per row of the layer's box a bound, in working pixels, of how far from a place between it and the rows
+    beside it, or at the box's rim, the row lies that is sampled there.
     """
     found = device.empty((layer.box[3], 2))
     device.run("geometry", "geometry_reach", (layer.box[3], 1), field, layer.box, grid.lens, found)
@@ -159,11 +159,26 @@ def reach(device: Device, layer: WorkingLayer, field: Buffer, grid: Grid) -> lis
     if not grid.lens[1]:
         return list(longest.tolist())
     # a vector of length v, added to a unit vector, turns it by asin(v) at most
-    turned = np.arcsin(np.minimum(longest, 1)) + math.pi * (longest >= 1)
-    latitudes = grid.lens[2] - (layer.box[1] + np.arange(len(longest)) + 0.5) * grid.lens[3]
-    # most ways lead to the side; but between pixels they are means of those around, from places of their own:
-    # meridians' directions differ, and what lies between two places of one latitude lies beyond it
-    slack = (1 + 2 * longest) * grid.lens[3] + np.abs(np.tan(latitudes)) * longest**2 / 2
+    angles = np.arcsin(np.minimum(longest, 1)) + math.pi * (longest >= 1)
+    latitudes = np.abs(grid.lens[2] - (layer.box[1] + np.arange(len(longest)) + 0.5) * grid.lens[3])
+    # but most lead to the side. Displacements of pixels are added to places beside them, too, and their means
+    changes = np.arctan(steepest) + (1 + 2 * longest) * max(grid.lens[1], grid.lens[3])
     far_from_poles = 2 * longest < np.cos(latitudes)
-    angles = np.where(far_from_poles, np.minimum(turned, np.arctan(steepest) + slack), turned)
+    aside = np.where(
+        far_from_poles, longest / np.cos(latitudes), 0
+    )  # sine of the largest change of longitude
+    beyond = np.maximum(_beyond(latitudes + changes, aside), _beyond(changes - latitudes, aside))
+    angles = np.where(far_from_poles, np.minimum(angles, changes + beyond), angles)
+    # a row beyond a pole is seen where its directions are, on the pole's other side
+    angles += 2 * np.maximum(latitudes + 1.5 * grid.lens[3] - math.pi / 2, 0)
     return list((angles / grid.lens[3]).tolist())
+
+
+def _beyond(latitudes: npt.NDArray[np.float64], aside: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+    """How far beyond a latitude a mean of points lies at most of which none does. aside: sine of how far in
+    longitude they lie from its meridian.
+
+    The mean's height is the points', but it lies nearer to the axis, by the cosine of that angle at most.
+    """
+    tangents = np.tan(latitudes) / np.sqrt(1 - aside**2)
+    return np.where(latitudes < math.pi / 2, np.maximum(np.arctan(tangents) - latitudes, 0), math.inf)

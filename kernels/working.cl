@@ -1,7 +1,7 @@
 /* Layers at working resolution. Built with PIXEL (stored sample type) and SAMPLES (2 or 4, alpha last). */
 
-/* Area mean of the full-resolution pixels under each working pixel; exact integer weights, because working
-   edges lie at fractions of a pixel. Valid only if every pixel under it is. */
+/* Area mean of the full-resolution pixels under each working pixel; integer weights, because working edges lie
+   at fractions of a pixel. Valid only if every pixel under it is. */
 __kernel void working_reduce(__global const pixel_stored *rows, /* (box.w, box.z) */
                              int4 box,      /* place of `rows` in the region: left, top, width, height, px */
                              int4 ratio,    /* region width, working width, region height, working height */

@@ -16,6 +16,7 @@ from hugin_abflow import geometry
 from hugin_abflow.chart import Chart, pair_chart
 from hugin_abflow.coefficient import Coefficients
 from hugin_abflow.geometry import PairFlow
+from hugin_abflow.layer import Box
 from hugin_abflow.opencl import Device
 from hugin_abflow.settings import Settings
 from hugin_abflow.working import Grid, WorkingLayer
@@ -189,6 +190,40 @@ def test_reach_holds_between_pixels_and_is_short_for_ways_to_the_side(device: De
     mean = (way[1:, 1:] + way[1:, :-1] + way[:-1, 1:] + way[:-1, :-1]) / 4
     _, y = common.canvas_position(place + mean, grid.lens)
     assert (np.abs(y - between - 1).max(1) <= np.maximum(reach[1:], reach[:-1]) + POSITION).all()
+
+
+@pytest.mark.parametrize("middle", [0.0, 0.7, -1.2])
+def test_reach_holds_where_neighbours_lead_to_both_sides(device: Device, middle: float) -> None:
+    """The mean of two points of one latitude lies beyond it, by more than at the latitude of their row."""
+    step = 2 * math.pi / 2048
+    grid = Grid(Box(0, 0, 2048, 31), 2048, 31, True, 0, (-math.pi, step, middle + 15.5 * step, step))
+    here, rows = centres(grid)
+    columns, _ = common.pixels(2048, 31)
+    longitudes = grid.lens[0] + (columns + 0.5) * step + np.where(columns % 2, -0.35, 0.35) * math.cos(middle)
+    latitudes = grid.lens[2] - (rows + 0.5) * step + math.copysign(0.23 * math.cos(middle), middle)
+    there = np.stack(
+        [np.sin(longitudes) * np.cos(latitudes), np.cos(longitudes) * np.cos(latitudes), np.sin(latitudes)],
+        -1,
+    )
+    way = there - here
+    reach, moved = reached(device, grid, way, here, rows)
+    assert (moved <= reach + POSITION).all()
+    between = common.canvas_point(columns[:, 1:] * 1.0, rows[:, 1:] + 0.5, grid.lens)
+    _, y = common.canvas_position(between + (way[:, 1:] + way[:, :-1]) / 2, grid.lens)
+    meant = np.abs(y - rows[:, 1:] - 0.5).max(1)
+    assert (meant > moved + 0.5).all()
+    assert (meant <= reach + POSITION).all()
+
+
+def test_reach_of_rows_beyond_a_pole_is_that_of_their_directions(device: Device) -> None:
+    """A canvas may be higher than half of its width; what is moved there is seen on the pole's other side."""
+    step = 2 * math.pi / 200
+    grid = Grid(Box(0, 0, 200, 120), 200, 120, True, 0, (-math.pi, step, 60 * step, step))
+    here, rows = centres(grid)
+    columns, _ = common.pixels(200, 120)
+    way = common.canvas_point(columns + 0.8, rows + 0.5, grid.lens) - here
+    reach, moved = reached(device, grid, way, here, rows)
+    assert moved.max() > 15 and (moved <= reach + POSITION).all()
 
 
 def centres(grid: Grid) -> tuple[np.ndarray, np.ndarray]:

@@ -97,7 +97,7 @@ def work(pipe: Connection, level: int, traced: bool, sharers: int) -> None:
 def _read(pipe: Connection, orders: queue.SimpleQueue[Task | None], turn: _Turn) -> None:
     """Hand on what the pool sends; when it is gone, end this process as a signal would, or else at once: an
     interruption that comes while an object is collected is lost, and one that comes while a lock is held may
-    wait for itself.
+    wait for itself. A program that it waits for (nona) runs to its end then.
     """
     try:
         while (order := pipe.recv()) is not None:
@@ -112,5 +112,7 @@ def _read(pipe: Connection, orders: queue.SimpleQueue[Task | None], turn: _Turn)
         else:  # which also ends a wait for nona
             signal.pthread_kill(threading.main_thread().ident or 0, signal.SIGTERM)
         time.sleep(GRACE)
-        scratch.tidy()
-        os._exit(1)
+        try:
+            scratch.tidy()
+        finally:
+            os._exit(1)
