@@ -164,9 +164,7 @@ def reach(device: Device, layer: WorkingLayer, field: Buffer, grid: Grid) -> lis
     # but most lead to the side. Displacements of pixels are added to places beside them, too, and their means
     changes = np.arctan(steepest) + (1 + 2 * longest) * max(grid.lens[1], grid.lens[3])
     far_from_poles = 2 * longest < np.cos(latitudes)
-    aside = np.where(
-        far_from_poles, longest / np.cos(latitudes), 0
-    )  # sine of the largest change of longitude
+    aside = np.where(far_from_poles, longest / np.cos(latitudes), 0)  # sine of the change of longitude
     beyond = np.maximum(_beyond(latitudes + changes, aside), _beyond(changes - latitudes, aside))
     angles = np.where(far_from_poles, np.minimum(angles, changes + beyond), angles)
     # a row beyond a pole is seen where its directions are, on the pole's other side

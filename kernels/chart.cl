@@ -34,8 +34,8 @@ static inline float4 chart_places(float4 u, float4 v, const float16 *chart, floa
     return (angle_of4(q.x, q.y) - lens.x) / lens.y;
 }
 
-/* Brightness of a layer at position p of the canvas grid, by these weights where all taps are valid, bilinear at the
-   rim of the mask; negative where there is none. */
+/* Brightness of a layer at position p of the canvas grid, by these weights where all taps are valid, bilinear at
+   the rim of the mask; negative where there is none. */
 static float chart_brightness(__global const float4 *layer, int4 box, int4 border, float2 p, int coarse) {
     const float3 luma = (float3)(0.299f, 0.587f, 0.114f);
     p -= 0.5f;
@@ -93,8 +93,9 @@ __kernel void chart_sample(__global const float4 *layer, /* (box.w, box.z) r, g,
     const int i = get_global_id(0) * CHART_CHUNK, j = get_global_id(1);
     if (i >= size.x || j >= size.y)
         return;
+    const float4 u = convert_float4(i + (int4)(0, 1, 2, 3)) + 0.5f;
     float4 py;
-    const float4 px = chart_places(convert_float4(i + (int4)(0, 1, 2, 3)) + 0.5f, (float4)(j + 0.5f), &chart, lens, &py);
+    const float4 px = chart_places(u, (float4)(j + 0.5f), &chart, lens, &py);
     const float2 places[CHART_CHUNK] = {(float2)(px.x, py.x), (float2)(px.y, py.y), (float2)(px.z, py.z),
                                         (float2)(px.w, py.w)};
     for (int k = 0; k < CHART_CHUNK && i + k < size.x; ++k) {

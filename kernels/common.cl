@@ -203,7 +203,8 @@ ANGLES(4)
    se: period of a wrapped plane in canvas pixels, else 0. Handed on by its address: compilers warn of
    float16 arguments of functions on a CPU without registers of that size.
 
-   What follows is canvas_point, chart_point and chart_position on spheres, for one point or several. */
+   What follows is on spheres, for one point or several: the point of a canvas's or chart's position, and the
+   opposite for charts. */
 #define SPHERE(n)                                                                                                  \
     typedef struct {                                                                                               \
         float##n x, y, z;                                                                                          \
@@ -245,13 +246,6 @@ static inline float2 canvas_position(float3 q, float4 lens) {
         return q.xy;
     const float lon = angle_of(q.x, q.y), lat = angle_of(q.z, ROOT(square2(q.xy)));
     return (float2)((lon - lens.x) / lens.y, (lens.z - lat) / lens.w);
-}
-
-static inline float3 chart_point(float2 u, const float16 *chart) {
-    if (chart->sd == 0.0f)
-        return (float3)((u.x - chart->sb) / chart->s9, (u.y - chart->sc) / chart->sa, 0.0f);
-    const points q = chart_sphere(u.x, u.y, chart);
-    return (float3)(q.x, q.y, q.z);
 }
 
 static inline float2 chart_position(float3 q, const float16 *chart) {
