@@ -156,10 +156,11 @@ def reach(device: Device, layer: WorkingLayer, field: Buffer, grid: Grid) -> lis
     found = device.empty((layer.box[3], 2))
     device.run("geometry", "geometry_reach", (layer.box[3], 1), field, layer.box, grid.lens, found)
     longest, steepest = found.get().astype(np.float64).T
+    rows: list[float] = longest.tolist()
     if not grid.lens[1]:
-        return list(longest.tolist())
+        return rows
     # a vector of length v, added to a unit vector, turns it by asin(v) at most
-    angles = np.arcsin(np.minimum(longest, 1)) + math.pi * (longest >= 1)
+    angles = np.where(longest < 1, np.arcsin(np.minimum(longest, 1)), math.pi)
     latitudes = np.abs(grid.lens[2] - (layer.box[1] + np.arange(len(longest)) + 0.5) * grid.lens[3])
     # but most lead to the side. Displacements of pixels are added to places beside them, too, and their means
     changes = np.arctan(steepest) + (1 + 2 * longest) * max(grid.lens[1], grid.lens[3])
@@ -169,7 +170,8 @@ def reach(device: Device, layer: WorkingLayer, field: Buffer, grid: Grid) -> lis
     angles = np.where(far_from_poles, np.minimum(angles, changes + beyond), angles)
     # a row beyond a pole is seen where its directions are, on the pole's other side
     angles += 2 * np.maximum(latitudes + 1.5 * grid.lens[3] - math.pi / 2, 0)
-    return list((angles / grid.lens[3]).tolist())
+    rows = (angles / grid.lens[3]).tolist()
+    return rows
 
 
 def _beyond(latitudes: npt.NDArray[np.float64], aside: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:

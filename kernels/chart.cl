@@ -29,9 +29,7 @@ static inline float4 chart_places(float4 u, float4 v, const float16 *chart, floa
         *y = (v - chart->sc) / chart->sa;
         return (u - chart->sb) / chart->s9;
     }
-    const points4 q = chart_sphere4(u, v, chart);
-    *y = (lens.z - angle_of4(q.z, root4(q.x * q.x + q.y * q.y))) / lens.w;
-    return (angle_of4(q.x, q.y) - lens.x) / lens.y;
+    return canvas_sphere_position4(chart_sphere4(u, v, chart), lens, y);
 }
 
 /* Brightness of a layer at position p of the canvas grid, by these weights where all taps are valid, bilinear at

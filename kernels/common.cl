@@ -203,8 +203,7 @@ ANGLES(4)
    se: period of a wrapped plane in canvas pixels, else 0. Handed on by its address: compilers warn of
    float16 arguments of functions on a CPU without registers of that size.
 
-   What follows is on spheres, for one point or several: the point of a canvas's or chart's position, and the
-   opposite for charts. */
+   What follows is on spheres, for one point or several: the point of a canvas's or chart's position, and back. */
 #define SPHERE(n)                                                                                                  \
     typedef struct {                                                                                               \
         float##n x, y, z;                                                                                          \
@@ -214,6 +213,10 @@ ANGLES(4)
         const float##n sl = angle_sincos##n(lens.x + x * lens.y, &cl);                                             \
         const float##n sp = angle_sincos##n(lens.z - y * lens.w, &cp);                                             \
         return (points##n){cp * sl, cp * cl, sp};                                                                  \
+    }                                                                                                              \
+    static inline float##n canvas_sphere_position##n(points##n q, float4 lens, float##n *y) {                      \
+        *y = (lens.z - angle_of##n(q.z, root##n(q.x * q.x + q.y * q.y))) / lens.w;                                 \
+        return (angle_of##n(q.x, q.y) - lens.x) / lens.y;                                                          \
     }                                                                                                              \
     static inline points##n chart_sphere##n(float##n u, float##n v, const float16 *chart) {                        \
         float##n cl, cp;                                                                                           \
@@ -244,8 +247,9 @@ static inline float3 canvas_point(float2 p, float4 lens) {
 static inline float2 canvas_position(float3 q, float4 lens) {
     if (lens.y == 0.0f)
         return q.xy;
-    const float lon = angle_of(q.x, q.y), lat = angle_of(q.z, ROOT(square2(q.xy)));
-    return (float2)((lon - lens.x) / lens.y, (lens.z - lat) / lens.w);
+    float y;
+    const float x = canvas_sphere_position((points){q.x, q.y, q.z}, lens, &y);
+    return (float2)(x, y);
 }
 
 static inline float2 chart_position(float3 q, const float16 *chart) {

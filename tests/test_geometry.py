@@ -199,11 +199,9 @@ def test_reach_holds_where_neighbours_lead_to_both_sides(device: Device, middle:
     grid = Grid(Box(0, 0, 2048, 31), 2048, 31, True, 0, (-math.pi, step, middle + 15.5 * step, step))
     here, rows = centres(grid)
     columns, _ = common.pixels(2048, 31)
-    longitudes = grid.lens[0] + (columns + 0.5) * step + np.where(columns % 2, -0.35, 0.35) * math.cos(middle)
-    latitudes = grid.lens[2] - (rows + 0.5) * step + math.copysign(0.23 * math.cos(middle), middle)
-    there = np.stack(
-        [np.sin(longitudes) * np.cos(latitudes), np.cos(longitudes) * np.cos(latitudes), np.sin(latitudes)],
-        -1,
+    aside, north = np.where(columns % 2, -0.35, 0.35) * math.cos(middle), 0.23 * math.cos(middle)
+    there = common.canvas_point(
+        columns + 0.5 + aside / step, rows + 0.5 - math.copysign(north, middle) / step, grid.lens
     )
     way = there - here
     reach, moved = reached(device, grid, way, here, rows)
