@@ -155,15 +155,15 @@ def reach(device: Device, layer: WorkingLayer, field: Buffer, grid: Grid) -> lis
     """
     found = device.empty((layer.box[3], 2))
     device.run("geometry", "geometry_reach", (layer.box[3], 1), field, layer.box, grid.lens, found)
-    longest, steepest = found.get().astype(np.float64).T
-    rows: list[float] = longest.tolist()
+    longest, furthest = found.get().astype(np.float64).T
+    rows: list[float] = furthest.tolist()
     if not grid.lens[1]:
         return rows
     # a vector of length v, added to a unit vector, turns it by asin(v) at most
     angles = np.where(longest < 1, np.arcsin(np.minimum(longest, 1)), math.pi)
     latitudes = np.abs(grid.lens[2] - (layer.box[1] + np.arange(len(longest)) + 0.5) * grid.lens[3])
     # but most lead to the side. Displacements of pixels are added to places beside them, too, and their means
-    changes = np.arctan(steepest) + (1 + 2 * longest) * max(grid.lens[1], grid.lens[3])
+    changes = furthest * grid.lens[3] + (1 + 2 * longest) * max(grid.lens[1], grid.lens[3])
     far_from_poles = 2 * longest < np.cos(latitudes)
     aside = np.where(far_from_poles, longest / np.cos(latitudes), 0)  # sine of the change of longitude
     beyond = np.maximum(_beyond(latitudes + changes, aside), _beyond(changes - latitudes, aside))

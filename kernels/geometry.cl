@@ -131,31 +131,22 @@ __kernel void geometry_softmax(__global float4 *field,       /* (box.w, box.z); 
                       : 0.0f;
 }
 
-/* The longest displacement of each row, on a plane in y alone, and on the sphere the tangent of the largest change of
-   latitude, INFINITY from a right angle on: how many rows a band needs beyond its own. */
+/* The longest displacement of each row, and how many rows it leads up or down at most: how many rows a band needs
+   beyond its own. */
 __kernel void geometry_reach(__global const float4 *field, /* (box.w, box.z) */
                              int4 box,                     /* place on the working grid; run size: (box.w, 1) */
                              float4 lens,                  /* working grid */
-                             __global float2 *reach)       /* (box.w) in units of the field; a tangent */
+                             __global float2 *reach)       /* (box.w) in units of the field; working px */
 {
     const int y = get_global_id(0);
     if (y >= box.w || get_global_id(1) > 0)
         return;
-    float cp, longest = 0.0f, steepest = 0.0f;
-    const float sp = angle_sincos(lens.z - (y + box.y + 0.5f) * lens.w, &cp);
+    float longest = 0.0f, furthest = 0.0f;
     for (int x = 0; x < box.z; ++x) {
         const float3 d = field[y * box.z + x].xyz;
-        if (lens.y == 0.0f) {
-            longest = GREATEST(longest, MAGNITUDE(d.y));
-            continue;
-        }
+        const float2 q = (float2)(x + box.x, y + box.y) + 0.5f;
         longest = GREATEST(longest, square3(d));
-        float cl;
-        const float sl = angle_sincos(lens.x + (x + box.x + 0.5f) * lens.y, &cl);
-        const float east = cl * d.x - sl * d.y, out = cp + sl * d.x + cl * d.y, north = sp + d.z;
-        const float level = ROOT(east * east + out * out), along = level * cp + north * sp;
-        const float tangent = along > 0.0f ? (north * cp - level * sp) / along : INFINITY;
-        steepest = GREATEST(steepest, MAGNITUDE(tangent));
+        furthest = GREATEST(furthest, MAGNITUDE(layer_position(q, d, lens).y - q.y));
     }
-    reach[y] = (float2)(lens.y == 0.0f ? longest : ROOT(longest), steepest);
+    reach[y] = (float2)(ROOT(longest), furthest);
 }

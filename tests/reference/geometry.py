@@ -6,7 +6,17 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from reference.common import Array, Numbers, bilinear, canvas_point, chart_point, chart_position, pixels, take
+from reference.common import (
+    Array,
+    Numbers,
+    bilinear,
+    canvas_point,
+    canvas_position,
+    chart_point,
+    chart_position,
+    pixels,
+    take,
+)
 
 # Coefficients below this move nothing.
 NEGLIGIBLE = 1e-5
@@ -80,13 +90,8 @@ def geometry_softmax(field: Array, blend: Array, rim: Array, box: Sequence[int],
 
 
 def geometry_reach(field: Array, box: Sequence[int], lens: Numbers) -> Array:
-    """The longest way of each row, and the tangent of its largest change of latitude: (height, 2)."""
-    if not lens[1]:
-        return np.stack([np.abs(field[..., 1]).max(1), np.zeros(len(field))], -1)
+    """The longest way of each row, and how many rows its ways lead up or down at most: (height, 2)."""
     x, y = pixels(box[2], box[3], box[0], box[1])
-    here = canvas_point(x + 0.5, y + 0.5, lens)
-    there = here + field[..., :3]
-    latitudes = [np.arctan2(p[..., 2], np.hypot(p[..., 0], p[..., 1])) for p in (here, there)]
-    change = np.abs(latitudes[1] - latitudes[0])
-    tangent = np.where(change < np.pi / 2, np.tan(change), np.inf)
-    return np.stack([np.linalg.norm(field[..., :3], axis=-1).max(1), tangent.max(1)], -1)
+    way = field[..., :3].astype(np.float64)
+    _, there = canvas_position(canvas_point(x + 0.5, y + 0.5, lens) + way, lens)
+    return np.stack([np.linalg.norm(way, axis=-1).max(1), np.abs(there - y - 0.5).max(1)], -1)
