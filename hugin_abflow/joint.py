@@ -6,7 +6,7 @@ import importlib
 import logging
 import threading
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
@@ -85,7 +85,7 @@ def merge(
     settings: Settings,
     progress: Progress,
     guides: Sequence[Guide] = (),
-) -> Iterator[npt.NDArray[Any]]:
+) -> Generator[npt.NDArray[Any], None, None]:
     """Bands of the panorama's crop from top to bottom, as `blend.bands` gives them.
 
     The result does not depend on the order of `layers`, which `guides` are about.

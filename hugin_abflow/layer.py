@@ -104,6 +104,7 @@ class Layer:
     file        the file that `read` decodes; None for pixels in memory.
     has_alpha   False for a file without alpha: every pixel is valid.
     strip       rows that `read` decodes together, from row 0 on: it is fastest asked for whole ones.
+    compressed  in the file, so that reading again takes as long as it did.
     """
 
     name: str
@@ -116,6 +117,7 @@ class Layer:
     file: Path | None = None
     has_alpha: bool = True
     strip: int = 1
+    compressed: bool = False
 
     @classmethod
     def from_array(

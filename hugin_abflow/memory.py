@@ -52,6 +52,11 @@ def machine() -> int:
     return min(sizes)
 
 
+def unused() -> int:
+    """Bytes that this process, or the system's file cache, can have without taking them from others."""
+    return min(machine(), int(psutil.virtual_memory().available)) // _sharers
+
+
 _sharers = 1
 
 

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import closing
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -25,12 +26,14 @@ from hugin_abflow.pano_trafo import images_of, read_guides
 from hugin_abflow.progress import Progress, silent
 from hugin_abflow.project import Plan, read_plan
 from hugin_abflow.settings import Settings
+from hugin_abflow.spool import spooled
 
 _log = logging.getLogger(__name__)
 
 # What `joint.merge` looks like.
 Method = Callable[
-    [Device, Sequence[Layer], Canvas, Settings, Progress, Sequence[Guide]], Iterator[npt.NDArray[Any]]
+    [Device, Sequence[Layer], Canvas, Settings, Progress, Sequence[Guide]],
+    Generator[npt.NDArray[Any], None, None],
 ]
 
 OpenDevice = Callable[[str | None, int], Device]
@@ -156,9 +159,14 @@ def _bands(
     device = (open_device or Device)(settings.device, settings.threads)
     method = method or {"joint": joint.merge, "sequential": sequential.merge}[settings.merge]
     visible = False
-    for rows in method(device, layers, canvas, settings, progress, guides):
-        visible = visible or bool(rows[..., -1].any())
-        yield rows
+    with (
+        spooled(layers) as layers,
+        # closed first: its threads read the layers
+        closing(method(device, layers, canvas, settings, progress, guides)) as bands,
+    ):
+        for rows in bands:
+            visible = visible or bool(rows[..., -1].any())
+            yield rows
     if not visible:
         _log.warning(
             "the panorama is wholly transparent: no layer shows anything inside the crop; "

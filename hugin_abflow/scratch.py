@@ -78,15 +78,12 @@ def _create(final: Path, suffix: str) -> tuple[Path, int | None]:
 @contextmanager
 def work_folder() -> Iterator[Path]:
     """A folder for temporary files under TMPDIR; nothing is left of it. Raises OSError."""
-    # asked each time: Python remembers the first TMPDIR that it saw
-    named = os.environ.get("TMPDIR", "")
-    root = Path(named if named and Path(named).is_dir() else tempfile.gettempdir())
-    sweep(root)
+    sweep(root())
     folder: Path | None = None
     descriptor: int | None = None
     try:
         while True:
-            folder = root / f"hugin-abflow-{_HOST}-{secrets.token_hex(6)}"
+            folder = root() / f"hugin-abflow-{_HOST}-{secrets.token_hex(6)}"
             _ours.add(folder)
             folder.mkdir(0o700)
             descriptor = os.open(folder / _LOCK, os.O_CREAT | os.O_WRONLY, 0o600)
@@ -102,6 +99,12 @@ def work_folder() -> Iterator[Path]:
         if folder is not None:
             shutil.rmtree(folder, ignore_errors=True)
             _ours.discard(folder)
+
+
+def root() -> Path:
+    """The folder for temporary files: TMPDIR, asked each time, as Python remembers the first that it saw."""
+    named = os.environ.get("TMPDIR", "")
+    return Path(named if named and Path(named).is_dir() else tempfile.gettempdir())
 
 
 def sweep(folder: Path) -> None:

@@ -6,7 +6,7 @@ the pair that overlaps most comes first, then always the layer that overlaps the
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Generator, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -29,7 +29,7 @@ def merge(
     settings: Settings,
     progress: Progress,
     guides: Sequence[Guide] = (),
-) -> Iterator[npt.NDArray[Any]]:
+) -> Generator[npt.NDArray[Any], None, None]:
     """The panorama's crop, in bands as `joint.merge` gives them."""
     order = _order(device, layers, canvas, settings)
     if len(order) > 2:  # a mosaic was seen from several places: what stands still moves in several ways

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Generator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -49,7 +49,7 @@ class MaskedMerge:
         settings: Settings,
         progress: Progress,
         guides: Sequence[Guide],
-    ) -> Iterator[npt.NDArray[Any]]:
+    ) -> Generator[npt.NDArray[Any], None, None]:
         """Bands as `joint.merge` gives them; raises what it raises, and `LayersMissingError`,
         `LayersMismatchError` and `ImageReadError` for masks that are missing, of another size, or broken.
         """

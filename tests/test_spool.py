@@ -1,0 +1,195 @@
+"""Decoded rows, kept from one reading to the next: the same rows, decoded once, and nothing depends on it."""
+
+from __future__ import annotations
+
+import errno
+import os
+import shutil
+from collections.abc import Callable, Generator, Sequence
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import psutil
+import pytest
+from conftest import DTYPES, names_in
+from hypothesis import given
+from hypothesis import strategies as st
+from pictures import noise
+
+from hugin_abflow import joint, memory, merge, scratch, spool
+from hugin_abflow.layer import Canvas, Layer
+from hugin_abflow.merge import merge_layers
+from hugin_abflow.opencl import Device
+from hugin_abflow.progress import silent
+from hugin_abflow.settings import MergeMode, Settings
+from hugin_abflow.spool import spooled
+
+HEIGHT, WIDTH = 13, 7
+PLENTY = 1 << 40
+
+pytestmark = pytest.mark.skipif(not hasattr(os, "preadv"), reason="what is tested needs preadv")
+
+
+@pytest.fixture(autouse=True)
+def root(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.setenv("TMPDIR", str(tmp_path))
+    monkeypatch.setattr(memory, "unused", lambda: PLENTY)
+    return tmp_path
+
+
+def counted(name: str = "a", dtype: npt.DTypeLike = np.uint8, seed: int = 0) -> tuple[Layer, list[int]]:
+    """A layer that is compressed in its file, as it says, and how often each of its rows was decoded."""
+    pixels = np.random.default_rng(seed).integers(0, 256, (HEIGHT, WIDTH, 4)).astype(dtype)
+    return counting(Layer.from_array(name, pixels))
+
+
+def counting(layer: Layer) -> tuple[Layer, list[int]]:
+    times = [0] * layer.box.height
+
+    def read(top: int, bottom: int) -> npt.NDArray[Any]:
+        for row in range(top, bottom):
+            times[row] += 1
+        return layer.read(top, bottom)
+
+    return replace(layer, read=read, compressed=True), times
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+def test_rows_are_decoded_once_and_stay_the_same(dtype: npt.DTypeLike) -> None:
+    (a, times_a), (b, times_b) = counted("a", dtype, 1), counted("b", dtype, 2)
+    want = a.read(0, HEIGHT), b.read(0, HEIGHT)
+    with spooled([a, b]) as kept:
+        for _ in range(2):
+            for layer, pixels in zip(kept, want, strict=True):
+                for top in range(0, HEIGHT, 5):
+                    rows = layer.read(top, min(top + 5, HEIGHT))
+                    assert rows.dtype == pixels.dtype
+                    np.testing.assert_array_equal(rows, pixels[top : top + 5])
+    assert times_a == times_b == [2] * HEIGHT  # with `want`
+
+
+@given(
+    st.lists(
+        st.tuples(st.integers(0, HEIGHT), st.integers(0, HEIGHT)).map(lambda span: tuple(sorted(span))),
+        max_size=12,
+    )
+)
+def test_rows_are_right_in_any_order(spans: list[tuple[int, int]]) -> None:
+    layer, _ = counted()
+    with spooled([layer]) as (kept,):
+        for top, bottom in spans:
+            np.testing.assert_array_equal(kept.read(top, bottom), layer.read(top, bottom))
+
+
+def test_errors_of_the_layer_are_its_own() -> None:
+    layer, _ = counted()
+
+    def read(top: int, bottom: int) -> npt.NDArray[Any]:
+        raise IndexError(f"rows {top}..{bottom}")
+
+    with spooled([replace(layer, read=read)]) as (kept,), pytest.raises(IndexError, match=r"rows 5\.\.99"):
+        kept.read(5, 99)
+
+
+def test_what_is_not_compressed_is_left_as_it_is() -> None:
+    layer = Layer.from_array("a", np.zeros((3, 5, 4), np.uint8))
+    with spooled([layer]) as kept:
+        assert kept == [layer]
+
+
+@pytest.mark.parametrize("scarce", ["memory", "disk"])
+def test_what_does_not_fit_is_left_as_it_is(monkeypatch: pytest.MonkeyPatch, scarce: str) -> None:
+    layers = [counted(name)[0] for name in "abc"]
+    room = spool._SHARE * (2 * WIDTH * HEIGHT * 4 + 1)  # for two of them
+    if scarce == "memory":
+        monkeypatch.setattr(memory, "unused", lambda: room)
+    else:
+        monkeypatch.setattr(shutil, "disk_usage", lambda folder: SimpleNamespace(free=room))
+    with spooled(layers) as kept:
+        assert [a is b for a, b in zip(kept, layers, strict=True)] == [False, False, True]
+
+
+def full_disk(file: int, rows: memoryview, place: int) -> int:
+    raise OSError(errno.ENOSPC, "no space left")
+
+
+def nearly_full_disk(write: Callable[[int, Any, int], int]) -> Callable[[int, memoryview, int], int]:
+    return lambda file, rows, place: write(file, rows[: 2 * WIDTH * 4 + 5], place)
+
+
+@pytest.mark.parametrize("left", [0, 2])
+def test_a_full_disk_costs_time_alone(monkeypatch: pytest.MonkeyPatch, left: int) -> None:
+    layer, times = counted()
+    want = Layer.from_array("a", layer.read(0, HEIGHT)).read
+    monkeypatch.setattr(os, "pwrite", nearly_full_disk(os.pwrite) if left else full_disk)
+    with spooled([layer]) as (kept,):
+        for _ in range(2):
+            np.testing.assert_array_equal(kept.read(0, 9), want(0, 9))
+        np.testing.assert_array_equal(kept.read(0, 2), want(0, 2))
+    assert times[:2] == [1 + (2 if left else 3)] * 2  # `want` has read them, too
+
+
+@pytest.mark.parametrize("failure", ["error", "short"])
+def test_a_disk_that_fails_costs_time_alone(monkeypatch: pytest.MonkeyPatch, failure: str) -> None:
+    layer, times = counted()
+
+    def preadv(file: int, buffers: list[memoryview], place: int) -> int:
+        if failure == "error":
+            raise OSError(errno.EIO, "input/output error")
+        return 3
+
+    with spooled([layer]) as (kept,):
+        first = kept.read(0, HEIGHT)
+        monkeypatch.setattr(os, "preadv", preadv)
+        np.testing.assert_array_equal(kept.read(0, HEIGHT), first)
+    assert times == [2] * HEIGHT
+
+
+def test_no_folder_is_no_error(monkeypatch: pytest.MonkeyPatch, root: Path) -> None:
+    monkeypatch.setattr(scratch, "root", lambda: root / "gone")
+    layer, _ = counted()
+    with spooled([layer]) as kept:
+        assert kept == [layer]
+
+
+def test_nothing_is_left(root: Path) -> None:
+    before = psutil.Process().num_fds()
+    layer, _ = counted()
+    with pytest.raises(KeyboardInterrupt), spooled([layer]) as (kept,):
+        kept.read(0, HEIGHT)
+        raise KeyboardInterrupt
+    assert names_in(root) == [] and psutil.Process().num_fds() == before
+
+
+@pytest.mark.parametrize("mode", ["joint", "sequential"])
+def test_a_panorama_is_the_same_of_layers_decoded_once(mode: MergeMode) -> None:
+    canvas = Canvas.plane(151, 103)
+    layers = [Layer.from_array(name, noise(103, 97, seed=left), left) for name, left in (("a", 0), ("b", 54))]
+    settings = Settings(merge=mode, band_rows=7)
+    pairs = [counting(layer) for layer in layers]
+    np.testing.assert_array_equal(
+        merge_layers([layer for layer, _ in pairs], canvas, settings), merge_layers(layers, canvas, settings)
+    )
+    assert all(times == [1] * layer.box.height for layer, times in pairs)
+
+
+def test_the_file_is_there_until_nobody_reads_layers(monkeypatch: pytest.MonkeyPatch) -> None:
+    layer, times = counted()
+    again = []
+
+    def bands(device: Device, layers: Sequence[Layer], *_: object) -> Generator[npt.NDArray[Any], None, None]:
+        try:
+            yield layers[0].read(0, HEIGHT)
+        finally:
+            again.append(layers[0].read(0, HEIGHT))
+
+    monkeypatch.setattr(joint, "merge", bands)
+    rows = merge._bands([layer], Canvas.plane(WIDTH, HEIGHT), Settings(), silent, ())
+    first = next(rows)
+    rows.close()
+    np.testing.assert_array_equal(first, again[0])
+    assert times == [1] * HEIGHT
