@@ -37,7 +37,7 @@ class FlowParameters:
     mean_sigma: float = 6.0  # px: h is log brightness less its Gaussian mean of this sigma
     reach: float = 0.16  # of the longer side: how large a motion is searched where the caller does not say
     overlap: float = 0.5  # of the root of the common mask's area: no larger motion is searched
-    choose_from: int = 2  # finest level (0: full) on which pixels take over flow from beside them
+    choose_from: int = 1  # finest level (0: full) on which pixels take over flow from beside them
     decide_on: int = 1  # level on which flow with and flow without what was searched are compared at last
     misfit: float = 0.2  # the largest misfit of a pixel, as a difference of the gradients of h
     search: SearchParameters = field(default_factory=SearchParameters)
@@ -166,9 +166,7 @@ def _refine(
     together = 2 * grid[0] * grid[1] * _PLANES * 4 <= _TOGETHER
     board = Board.of(device, 2 if together else 1, grid)
     rows, halves = (2 * board.pitch, grid[1], board.ways), (board.pitch, 2 * grid[1], board.ways)
-    warps, sweeps = (
-        per_level[min(level, len(per_level) - 1)] for per_level in (parameters.warps, parameters.sweeps)
-    )
+    warps, sweeps = (pyramid.on_level(values, level) for values in (parameters.warps, parameters.sweeps))
     for first in range(0, 2, board.ways):
         old, new = flows, median
         device.run("flow", "flow_board", rows, features, grid, board.pitch, first, board.planes)
@@ -206,8 +204,14 @@ def finest_features(device: Device, image: Level, parameters: FlowParameters) ->
 
 
 def _choose(
-    device: Device, features: Buffer, stacked: Buffer, grid: Grid, reach: int, parameters: FlowParameters,
-) -> Buffer:  # fmt: skip
+    device: Device,
+    features: Buffer,
+    stacked: Buffer,
+    grid: Grid,
+    level: int,
+    reach: int,
+    parameters: FlowParameters,
+) -> Buffer:
     """The flows with which a level starts: each pixel's own, found by search, or from beside it.
 
     reach: px of the level up to which motion is searched; 0: not at all.
@@ -220,7 +224,7 @@ def _choose(
     return _together(
         device,
         [
-            search.choose(device, descriptors[i], descriptors[1 - i], flow, others[i], grid, how)
+            search.choose(device, descriptors[i], descriptors[1 - i], flow, others[i], grid, level, how)
             for i, flow in enumerate(flows)
         ],
     )
@@ -351,7 +355,8 @@ def solve(
         always = parameters.search.always and level <= max(searched, default=-1)
         followed = always or len(flows) > 1
         if level in searched or (followed and level >= parameters.choose_from):
-            chosen = _choose(device, features, flows[-1], grid, searched.get(level, 0), parameters)
+            its_reach = searched.get(level, 0)
+            chosen = _choose(device, features, flows[-1], grid, level, its_reach, parameters)
             flows = [chosen] if always else [flows[0], chosen]
         pulls = start.pulls if start else (None, None)
         flows = [_refine(device, features, one, grid, level, parameters, pulls) for one in flows]

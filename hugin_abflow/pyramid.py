@@ -6,11 +6,15 @@ never enters a sum. Coarse position = fine position / 2 for any size, odd ones t
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import TypeVar
 
 import numpy as np
 
 from hugin_abflow.opencl import Buffer, Device
+
+_Value = TypeVar("_Value")
 
 
 @dataclass(frozen=True)
@@ -48,6 +52,11 @@ def build(device: Device, finest: Level, levels: int) -> list[Level]:
     while len(pyramid) < levels:
         pyramid.append(reduce(device, pyramid[-1]))
     return pyramid
+
+
+def on_level(values: Sequence[_Value], level: int) -> _Value:
+    """What holds on a level, of values from the finest on; the last holds for all coarser ones."""
+    return values[min(level, len(values) - 1)]
 
 
 def smooth(device: Device, level: Level, sigma: float) -> Level:

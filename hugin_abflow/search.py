@@ -13,6 +13,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from hugin_abflow.opencl import Buffer, Device
+from hugin_abflow.pyramid import on_level
 
 Grid = tuple[int, int, int, int]  # (width, height, wraps, 0), as the kernels take it
 
@@ -33,7 +34,9 @@ class SearchParameters:
     own_outside: float = 0.25  # the same for a pixel's own flow, which is not given up for want of evidence
     other_outside: float = 0.75  # and for a flow that it may take over
     patience: float = 0.06  # by how much a flow from elsewhere must fit better
-    radius: int = 2  # px: of the window in which two flows are compared
+    # px, at most 4, per level, finest first, the last for all coarser: of the window in which two flows are
+    # compared; thin things show on finer levels alone, whose windows would hold too little if not larger
+    radius: tuple[int, ...] = (4, 4, 2)
     focus: float = 4.0  # e-folds by which a pixel counts less there, for a difference of 1 from the middle
     # what a search found is dropped on a level where more than this share of the misfit without it remains,
     # and kept if no more than this remains at last, and it leads elsewhere by so many px (of the level on
@@ -47,7 +50,9 @@ class SearchParameters:
     gain_apart: float = 0.75
     textured: float = 0.02
     always: bool = False  # keep what is found, whatever becomes of it
-    steps: tuple[int, ...] = (16, 8, 4, 2, 1)  # px from which flow is taken over, in turns
+    # px from which flow is taken over, in turns, likewise: what comes from far came on coarser levels, and on
+    # finer ones more fits by chance
+    steps: tuple[tuple[int, ...], ...] = ((6, 3, 1), (6, 3, 1), (16, 8, 4, 2, 1))
 
 
 def descriptor(device: Device, feature: Buffer, grid: Grid, parameters: SearchParameters) -> Buffer:
@@ -127,17 +132,18 @@ def _coupled(
 
 
 def choose(
-    device: Device, a: Buffer, b: Buffer, flow: Buffer, other: Buffer, grid: Grid,
+    device: Device, a: Buffer, b: Buffer, flow: Buffer, other: Buffer, grid: Grid, level: int,
     parameters: SearchParameters,
 ) -> Buffer:  # fmt: skip
     """`flow` from a to b, with flow from beside or of `other` where that fits better.
 
     a, b: descriptors; flows float32 (height, width, 2), px.
     """
-    for step in parameters.steps:
+    radius = on_level(parameters.radius, level)
+    for step in on_level(parameters.steps, level):
         chosen = device.empty(flow.shape)
         device.run(
-            "search", "search_choose", grid[:2], a, b, flow, other, grid, step, parameters.radius,
+            "search", "search_choose", grid[:2], a, b, flow, other, grid, step, radius,
             parameters.focus, (parameters.own_outside, parameters.other_outside), parameters.patience, chosen,
         )  # fmt: skip
         flow = other = chosen

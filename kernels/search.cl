@@ -7,6 +7,7 @@
    A displacement has the index (d.y + reach.y) * (2 reach.x + 1) + d.x + reach.x. */
 
 #define SEARCH_SLOPE 1.5f /* weight of the derivatives beside h */
+#define SEARCH_WINDOW 81  /* pixels of the largest window in which flows are compared: its radius is 4 */
 
 /* Features over the root of their mean square in 7 x 7 pixels. */
 __kernel void search_descriptor(__global const float4 *feature, /* (grid.y, grid.x) kernels/flow.cl */
@@ -219,27 +220,44 @@ static inline float4 search_sample(__global const float4 *b, int2 corner, float2
     return sum.w > 0.999f ? sum : (float4)(0.0f);
 }
 
-/* Mean misfit of a window under one flow; pixels that look like the middle count most. */
-static inline float search_window(__global const float4 *a, __global const float4 *b, int2 at, float2 f, int4 grid,
-                                  int radius, float focus, float outside) {
-    const float2 base = floor(f), t = f - base;
-    const int2 shift = convert_int2(base);
-    const float4 middle = a[at.y * grid.x + at.x];
-    float sum = 0.0f, weight = 0.0f;
+/* Weights of a window, in its rows' order, and their sum: pixels that look like the middle count most, what is not
+   known counts nothing. */
+static inline float search_weights(__global const float4 *a, int2 at, int4 grid, int radius, float focus,
+                                   float *weights) {
+    const float middle = a[at.y * grid.x + at.x].x;
+    float sum = 0.0f;
     for (int j = -radius; j <= radius; ++j)
         for (int i = -radius; i <= radius; ++i) {
             int2 p = at + (int2)(i, j);
-            const int2 to = p + shift;
-            if (!grid_border(&p, grid))
-                continue;
-            const float4 own = a[p.y * grid.x + p.x];
-            if (own.w == 0.0f)
-                continue;
-            const float w = exp(-focus * fabs(own.x - middle.x));
-            sum += w * search_misfit(own, search_sample(b, to, t, grid), outside);
-            weight += w;
+            const bool inside = grid_border(&p, grid);
+            const float4 own = inside ? a[p.y * grid.x + p.x] : (float4)(0.0f);
+            const float weight = own.w == 0.0f ? 0.0f : exp(-focus * fabs(own.x - middle));
+            *weights++ = weight;
+            sum += weight;
         }
-    return weight > 0.0f ? sum / weight : 0.0f;
+    return sum;
+}
+
+/* Mean misfit of a window under one flow, or something above `least` if it is more than that. */
+static inline float search_window(__global const float4 *a, __global const float4 *b, int2 at, float2 f, int4 grid,
+                                  int radius, const float *weights, float total, float outside, float least) {
+    const float2 base = floor(f), t = f - base;
+    const int2 shift = convert_int2(base);
+    float sum = 0.0f;
+    for (int j = -radius; j <= radius; ++j) {
+        for (int i = -radius; i <= radius; ++i) {
+            const float weight = *weights++;
+            int2 p = at + (int2)(i, j);
+            const int2 to = p + shift;
+            if (weight == 0.0f)
+                continue;
+            grid_border(&p, grid);
+            sum += weight * search_misfit(a[p.y * grid.x + p.x], search_sample(b, to, t, grid), outside);
+        }
+        if (sum > least * total * 1.001f)
+            return INFINITY;
+    }
+    return sum / total;
 }
 
 /* Each pixel keeps its flow, or takes over the other field's or one from `step` px beside it in either field, if
@@ -250,7 +268,7 @@ __kernel void search_choose(__global const float4 *a,     /* (grid.y, grid.x) de
                             __global const float2 *other, /* (grid.y, grid.x) px; may be flow itself */
                             int4 grid,                    /* run size */
                             int step,                     /* px */
-                            int radius,                   /* px, of the window compared */
+                            int radius,                   /* px, of the window compared, at most 4 */
                             float focus,                  /* e-folds for a difference of 1 from the middle */
                             float2 outside,               /* misfit where not known: own flow, another */
                             float patience,               /* by how much another must fit better */
@@ -263,7 +281,7 @@ __kernel void search_choose(__global const float4 *a,     /* (grid.y, grid.x) de
     const float2 own = flow[at];
     float2 best = own;
     if (a[at].w > 0.0f) {
-        float least = -1.0f;
+        float weights[SEARCH_WINDOW], total = 0.0f, least = INFINITY;
         const int2 beside[5] = {(int2)(0, 0), (int2)(-1, 0), (int2)(1, 0), (int2)(0, -1), (int2)(0, 1)};
         for (int k = 0; k < 10; ++k) {
             int2 p = (int2)(x, y) + step * beside[k % 5];
@@ -273,9 +291,12 @@ __kernel void search_choose(__global const float4 *a,     /* (grid.y, grid.x) de
             const float2 from_own = f - own, from_best = f - best;
             if (dot(from_own, from_own) < 0.25f || dot(from_best, from_best) < 0.25f)
                 continue;
-            if (least < 0.0f) /* nothing is calculated where all agree */
-                least = search_window(a, b, (int2)(x, y), own, grid, radius, focus, outside.x) - patience;
-            const float cost = search_window(a, b, (int2)(x, y), f, grid, radius, focus, outside.y);
+            if (total == 0.0f) { /* nothing is calculated where all agree */
+                total = search_weights(a, (int2)(x, y), grid, radius, focus, weights);
+                least = search_window(a, b, (int2)(x, y), own, grid, radius, weights, total, outside.x, INFINITY);
+                least -= patience;
+            }
+            const float cost = search_window(a, b, (int2)(x, y), f, grid, radius, weights, total, outside.y, least);
             if (cost < least) {
                 least = cost;
                 best = f;
