@@ -121,7 +121,7 @@ def _describe(path: Path, name: str, page: int, source: Any, place: tifftags.Pla
         file=path,
         has_alpha=rows.has_alpha,
         strip=rows.chunk,
-        compressed=spec.get_string_attribute("compression", "none") != "none",
+        compressed=spec.get_string_attribute("compression") != "none",
     )
 
 

@@ -104,7 +104,7 @@ class Layer:
     file        the file that `read` decodes; None for pixels in memory.
     has_alpha   False for a file without alpha: every pixel is valid.
     strip       rows that `read` decodes together, from row 0 on: it is fastest asked for whole ones.
-    compressed  in the file, so that reading again takes as long as it did.
+    compressed  True for a file that is: to read rows again is to decode them again.
     """
 
     name: str

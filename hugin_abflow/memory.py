@@ -53,7 +53,7 @@ def machine() -> int:
 
 
 def unused() -> int:
-    """Bytes that this process, or the system's file cache, can have without taking them from others."""
+    """Bytes that nobody uses, or this process's share of them; the system's file cache counts as not used."""
     return min(machine(), int(psutil.virtual_memory().available)) // _sharers
 
 

@@ -161,7 +161,7 @@ def _bands(
     visible = False
     with (
         spooled(layers) as layers,
-        # closed first: its threads read the layers
+        # ended first: its threads read the layers
         closing(method(device, layers, canvas, settings, progress, guides)) as bands,
     ):
         for rows in bands:

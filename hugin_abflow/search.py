@@ -50,9 +50,13 @@ class SearchParameters:
     gain_apart: float = 0.75
     textured: float = 0.02
     always: bool = False  # keep what is found, whatever becomes of it
-    # px from which flow is taken over, in turns, likewise: what comes from far came on coarser levels, and on
-    # finer ones more fits by chance
+    # px from which flow is taken over, in turns, likewise: short on finer levels, where the rails of a chair
+    # in the sample room took over what fits them by chance (benchmarks/RESULTS.md, Parts)
     steps: tuple[tuple[int, ...], ...] = ((6, 3, 1), (6, 3, 1), (16, 8, 4, 2, 1))
+
+    def __post_init__(self) -> None:
+        if max(self.radius) > 4:  # SEARCH_WINDOW of kernels/search.cl
+            raise ValueError(f"radius is {self.radius}; windows have a radius of at most 4")
 
 
 def descriptor(device: Device, feature: Buffer, grid: Grid, parameters: SearchParameters) -> Buffer:

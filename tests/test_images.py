@@ -250,6 +250,19 @@ class Counting:
         return self._source.read_scanlines(top, bottom, *rest)
 
 
+@pytest.mark.parametrize(
+    ("name", "compression", "compressed"),
+    [
+        ("a.tif", "none", False), ("a.tif", "lzw", True), ("a.tif", "zstd", True),
+        ("a.exr", "none", False), ("a.exr", "zip", True), ("a.png", None, True),
+    ],
+)  # fmt: skip
+def test_layers_tell_whether_their_files_are_compressed(tmp_path, name, compression, compressed):
+    dtype = np.float32 if name.endswith("exr") else np.uint8
+    write_image(tmp_path / name, noise(dtype, width=31, height=17), compression=compression)
+    assert read_layer(tmp_path / name).compressed == compressed
+
+
 @pytest.mark.parametrize("rows_per_strip", [7, 32, 40])
 def test_overlapping_bands_decode_each_row_once(tmp_path, monkeypatch, rows_per_strip):
     from hugin_abflow import images

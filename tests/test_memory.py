@@ -5,7 +5,9 @@ from __future__ import annotations
 import re
 import subprocess
 import sys
+from types import SimpleNamespace
 
+import psutil
 import pytest
 
 from hugin_abflow import memory
@@ -56,6 +58,19 @@ def test_processes_side_by_side_share_the_limit(monkeypatch: pytest.MonkeyPatch)
     assert remedy == "give 13M, or fewer --jobs"
     monkeypatch.setattr(memory, "machine", lambda: 64 * MIB)
     assert memory.shortage(0, 9 * MIB)[0].startswith("half of the machine's memory, 32.0 MiB, for each of 4")
+
+
+def test_processes_side_by_side_share_what_is_not_used(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(memory, "_sharers", 1)
+    monkeypatch.setattr(memory, "machine", lambda: 64 * MIB)
+    for available, whole in ((40 * MIB, 40 * MIB), (99 * MIB, 64 * MIB)):  # of the host; a container has less
+        monkeypatch.setattr(
+            psutil, "virtual_memory", lambda available=available: SimpleNamespace(available=available)
+        )
+        memory.share(1)
+        assert memory.unused() == whole
+        memory.share(4)
+        assert memory.unused() == whole // 4
 
 
 def test_a_container_has_less_than_the_machine(monkeypatch: pytest.MonkeyPatch, tmp_path) -> None:

@@ -154,9 +154,9 @@ def test_agree_refuses_what_repeats(device: Device) -> None:
 @pytest.mark.parametrize(("step", "radius"), [(1, 2), (4, 2), (3, 4)])
 def test_choose_equals_its_twin(device: Device, name: str, step: int, radius: int) -> None:
     grid = GRIDS[name]
-    a, b = descriptors(25, grid)
-    own = np.array([2, -1]) + 3 * noise(29, grid, 2, 2)
-    other = np.array([2, -1]) + 1.5 * noise(31, grid, 2, 2)
+    a, b = descriptors(125, grid)
+    own = np.array([2, -1]) + 3 * noise(129, grid, 2, 2)
+    other = np.array([2, -1]) + 1.5 * noise(131, grid, 2, 2)
     arguments = (a, b, own, other, grid, step, radius, 2.0, (0.25, 0.75), 0.06)
     expected = twin.search_choose(*arguments)
     assert 0.2 < (expected != own).any(-1).mean() < 0.95
@@ -274,7 +274,7 @@ def test_rails_before_a_near_surface_follow_the_frame_they_belong_to(device: Dev
         images = [on_device(device, image, np.ones(image.shape)) for image in (a, b)]
         forward, _ = flow.pair_flow(device, *images, quality.flow_parameters("normal", "on"))
         right.append((np.linalg.norm(forward.get()[rails] - (30, 0), axis=-1) < 2).mean())
-    assert np.mean(right) > 0.75  # .58 where none but coarser levels take over flow from beside
+    assert np.mean(right) > 0.68  # .53 where coarser levels alone take over flow from beside
 
 
 @pytest.mark.parametrize(("by", "kept"), [(33, True), (-33, False)])
@@ -328,3 +328,8 @@ def test_levels_of_the_search() -> None:
     assert search.reaches(200, 3, how) == {2: 10, 1: 7}
     assert search.reaches(18, 6, how, finest=1) == {1: 9}
     assert search.reaches(3, 6, how, finest=1) == {0: 3}
+
+
+def test_a_window_that_kernels_do_not_hold_is_refused() -> None:
+    with pytest.raises(ValueError, match="at most 4"):
+        search.SearchParameters(radius=(2, 5))

@@ -117,8 +117,10 @@ def full_disk(file: int, rows: memoryview, place: int) -> int:
     raise OSError(errno.ENOSPC, "no space left")
 
 
-def nearly_full_disk(write: Callable[[int, Any, int], int]) -> Callable[[int, memoryview, int], int]:
-    return lambda file, rows, place: write(file, rows[: 2 * WIDTH * 4 + 5], place)
+def nearly_full_disk(
+    write: Callable[[int, Any, int], int], left: int = 2 * WIDTH * 4 + 5
+) -> Callable[[int, memoryview, int], int]:
+    return lambda file, rows, place: write(file, rows[:left], place)
 
 
 @pytest.mark.parametrize("left", [0, 2])
@@ -131,6 +133,19 @@ def test_a_full_disk_costs_time_alone(monkeypatch: pytest.MonkeyPatch, left: int
             np.testing.assert_array_equal(kept.read(0, 9), want(0, 9))
         np.testing.assert_array_equal(kept.read(0, 2), want(0, 2))
     assert times[:2] == [1 + (2 if left else 3)] * 2  # `want` has read them, too
+
+
+@pytest.mark.parametrize("left", [0, 2 * WIDTH * 4 + 5])
+def test_what_was_not_written_is_not_recalled(monkeypatch: pytest.MonkeyPatch, left: int) -> None:
+    """The file goes on behind the layer, so that what is missing would be zeros."""
+    (a, _), (b, _) = counted("a"), counted("b", seed=1)
+    want, write = a.read(0, HEIGHT), os.pwrite
+    with spooled([a, b]) as (first, second):
+        second.read(0, HEIGHT)
+        monkeypatch.setattr(os, "pwrite", nearly_full_disk(write, left) if left else full_disk)
+        first.read(0, HEIGHT)
+        for row in range(HEIGHT):
+            np.testing.assert_array_equal(first.read(row, row + 1), want[row : row + 1])
 
 
 @pytest.mark.parametrize("failure", ["error", "short"])
@@ -193,3 +208,16 @@ def test_the_file_is_there_until_nobody_reads_layers(monkeypatch: pytest.MonkeyP
     rows.close()
     np.testing.assert_array_equal(first, again[0])
     assert times == [1] * HEIGHT
+
+
+def test_the_number_of_the_file_is_not_used_afterwards(root: Path) -> None:
+    """Threads may live on; then another file has it."""
+    layer, times = counted()
+    want = layer.read(0, HEIGHT)
+    with spooled([layer]) as (kept,):
+        kept.read(0, 5)
+    with (root / "other").open("w+b") as other:
+        for _ in range(2):
+            np.testing.assert_array_equal(kept.read(0, HEIGHT), want)
+        assert other.seek(0, os.SEEK_END) == 0
+    assert times == [4] * 5 + [3] * (HEIGHT - 5)
