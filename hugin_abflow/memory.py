@@ -52,11 +52,6 @@ def machine() -> int:
     return min(sizes)
 
 
-def unused() -> int:
-    """Bytes that nobody uses, or this process's share of them; the system's file cache counts as not used."""
-    return min(machine(), int(psutil.virtual_memory().available)) // _sharers
-
-
 _sharers = 1
 
 
@@ -69,6 +64,11 @@ def share(processes: int) -> None:
 def limit(max_memory: int) -> int:
     """Bytes that this process may take: its share of `max_memory`, or of half of the machine's for 0."""
     return (max_memory or machine() // 2) // _sharers
+
+
+def unused() -> int:
+    """Bytes that nobody uses, or this process's share of them; the system's file cache counts as not used."""
+    return min(machine(), int(psutil.virtual_memory().available)) // _sharers
 
 
 def shortage(max_memory: int, needed: int) -> tuple[str, str]:

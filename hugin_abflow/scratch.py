@@ -78,12 +78,13 @@ def _create(final: Path, suffix: str) -> tuple[Path, int | None]:
 @contextmanager
 def work_folder() -> Iterator[Path]:
     """A folder for temporary files under TMPDIR; nothing is left of it. Raises OSError."""
-    sweep(root())
+    parent = root()
+    sweep(parent)
     folder: Path | None = None
     descriptor: int | None = None
     try:
         while True:
-            folder = root() / f"hugin-abflow-{_HOST}-{secrets.token_hex(6)}"
+            folder = parent / f"hugin-abflow-{_HOST}-{secrets.token_hex(6)}"
             _ours.add(folder)
             folder.mkdir(0o700)
             descriptor = os.open(folder / _LOCK, os.O_CREAT | os.O_WRONLY, 0o600)

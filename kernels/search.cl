@@ -254,7 +254,7 @@ static inline float search_window(__global const float4 *a, __global const float
             grid_border(&p, grid);
             sum += weight * search_misfit(a[p.y * grid.x + p.x], search_sample(b, to, t, grid), outside);
         }
-        if (sum > least * total * 1.001f)
+        if (sum > least * total * 1.001f) /* by more than rounding could make up for */
             return INFINITY;
     }
     return sum / total;
