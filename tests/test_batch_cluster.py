@@ -53,7 +53,8 @@ def cluster(
         local = "--host", "127.0.0.1", "--no-dashboard", "--scheduler-file", file
         start("dask_scheduler", *local, "--port", 0)
         deadline = time.monotonic() + 60
-        while not file.exists() and time.monotonic() < deadline:
+        # the scheduler makes the file, and then fills it
+        while not (file.exists() and file.read_text().endswith("}")) and time.monotonic() < deadline:
             time.sleep(0.05)
         for _ in range(workers):
             start("dask_worker", *local, "--no-nanny", "--nthreads", 1)
