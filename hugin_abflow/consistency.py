@@ -1,13 +1,17 @@
 """Flow that leads back to where it started is trusted; elsewhere it is filled (kernels/consistency.cl).
 
 A flow from a to b and the flow from b to a undo each other where both are right. Where they do not
-(occlusions, surfaces without texture), and where something moved by itself (movers.py), flow is taken from
-the trusted flow around, near before far: a pyramid of trust-weighted means, from which every level fills the
-finer one.
+(occlusions, surfaces without texture, what lies beside the other image), and where something moved by itself
+(movers.py), flow is carried on from the trusted flow around, hardly across edges of the image: a thing keeps
+its motion up to its outline, and what is behind it has its own. It is a diffusion that stops at edges, solved
+coarse to fine on a pyramid of trust-weighted means, each level starting from the coarser one's solution
+(Bornemann, Deuflhard, "The cascadic multigrid method for elliptic problems", 1996). The place of what moved
+is filled with wide means instead: what is beside it was matched half with it.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -15,33 +19,54 @@ import numpy as np
 from hugin_abflow.geometry import PairFlow
 from hugin_abflow.movers import CELL, Mask, Movers
 from hugin_abflow.opencl import Buffer, Device
+from hugin_abflow.pyramid import Level
 
-# Pixels between start and return that leave a quarter of the trust.
-_TOLERANCE = 1.5
+# Pixels between start and return that leave a sixteenth of the trust. What is far off must leave next to
+# nothing: many such pixels would outweigh the few around them.
+_TOLERANCE = 2.2
+# What a fully trusted pixel's own flow counts, against what one neighbour has to say.
+_OWN = 20.0
+# Difference of log brightness between neighbours that halves what is carried from one to the other, and what
+# is carried across any edge: what is enclosed by edges is filled, too.
+_EDGE = (0.08, 0.003)
+# Sweeps per level, and how far each goes (successive over-relaxation). A few are enough, as they begin near
+# the solution; on levels of fewer pixels than this nothing is told apart.
+_SWEEPS, _RELAXATION, _LEAST_PIXELS = 4, 1.5, 64
 
 
-def mend(device: Device, pair: PairFlow, moved: Movers | None = None) -> PairFlow:
-    """The pair's flows, filled where they disagree and where things moved by themselves."""
+def mend(device: Device, pair: PairFlow, images: Sequence[Level], moved: Movers | None = None) -> PairFlow:
+    """The pair's flows, filled where they disagree and where things moved by themselves.
+
+    images: log brightness of both layers on the pair's chart.
+    """
     wraps = pair.chart.wraps
     first, second = (moved.first, moved.second) if moved else (None, None)
-    forward = _fill(device, trust(device, pair.forward, pair.backward, wraps, first), wraps)
-    backward = _fill(device, trust(device, pair.backward, pair.forward, wraps, second), wraps)
+    a, b = (level.image for level in images)
+    forward = _fill(device, trust(device, pair.forward, pair.backward, wraps, a, first), wraps, bool(moved))
+    backward = _fill(device, trust(device, pair.backward, pair.forward, wraps, b, second), wraps, bool(moved))
     return replace(pair, forward=forward, backward=backward)
 
 
-def trust(device: Device, flow: Buffer, back: Buffer, wraps: bool, moved: Mask | None = None) -> Buffer:
-    """float32 (height, width, 4): flow in px, trust 0..1, and an unused 0. moved: cells that have none."""
+def trust(
+    device: Device, flow: Buffer, back: Buffer, wraps: bool, image: Buffer, moved: Mask | None = None
+) -> Buffer:
+    """float32 (height, width, 4): flow in px, trust 0..1, and brightness, which tells where edges are.
+
+    image: log brightness of the layer that the flow starts on, float32 (height, width). moved: cells that
+    have no trust, and whose brightness tells nothing.
+    """
     trusted = device.empty((*flow.shape[:2], 4))
     grid = _grid(flow, wraps)
     distrusted = device.upload(np.zeros((1, 1), np.uint8) if moved is None else moved.astype(np.uint8))
     cells = (*distrusted.shape[::-1], CELL, 0)
     device.run(
-        "consistency", "consistency_trust", grid[:2], flow, back, grid, _TOLERANCE, distrusted, cells, trusted
-    )
+        "consistency", "consistency_trust", grid[:2], flow, back, grid, _TOLERANCE, distrusted, cells, image,
+        trusted,
+    )  # fmt: skip
     return trusted
 
 
-def _fill(device: Device, trusted: Buffer, wraps: bool) -> Buffer:
+def _fill(device: Device, trusted: Buffer, wraps: bool, moved: bool) -> Buffer:
     levels = [trusted]
     while max(levels[-1].shape[:2]) > 1:
         fine = levels[-1]
@@ -49,13 +74,31 @@ def _fill(device: Device, trusted: Buffer, wraps: bool) -> Buffer:
         size = _grid(small, wraps)[:2]
         device.run("consistency", "consistency_push", size, fine, _grid(fine, wraps), small, size)
         levels.append(small)
-    for coarse, fine in zip(levels[:0:-1], levels[-2::-1], strict=True):
-        grid = _grid(fine, wraps)
-        device.run("consistency", "consistency_pull", grid[:2], fine, grid, coarse, _grid(coarse, wraps))
-    mended = device.empty((*trusted.shape[:2], 2))
+    filled = _carried(device, levels, wraps, _OWN)
+    around = _carried(device, levels, wraps, 0.0) if moved else filled
     grid = _grid(trusted, wraps)
-    device.run("consistency", "consistency_flow", grid[:2], levels[0], grid, mended)
-    return mended
+    device.run("consistency", "consistency_mix", grid[:2], trusted, grid, around, filled)
+    return filled
+
+
+def _carried(device: Device, levels: Sequence[Buffer], wraps: bool, own: float) -> Buffer:
+    """The finest level's flow, filled coarse to fine. own: what trust counts there, against one neighbour; 0:
+    nothing but wide means of what is around.
+    """
+    coarse = device.zeros((1, 1, 2))
+    for number, level in reversed([*enumerate(levels)]):
+        grid, counts = _grid(level, wraps), own * 4.0**number
+        filled = device.empty((*level.shape[:2], 2))
+        device.run(
+            "consistency", "consistency_pull", grid[:2], level, grid, counts, coarse, _grid(coarse, wraps),
+            filled,
+        )  # fmt: skip
+        if own and grid[0] * grid[1] >= _LEAST_PIXELS:
+            calls = [(level, grid, counts, _EDGE, colour, _RELAXATION, filled) for colour in (0, 1)]
+            half = (-(-grid[0] // 2), grid[1])
+            device.repeat("consistency", "consistency_relax", half, calls, _SWEEPS)
+        coarse = filled
+    return coarse
 
 
 def _grid(buffer: Buffer, wraps: bool) -> tuple[int, int, int, int]:

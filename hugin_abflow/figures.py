@@ -36,7 +36,7 @@ class Parallax:
 def parallax(device: Device, pair: PairFlow, levels: Sequence[Level], grid: Grid) -> Parallax:
     """Of a pair's flow as it was found, before it is mended; levels: both layers on the pair's chart."""
     both = np.logical_and(*(level.mask.get() > 0 for level in levels))
-    trusted = trust(device, pair.forward, pair.backward, pair.chart.wraps).get()
+    trusted = trust(device, pair.forward, pair.backward, pair.chart.wraps, levels[0].image).get()
     sure = both & (trusted[..., 2] >= _SURE)
     if not sure.any():
         return Parallax(0.0, 0.0, 0.0)

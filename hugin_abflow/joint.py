@@ -46,6 +46,7 @@ from hugin_abflow.layer import Canvas, Layer
 from hugin_abflow.movers import Movers
 from hugin_abflow.opencl import Buffer, Device, DeviceMemoryError
 from hugin_abflow.progress import Progress
+from hugin_abflow.pyramid import Level
 from hugin_abflow.settings import Settings
 from hugin_abflow.working import Grid, WorkingLayer
 
@@ -154,8 +155,6 @@ def prepare(
         else ([], [], [])
     )
     with progress("align", 1) as advance:
-        for index, pair_flow in enumerate(flows):  # one by one: they are large
-            flows[index] = consistency.mend(device, pair_flow, moving[index])
         moved = _moved(flows, moving, grid)
         pairs = [pair for pair, _ in overlaps]
         fields, correction, whole = _align(device, reduced, pairs, flows, moved, masks, grid, settings)
@@ -390,7 +389,7 @@ def _flows(
     guides: Mapping[tuple[int, int], Sequence[Guide]],
     numbers: Sequence[int],
 ) -> tuple[list[PairFlow], list[figures.Parallax], list[Movers | None]]:
-    """Flow of every pair of layers, on the pair's own chart; figures of it, if somebody listens; and movers.
+    """Flow of every pair of layers, on its own chart, mended; figures of it, if somebody listens; and movers.
 
     overlaps    the pairs, and where they overlap on the grid of `masks`.
     guides      of each two layers, by their numbers; numbers: what guides call each of `layers`.
@@ -399,8 +398,15 @@ def _flows(
     coarse = quality.coarseness(settings.flow_quality, grid.width * grid.height)
     largest = _REACH * (grid.canvas_width or grid.region.width) * grid.width / grid.region.width
     reach = largest / coarse if settings.large_motion != "off" else 0.0
-    result, shifts = [], []
-    moving: list[Future[Movers | None]] = []
+    result, moving, shifts = list[PairFlow](), list[Movers | None](), list[figures.Parallax]()
+    waiting: list[tuple[PairFlow, tuple[Level, Level], Future[Movers | None] | None]] = []
+
+    def mend() -> None:
+        while waiting:  # one at most: a pair's images are large
+            pair, images, job = waiting.pop()
+            moving.append(job.result() if job else None)
+            result.append(consistency.mend(device, pair, images, moving[-1]))
+
     with (
         ThreadPoolExecutor(1, "chart") as drawing,
         ThreadPoolExecutor(1, "movers") as looking,
@@ -408,31 +414,31 @@ def _flows(
     ):
         charts = drawing.map(lambda overlap: chart.pair_chart(overlap[1], masks.grid, grid, coarse), overlaps)
         for (pair, _), its_chart in zip(overlaps, charts, strict=True):
-            its_layers = (layers[pair.a], layers[pair.b])
-            image_a, image_b = (chart.sample(device, layer, grid, its_chart) for layer in its_layers)
+            sample = partial(chart.sample, device, grid=grid, chart=its_chart)
+            images = sample(layers[pair.a]), sample(layers[pair.b])
             bearings = its_chart.eye.bearings if its_chart.eye else None
-            solved = flow.solve(device, image_a, image_b, parameters, reach=reach, bearings=bearings)
+            solved = flow.solve(device, *images, parameters, reach=reach, bearings=bearings)
             found = (solved.forward, solved.backward)
             first, second = numbers[pair.a], numbers[pair.b]
             its_guides = guides.get((min(first, second), max(first, second)), ())
             placed = guidance.on_chart(its_guides, first, its_chart, grid)
             if its_guides:
-                found = guidance.lead(device, (image_a, image_b), found, placed, its_chart.around(grid))
-            if settings.seam and settings.movers and its_chart.eye:  # which all of a canvas have, or none
-                if moving:
-                    moving[-1].result()  # one pair's arrays at a time
-                views = (movers.View.of(image_a), movers.View.of(image_b))
-                arrays = (found[0].get(), found[1].get())
-                vouched = (placed.at_a, placed.at_b)
-                moving.append(looking.submit(movers.find, its_chart, arrays, views, vouched, solved.refused))
-            result.append(PairFlow(pair.a, pair.b, its_chart, *found))
+                found = guidance.lead(device, images, found, placed, its_chart.around(grid))
+            its_flow = PairFlow(pair.a, pair.b, its_chart, *found)
+            mend()
+            job = None
+            if settings.seam and settings.movers and its_chart.eye:
+                views = (movers.View.of(images[0]), movers.View.of(images[1]))
+                arrays, vouched = (found[0].get(), found[1].get()), (placed.at_a, placed.at_b)
+                job = looking.submit(movers.find, its_chart, arrays, views, vouched, solved.refused)
+            waiting.append((its_flow, images, job))
             if _log.isEnabledFor(logging.INFO):
-                shifts.append(figures.parallax(device, result[-1], (image_a, image_b), grid))
+                shifts.append(figures.parallax(device, its_flow, images, grid))
             advance(1)
+        mend()
         device.finish()  # kernels are only queued: the last pair's time would be told as that of what follows
-        moved = [job.result() for job in moving] or [None] * len(result)
     device.give_back()
-    return result, shifts, moved
+    return result, shifts, moving
 
 
 def _moved(flows: Sequence[PairFlow], moving: Sequence[Movers | None], grid: Grid) -> seam.Cells | None:

@@ -1,15 +1,20 @@
 /* Where the two flows of a pair do not lead back to the start they are not to be trusted; there flow is filled
-   from where it is. */
+   from where it is: coarse to fine, on every level by sweeps that carry it on, but hardly across edges of the
+   image. Where something moved by itself, edges are its own and tell nothing of what is around. */
 
-/* Trust in a flow, 1 / (1 + (e / tolerance)^2)^2 with e = |F_ab(q) + F_ba(q + F_ab(q))|; none in that of what
+/* Brightness of what tells nothing. */
+#define UNTOLD 1e3f
+
+/* Trust in a flow, 1 / (1 + (e / tolerance)^2)^4 with e = |F_ab(q) + F_ba(q + F_ab(q))|; none in that of what
    moved by itself. */
 __kernel void consistency_trust(__global const float2 *flow, /* (grid.y, grid.x) F_ab, px */
                                 __global const float2 *back, /* (grid.y, grid.x) F_ba, px */
                                 int4 grid,                   /* width, height, wraps, 0; run size */
-                                float tolerance,             /* px that leave a quarter of the trust */
+                                float tolerance,             /* px that leave a sixteenth of the trust */
                                 __global const uchar *moved, /* (cells.y, cells.x): what moved by itself */
                                 int4 cells,                  /* width, height, px of the chart per cell, 0 */
-                                __global float4 *trusted)    /* (grid.y, grid.x) F_ab, trust, 0 */
+                                __global const float *image, /* (grid.y, grid.x) a: log brightness */
+                                __global float4 *trusted)    /* (grid.y, grid.x) F_ab, trust, brightness */
 {
     const int x = get_global_id(0), y = get_global_id(1);
     if (x >= grid.x || y >= grid.y)
@@ -24,11 +29,12 @@ __kernel void consistency_trust(__global const float2 *flow, /* (grid.y, grid.x)
     const float2 e = (f + bilinear_flow(back, q, grid)) / tolerance;
     const float c = 1.0f / (1.0f + square2(e));
     const int column = LEAST(x / cells.z, cells.x - 1), row = LEAST(y / cells.z, cells.y - 1);
-    trusted[at] = (float4)(f, moved[row * cells.x + column] ? 0.0f : c * c, 0.0f);
+    const bool by_itself = moved[row * cells.x + column];
+    trusted[at] = (float4)(f, by_itself ? 0.0f : c * c * c * c, by_itself ? UNTOLD : image[at]);
 }
 
-/* Halve: the mean flow, weighted by trust, and the mean trust; taps as in pyramid_reduce. */
-__kernel void consistency_push(__global const float4 *trusted, /* (fine.y, fine.x) flow, trust, 0 */
+/* Halve: the mean flow, weighted by trust, the mean trust and the mean brightness; taps as in pyramid_reduce. */
+__kernel void consistency_push(__global const float4 *trusted, /* (fine.y, fine.x) flow, trust, brightness */
                                int4 fine,                      /* width, height, wraps, 0 */
                                __global float4 *small,         /* (size.y, size.x), flow in px of the finest */
                                int2 size)                      /* run size */
@@ -38,7 +44,7 @@ __kernel void consistency_push(__global const float4 *trusted, /* (fine.y, fine.
         return;
     const float taps[4] = {0.125f, 0.375f, 0.375f, 0.125f};
     float2 sum = (float2)(0.0f);
-    float trust = 0.0f, weight = 0.0f;
+    float trust = 0.0f, brightness = 0.0f, told = 0.0f, weight = 0.0f;
     for (int j = 0; j < 4; ++j)
         for (int i = 0; i < 4; ++i) {
             int2 p = (int2)(2 * x - 1 + i, 2 * y - 1 + j);
@@ -48,33 +54,81 @@ __kernel void consistency_push(__global const float4 *trusted, /* (fine.y, fine.
             const float w = taps[i] * taps[j];
             sum += w * f.z * f.xy;
             trust += w * f.z;
+            const float tells = f.w < UNTOLD ? w : 0.0f;
+            brightness += tells * f.w;
+            told += tells;
             weight += w;
         }
-    small[y * size.x + x] = (float4)(trust > 0.0f ? sum / trust : (float2)(0.0f), trust / weight, 0.0f);
+    small[y * size.x + x] = (float4)(trust > 0.0f ? sum / trust : (float2)(0.0f), trust / weight,
+                                     told > 0.0f ? brightness / told : UNTOLD);
 }
 
-/* Give a level, in place, from the filled coarser one what it does not trust itself. */
-__kernel void consistency_pull(__global float4 *trusted,      /* (fine.y, fine.x) flow, trust, 0: flow is mended */
-                               int4 fine,                     /* width, height, wraps, 0; run size */
-                               __global const float4 *coarse, /* (size.y, size.x) */
-                               int4 size)                     /* width, height, wraps, 0 */
+/* With what a level starts: its own flow as far as that is trusted, else the coarser one's. */
+__kernel void consistency_pull(__global const float4 *trusted, /* (fine.y, fine.x) flow, trust, brightness */
+                               int4 fine,                      /* width, height, wraps, 0; run size */
+                               float own, /* what trust counts, against one neighbour; 0: as its share of 1 */
+                               __global const float2 *coarse, /* (size.y, size.x) filled flow */
+                               int4 size,                     /* width, height, wraps, 0 */
+                               __global float2 *filled)       /* (fine.y, fine.x) */
 {
     const int x = get_global_id(0), y = get_global_id(1);
     if (x >= fine.x || y >= fine.y)
         return;
-    const float4 own = trusted[y * fine.x + x];
-    int4 at;
-    const float4 w = bilinear_taps(0.5f * (float2)(x + 0.5f, y + 0.5f), size, &at);
-    const float4 sum = w.x * coarse[at.x] + w.y * coarse[at.y] + w.z * coarse[at.z] + w.w * coarse[at.w];
-    trusted[y * fine.x + x].xy = own.z * own.xy + (1.0f - own.z) * sum.xy;
+    const float4 its = trusted[y * fine.x + x];
+    const float2 below = bilinear_flow(coarse, 0.5f * (float2)(x + 0.5f, y + 0.5f), size);
+    const float share = own > 0.0f ? own * its.z / (own * its.z + 1.0f) : its.z;
+    filled[y * fine.x + x] = share * its.xy + (1.0f - share) * below;
 }
 
-/* The flow alone. */
-__kernel void consistency_flow(__global const float4 *trusted, /* (grid.y, grid.x) flow, trust, 0 */
-                               int4 grid,                      /* run size */
-                               __global float2 *flow)          /* (grid.y, grid.x) px */
+/* How well flow is carried from a pixel to the next, by their brightness: 1 where it is equal. */
+static inline float conductance(float a, float b, float2 edge) {
+    const float d = GREATEST(a, b) < UNTOLD ? (a - b) / edge.x : 0.0f;
+    return 1.0f / (1.0f + d * d) + edge.y;
+}
+
+/* Half a sweep, in place: each pixel of one colour of a chessboard goes to, and beyond, the mean of its own flow,
+   as far as it is trusted, and its neighbours'. Around a grid of odd width pixels of one colour would meet:
+   nothing is carried there. */
+__kernel void consistency_relax(__global const float4 *trusted, /* (grid.y, grid.x) flow, trust, brightness */
+                                int4 grid,                      /* width, height, wraps, 0; run size: half as wide */
+                                float own,                      /* what trust counts, against one neighbour */
+                                float2 edge,      /* difference of log brightness that halves what is carried, and
+                                                     what is carried across any */
+                                int colour,       /* 0 or 1 */
+                                float relaxation, /* how far to go: 1 to the mean */
+                                __global float2 *filled) /* (grid.y, grid.x) */
+{
+    const int y = get_global_id(1), x = 2 * (int)get_global_id(0) + (y + colour) % 2;
+    if (x >= grid.x || y >= grid.y)
+        return;
+    const int at = y * grid.x + x, turn = grid.z && grid.x % 2 == 0 ? grid.x : 0;
+    const int beside[4] = {x > 0 ? at - 1 : at - 1 + turn, x < grid.x - 1 ? at + 1 : at + 1 - turn,
+                           at - grid.x, at + grid.x};
+    const bool there[4] = {x > 0 || turn, x < grid.x - 1 || turn, y > 0, y < grid.y - 1};
+    const float4 its = trusted[at];
+    float2 sum = own * its.z * its.xy;
+    float weight = own * its.z;
+    for (int i = 0; i < 4; ++i) {
+        const int n = there[i] ? beside[i] : at;
+        const float w = there[i] ? conductance(trusted[n].w, its.w, edge) : 0.0f;
+        sum += w * filled[n];
+        weight += w;
+    }
+    const float2 old = filled[at];
+    filled[at] = weight > 0.0f ? old + relaxation * (sum / weight - old) : old;
+}
+
+/* The flow where it is trusted, else what was filled in, in place. */
+__kernel void consistency_mix(__global const float4 *trusted, /* (grid.y, grid.x) flow, trust, brightness */
+                              int4 grid,                      /* run size */
+                              __global const float2 *around,  /* (grid.y, grid.x) for what moved by itself */
+                              __global float2 *filled)        /* (grid.y, grid.x) for all else */
 {
     const int x = get_global_id(0), y = get_global_id(1);
-    if (x < grid.x && y < grid.y)
-        flow[y * grid.x + x] = trusted[y * grid.x + x].xy;
+    if (x >= grid.x || y >= grid.y)
+        return;
+    const int at = y * grid.x + x;
+    const float4 its = trusted[at];
+    const float2 other = its.w < UNTOLD ? filled[at] : around[at];
+    filled[at] = its.z * its.xy + (1.0f - its.z) * other;
 }

@@ -17,6 +17,7 @@ from hugin_abflow.chart import Chart, pair_chart
 from hugin_abflow.geometry import PairFlow
 from hugin_abflow.movers import CELL, Movers
 from hugin_abflow.opencl import Device
+from hugin_abflow.pyramid import Level
 from hugin_abflow.working import Grid
 
 SIZES = [(77, 53), (64, 31), (5, 3), (1, 7), (1, 1)]
@@ -43,12 +44,18 @@ def moved_cells(seed: int, width: int, height: int) -> np.ndarray:
 
 
 def random_trusted(seed: int, width: int, height: int) -> np.ndarray:
-    """Flow, trust 0..1 with patches of none, and 0."""
+    """Flow, trust 0..1 with patches of none, and brightness with steps and patches that tell nothing."""
     random = np.random.default_rng(seed)
     trusted = random.normal(size=(height, width, 4)).astype(np.float32) * 3
     trusted[..., 2] = random.random((height, width)) * patches(seed, width, height, 0.6)
-    trusted[..., 3] = 0
+    trusted[..., 3] = random.normal(size=(height, width)) * 0.05 + patches(seed + 1, width, height, 0.5) * 0.7
+    trusted[patches(seed + 2, width, height, 0.15) > 0, 3] = twin.UNTOLD
     return trusted
+
+
+def random_filled(seed: int, width: int, height: int) -> np.ndarray:
+    """Flow without holes."""
+    return np.random.default_rng(seed).normal(size=(height, width, 2)).astype(np.float32) * 3
 
 
 def on_tiles(values: np.ndarray, wraps: bool, by: int = 8) -> np.ndarray:
@@ -65,15 +72,18 @@ def read_at(values: np.ndarray, x: np.ndarray, y: np.ndarray, wraps: bool, by: i
 @pytest.mark.parametrize("wraps", WRAPS)
 def test_twin_of_trust_is_the_formula(wraps: bool) -> None:
     flow, back = (smooth_flow(k, 77, 53, 6.0, wraps).astype(np.float64) for k in (0, 1))
-    trusted = twin.consistency_trust(flow, back, (77, 53, int(wraps), 0), 1.5, *NOTHING)
+    image = np.random.default_rng(2).normal(size=(53, 77))
+    trusted = twin.consistency_trust(flow, back, (77, 53, int(wraps), 0), 1.5, *NOTHING, image)
     columns, rows = common.pixels(77, 53)
     there = columns + 0.5 + flow[..., 0], rows + 0.5 + flow[..., 1]
     u, v = (read_at(back[..., k], *there, wraps) for k in (0, 1))
     squared = (flow[..., 0] + u) ** 2 + (flow[..., 1] + v) ** 2
-    assert np.allclose(trusted[..., 2], 1 / (1 + squared / 1.5**2) ** 2)
+    assert np.allclose(trusted[..., 2], 1 / (1 + squared / 1.5**2) ** 4)
     assert np.array_equal(trusted[..., :2], flow)
-    off = np.array([[[1.5, 0.0]]])  # 1.5 px from the start: a quarter
-    assert twin.consistency_trust(off, 0 * off, (1, 1, 0, 0), 1.5, *NOTHING)[0, 0, 2] == pytest.approx(0.25)
+    assert np.array_equal(trusted[..., 3], image)
+    off = np.array([[[1.5, 0.0]]])  # 1.5 px from the start: a sixteenth
+    little = twin.consistency_trust(off, 0 * off, (1, 1, 0, 0), 1.5, *NOTHING, np.zeros((1, 1)))
+    assert little[0, 0, 2] == pytest.approx(1 / 16)
 
 
 @pytest.mark.parametrize("size", SIZES)
@@ -82,20 +92,23 @@ def test_twin_of_trust_has_none_in_what_moved(size: tuple[int, int]) -> None:
     moved, still = moved_cells(4, *size), np.zeros((size[1], size[0], 2))
     rows, columns = moved.shape
     grid, cells = (*size, 0, 0), (columns, rows, CELL, 0)
-    trusted = twin.consistency_trust(still, still, grid, 1.5, moved, cells)
+    trusted = twin.consistency_trust(still, still, grid, 1.5, moved, cells, still[..., 0])
     for y, x in np.ndindex(trusted.shape[:2]):
         its = moved[min(y // CELL, rows - 1), min(x // CELL, columns - 1)]
-        assert trusted[y, x, 2] == (0 if its else 1)
+        assert tuple(trusted[y, x, 2:]) == ((0, twin.UNTOLD) if its else (1, 0))
 
 
 @pytest.mark.parametrize("size", SIZES)
 @pytest.mark.parametrize("wraps", WRAPS)
 def test_trust_equals_its_twin(device: Device, size: tuple[int, int], wraps: bool) -> None:
     flow, back = (smooth_flow(k, *size, 6.0, wraps) for k in (2, 3))
+    image = random_trusted(4, *size)[..., 3]
     for moved in (None, moved_cells(5, *size), moved_cells(6, *size)):
-        kernel = consistency.trust(device, device.upload(flow), device.upload(back), wraps, moved).get()
+        uploaded = device.upload(flow), device.upload(back), wraps, device.upload(image)
+        kernel = consistency.trust(device, *uploaded, moved).get()
         given = NOTHING if moved is None else (moved, (*moved.shape[::-1], CELL, 0))
-        expected = twin.consistency_trust(flow, back, (*size, int(wraps), 0), consistency._TOLERANCE, *given)
+        grid = (*size, int(wraps), 0)
+        expected = twin.consistency_trust(flow, back, grid, consistency._TOLERANCE, *given, image)
         assert np.array_equal(kernel[..., :2], flow)
         assert_close(kernel, expected, POSITION)
         none = expected[..., 2] == 0
@@ -113,7 +126,7 @@ def test_twin_of_push_is_a_weighted_mean(wraps: bool, width: int) -> None:
     taps = [1 / 8, 3 / 8, 3 / 8, 1 / 8]
     assert small.shape == (6, (width + 1) // 2, 4)
     for row, column in np.ndindex(small.shape[:2]):
-        flows, trusts, weights = [], [], []
+        flows, trusts, bright, weights, told = [], [], [], [], []
         for j in range(4):
             for i in range(4):
                 x, y = 2 * column - 1 + i, 2 * row - 1 + j
@@ -121,13 +134,18 @@ def test_twin_of_push_is_a_weighted_mean(wraps: bool, width: int) -> None:
                     own = trusted[y, x % width]
                     flows.append(own[:2])
                     trusts.append(own[2])
+                    bright.append(own[3])
                     weights.append(taps[i] * taps[j])
+                    told.append(weights[-1] * (own[3] < twin.UNTOLD))
         assert small[row, column, 2] == pytest.approx(np.average(trusts, weights=weights))
+        expected = np.average(bright, weights=told) if sum(told) else twin.UNTOLD
+        assert small[row, column, 3] == pytest.approx(expected)
         counted = np.multiply(weights, trusts)
         mean = counted @ np.array(flows) / counted.sum() if counted.sum() else np.zeros(2)
         assert np.allclose(small[row, column, :2], mean)
     assert (small[..., 2] == 0).any()
     assert (small[..., 2] > 0.3).any()
+    assert (small[..., 3] == twin.UNTOLD).any()
 
 
 @pytest.mark.parametrize("size", SIZES)
@@ -142,33 +160,78 @@ def test_push_equals_its_twin(device: Device, size: tuple[int, int], wraps: bool
 
 @pytest.mark.parametrize("wraps", WRAPS)
 @pytest.mark.parametrize("width", [76, 77])
-def test_twin_of_pull_mixes_with_scipys_zoom(wraps: bool, width: int) -> None:
-    trusted, coarse = random_trusted(6, width, 11), random_trusted(7, (width + 1) // 2, 6)
+@pytest.mark.parametrize("own", [3.0, 0.0])
+def test_twin_of_pull_mixes_with_scipys_zoom(own: float, width: int, wraps: bool) -> None:
+    trusted, coarse = random_trusted(6, width, 11), random_filled(7, (width + 1) // 2, 6)
     grids = (width, 11, int(wraps), 0), ((width + 1) // 2, 6, int(wraps), 0)
-    pulled = twin.consistency_pull(trusted, grids[0], coarse, grids[1])
+    pulled = twin.consistency_pull(trusted, grids[0], own, coarse, grids[1])
     columns, rows = common.pixels(width, 11)
     for k in (0, 1):
         below = read_at(coarse[..., k].astype(np.float64), (columns + 0.5) / 2, (rows + 0.5) / 2, wraps)
-        expected = below + trusted[..., 2] * (trusted[..., k] - below)
-        assert np.allclose(pulled[..., k], expected, atol=1e-5)
-    assert np.array_equal(pulled[..., 2:], trusted[..., 2:])
+        share = 1 - 1 / (1 + own * trusted[..., 2]) if own else trusted[..., 2]
+        assert np.allclose(pulled[..., k], below + share * (trusted[..., k] - below), atol=1e-5)
 
 
 @pytest.mark.parametrize("size", SIZES)
 @pytest.mark.parametrize("wraps", WRAPS)
-def test_pull_equals_its_twin(device: Device, size: tuple[int, int], wraps: bool) -> None:
+@pytest.mark.parametrize("own", [20.0, 0.0])
+def test_pull_equals_its_twin(device: Device, size: tuple[int, int], wraps: bool, own: float) -> None:
     half = ((size[0] + 1) // 2, (size[1] + 1) // 2)
-    trusted, coarse = random_trusted(8, *size), random_trusted(9, *half)
-    level, grids = device.upload(trusted), ((*size, int(wraps), 0), (*half, int(wraps), 0))
-    device.run("consistency", "consistency_pull", size, level, grids[0], device.upload(coarse), grids[1])
-    assert_close(level.get(), twin.consistency_pull(trusted, grids[0], coarse, grids[1]), 10 * SUM)
+    trusted, coarse = random_trusted(8, *size), random_filled(9, *half)
+    filled, grids = device.empty((*size[::-1], 2)), ((*size, int(wraps), 0), (*half, int(wraps), 0))
+    level, below = device.upload(trusted), device.upload(coarse)
+    device.run("consistency", "consistency_pull", size, level, grids[0], own, below, grids[1], filled)
+    assert_close(filled.get(), twin.consistency_pull(trusted, grids[0], own, coarse, grids[1]), 10 * SUM)
 
 
-def test_flow_equals_its_twin(device: Device) -> None:
-    trusted = random_trusted(10, 77, 53)
-    flow = device.empty((53, 77, 2))
-    device.run("consistency", "consistency_flow", (77, 53), device.upload(trusted), (77, 53, 0, 0), flow)
-    assert np.array_equal(flow.get(), twin.consistency_flow(trusted))
+@pytest.mark.parametrize("wraps", WRAPS)
+@pytest.mark.parametrize("width", [12, 13])
+def test_twin_of_sweeps_ends_at_scipys_solution(wraps: bool, width: int) -> None:
+    """Of the linear system: each pixel is drawn to its own flow and to its neighbours, less across edges."""
+    height, own, edge = 7, 20.0, (0.08, 0.003)
+    trusted = random_trusted(11, width, height).astype(np.float64)
+    counts = own * trusted[..., 2].ravel()
+    number = np.arange(width * height).reshape(height, width)
+    joints = [(number[:, :-1], number[:, 1:]), (number[:-1], number[1:])]
+    if wraps and width % 2 == 0:
+        joints.append((number[:, -1:], number[:, :1]))
+    matrix = np.diag(counts)
+    for one, other in joints:
+        for i, j in zip(one.ravel(), other.ravel(), strict=True):
+            ends = trusted[..., 3].ravel()[[i, j]]
+            difference = 0 if twin.UNTOLD in ends else ends[0] - ends[1]
+            carried = edge[0] ** 2 / (edge[0] ** 2 + difference**2) + edge[1]
+            matrix[[i, j, i, j], [i, j, j, i]] += np.array([1, 1, -1, -1]) * carried
+    expected = np.linalg.solve(matrix, counts[:, None] * trusted[..., :2].reshape(-1, 2))
+    filled = random_filled(12, width, height).astype(np.float64)
+    for sweep in range(1200):
+        filled = twin.consistency_relax(
+            trusted, (width, height, int(wraps), 0), own, edge, sweep % 2, 1.5, filled
+        )
+    assert np.allclose(filled.reshape(-1, 2), expected, atol=1e-6)
+    assert np.abs(expected).max() > 1
+
+
+@pytest.mark.parametrize("size", SIZES)
+@pytest.mark.parametrize("wraps", WRAPS)
+@pytest.mark.parametrize("colour", [0, 1])
+def test_sweep_equals_its_twin(device: Device, size: tuple[int, int], wraps: bool, colour: int) -> None:
+    trusted, filled = random_trusted(13, *size), random_filled(14, *size)
+    how = (*size, int(wraps), 0), 20.0, (0.08, 0.003), colour, 1.5
+    level, result = device.upload(trusted), device.upload(filled)
+    device.run("consistency", "consistency_relax", (-(-size[0] // 2), size[1]), level, *how, result)
+    expected = twin.consistency_relax(trusted, *how, filled)
+    assert_close(result.get(), expected, 10 * SUM)
+    rest = np.add(*common.pixels(*size)) % 2 != colour
+    assert np.array_equal(result.get()[rest], filled[rest])
+    assert size == (1, 1) or (result.get() != filled).any()
+
+
+def test_mix_equals_its_twin(device: Device) -> None:
+    trusted, around, filled = random_trusted(10, 77, 53), random_filled(11, 77, 53), random_filled(12, 77, 53)
+    level, wide, result = (device.upload(values) for values in (trusted, around, filled))
+    device.run("consistency", "consistency_mix", (77, 53), level, (77, 53, 0, 0), wide, result)
+    assert_close(result.get(), twin.consistency_mix(trusted, around, filled), SUM)
 
 
 # The module
@@ -184,10 +247,14 @@ def mended(
     forward: np.ndarray,
     backward: np.ndarray,
     moved: Movers | None = None,
+    image: np.ndarray | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:
-    flows = (device.upload(flow.astype(np.float32)) for flow in (forward, backward))
+    """Both flows mended; image: what both layers show, on the chart; else nothing."""
+    flows = [device.upload(flow.astype(np.float32)) for flow in (forward, backward)]
     pair = PairFlow(0, 1, chart_of(grid), *flows)
-    result = consistency.mend(device, pair, moved)
+    shown = np.zeros(forward.shape[:2]) if image is None else image
+    level = Level(device.upload(shown.astype(np.float32)), device.zeros(shown.shape), pair.chart.wraps)
+    result = consistency.mend(device, pair, (level, level), moved)
     assert (result.a, result.b, result.chart) == (0, 1, pair.chart)
     return result.forward.get(), result.backward.get()
 
@@ -292,6 +359,35 @@ def test_near_flow_counts_before_far(device: Device) -> None:
     assert np.abs(result[:, 54:56] - [6.0, 0.0]).max() < 1.5
     middle = result[30, 44:56, 0]
     assert (np.diff(middle) > -0.2).all()
+
+
+def test_a_thing_keeps_its_motion_up_to_its_outline(device: Device) -> None:
+    """A band of no trust goes across a bright thing and what is behind it: each is filled with its own."""
+    grid = plane(97, 61)
+    columns, rows = common.pixels(97, 61)
+    thing = np.abs(rows - 30 - (columns - 48) / 6) < 9
+    right = np.where(thing[..., None], [6.0, -2.0], [1.0, 0.5])
+    gap = np.abs(columns - 40) < 12
+    forward = np.where(gap[..., None], [-9.0, 30.0], right)
+    backward = np.where(gap[..., None], [5.0, 5.0], -right)
+    shown, blind = (
+        np.abs(mended(device, grid, forward, backward, image=image)[0] - right).max(-1)
+        for image in (np.where(thing, 0.0, -1.0), None)
+    )
+    assert shown[gap].mean() < 0.6
+    assert shown[gap].mean() < 0.5 * blind[gap].mean()
+    outline = ndimage.binary_dilation(thing, iterations=2) & ~ndimage.binary_erosion(thing, iterations=2)
+    assert shown[gap & outline].mean() < 0.5 * blind[gap & outline].mean()
+
+
+def test_what_edges_enclose_is_filled_too(device: Device) -> None:
+    """With what is around, if nothing inside is trusted."""
+    columns, rows = common.pixels(97, 61)
+    inside = np.hypot(columns - 45, rows - 28) < 11
+    forward = np.where(inside[..., None], [-9.0, 30.0], [2.0, -1.0])
+    backward = np.full_like(forward, [-2.0, 1.0])
+    result, _ = mended(device, plane(97, 61), forward, backward, image=np.where(inside, -1.0, 0.0))
+    assert np.abs(result - [2.0, -1.0]).max() < LEFT
 
 
 def disc(grid: Grid, x: float, y: float, radius: float) -> np.ndarray:

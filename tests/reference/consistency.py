@@ -8,12 +8,21 @@ import numpy as np
 
 from reference.common import Array, bilinear, pixels
 
+# Brightness of what tells nothing.
+UNTOLD = 1e3
+
 
 def consistency_trust(
-    flow: Array, back: Array, grid: Sequence[int], tolerance: float, moved: Array, cells: Sequence[int]
+    flow: Array,
+    back: Array,
+    grid: Sequence[int],
+    tolerance: float,
+    moved: Array,
+    cells: Sequence[int],
+    image: Array,
 ) -> Array:
-    """Flow, and how far going there and back again ends at the start, (height, width, 4); nothing of it is
-    believed under cells that moved, the last of which go on to the border.
+    """Flow, how far going there and back again ends at the start, and the image, (height, width, 4); under
+    cells that moved, the last of which go on to the border, nothing is believed and the image tells nothing.
     """
     columns, rows = pixels(grid[0], grid[1])
     x, y = columns + 0.5 + flow[..., 0], rows + 0.5 + flow[..., 1]
@@ -22,11 +31,11 @@ def consistency_trust(
         x = np.clip(x, 0.5, grid[0] - 0.5)
     returned, share = bilinear(back, grid, x, y)
     away = np.linalg.norm(flow + returned / share[..., None], axis=-1)
-    trust = (1 + (away / tolerance) ** 2) ** -2
+    trust = (1 + (away / tolerance) ** 2) ** -4
     under = np.kron(moved, np.ones((cells[2], cells[2])))
     beyond = [(0, max(0, wanted - there)) for wanted, there in zip(grid[1::-1], under.shape, strict=True)]
-    trust[np.pad(under, beyond, mode="edge")[: grid[1], : grid[0]] > 0] = 0
-    return np.dstack([flow, trust, np.zeros_like(trust)])
+    gone = np.pad(under, beyond, mode="edge")[: grid[1], : grid[0]] > 0
+    return np.dstack([flow, np.where(gone, 0, trust), np.where(gone, UNTOLD, image)])
 
 
 def _around(values: Array, fine: Sequence[int]) -> Array:
@@ -36,27 +45,64 @@ def _around(values: Array, fine: Sequence[int]) -> Array:
 
 
 def consistency_push(trusted: Array, fine: Sequence[int]) -> Array:
-    """Trust-weighted mean flow and mean trust, ((height + 1) // 2, (width + 1) // 2, 4)."""
+    """Trust-weighted mean flow, mean trust and brightness, ((height + 1) // 2, (width + 1) // 2, 4)."""
     width, height = fine[:2]
-    trust = trusted[..., 2].astype(np.float64)
-    summands = np.dstack([trusted[..., 0] * trust, trusted[..., 1] * trust, trust, np.ones_like(trust)])
-    padded, total = _around(summands, fine), 0.0
+    trust, bright = trusted[..., 2].astype(np.float64), trusted[..., 3]
+    tells = bright < UNTOLD
+    parts = [trusted[..., 0] * trust, trusted[..., 1] * trust, trust, bright * tells, tells]
+    padded, total = _around(np.dstack([*parts, np.ones_like(trust)]), fine), 0.0
     for (j, i), tap in np.ndenumerate(np.outer([1, 3, 3, 1], [1, 3, 3, 1]) / 64):
         total = total + tap * padded[2 + j : 2 + j + height : 2, 2 + i : 2 + i + width : 2]
-    known = total[..., 2:3] > 0
+    known, told = total[..., 2:3] > 0, total[..., 4] > 0
     mean = np.where(known, total[..., :2] / np.where(known, total[..., 2:3], 1), 0)
-    return np.dstack([mean, total[..., 2] / total[..., 3], np.zeros(known.shape[:2])])
+    brightness = np.where(told, total[..., 3] / np.where(told, total[..., 4], 1), UNTOLD)
+    return np.dstack([mean, total[..., 2] / total[..., 5], brightness])
 
 
-def consistency_pull(trusted: Array, fine: Sequence[int], coarse: Array, size: Sequence[int]) -> Array:
-    """The level with its flow mixed by trust with that of the coarser level, which is read bilinearly."""
+def consistency_pull(
+    trusted: Array, fine: Sequence[int], own: float, coarse: Array, size: Sequence[int]
+) -> Array:
+    """A level's flow mixed by trust with that of the coarser level, which is read bilinearly; own: what trust
+    counts against that, 0: trust is its own share of 1.
+    """
     columns, rows = pixels(fine[0], fine[1])
-    below, share = bilinear(coarse[..., :2], size, (columns + 0.5) / 2, (rows + 0.5) / 2)
-    result, trust = trusted.astype(np.float64), trusted[..., 2:3]
-    result[..., :2] = trust * trusted[..., :2] + (1 - trust) * below / share[..., None]
-    return result
+    below, weight = bilinear(coarse, size, (columns + 0.5) / 2, (rows + 0.5) / 2)
+    trust = trusted[..., 2:3].astype(np.float64)
+    share = own * trust / (own * trust + 1) if own else trust
+    return share * trusted[..., :2] + (1 - share) * below / weight[..., None]
 
 
-def consistency_flow(trusted: Array) -> Array:
-    """The flow alone, (height, width, 2)."""
-    return trusted[..., :2]
+def consistency_relax(
+    trusted: Array,
+    grid: Sequence[int],
+    own: float,
+    edge: Sequence[float],
+    colour: int,
+    relaxation: float,
+    filled: Array,
+) -> Array:
+    """`filled` with the pixels of one colour moved to, and beyond, the mean of what they are drawn to."""
+    width, height = grid[:2]
+    columns, rows = pixels(width, height)
+    counts = own * trusted[..., 2].astype(np.float64)
+    total, weight = counts[..., None] * trusted[..., :2], counts
+    joined = bool(grid[2]) and width % 2 == 0
+    for dx, dy in ((-1, 0), (1, 0), (0, -1), (0, 1)):
+        x, y = columns + dx, rows + dy
+        there = (y >= 0) & (y < height) & (joined | ((x >= 0) & (x < width)))
+        x, y = np.where(there, x % width, columns), np.where(there, y, rows)
+        told = np.maximum(trusted[y, x, 3], trusted[..., 3]) < UNTOLD
+        difference = told * (trusted[y, x, 3].astype(np.float64) - trusted[..., 3]) / edge[0]
+        carried = there * (1 / (1 + difference**2) + edge[1])
+        total, weight = total + carried[..., None] * filled[y, x], weight + carried
+    mean = np.where(weight[..., None] > 0, total / np.where(weight > 0, weight, 1)[..., None], filled)
+    turn = ((columns + rows) % 2 == colour)[..., None]
+    return np.where(turn, filled + relaxation * (mean - filled), filled)
+
+
+def consistency_mix(trusted: Array, around: Array, filled: Array) -> Array:
+    """The flow as far as it is trusted, else what was filled in, `around` where something moved; (height,
+    width, 2).
+    """
+    trust = trusted[..., 2:3]
+    return trust * trusted[..., :2] + (1 - trust) * np.where(trusted[..., 3:] < UNTOLD, filled, around)
