@@ -1,12 +1,12 @@
 """Flow that leads back to where it started is trusted; elsewhere it is filled (kernels/consistency.cl).
 
 A flow from a to b and the flow from b to a undo each other where both are right. Where they do not
-(occlusions, surfaces without texture, what lies beside the other image), and where something moved by itself
-(movers.py), flow is carried on from the trusted flow around, hardly across edges of the image: a thing keeps
-its motion up to its outline, and what is behind it has its own. It is a diffusion that stops at edges, solved
-coarse to fine on a pyramid of trust-weighted means, each level starting from the coarser one's solution
-(Bornemann, Deuflhard, "The cascadic multigrid method for elliptic problems", 1996). The place of what moved
-is filled with wide means instead: what is beside it was matched half with it.
+(occlusions, surfaces without texture), flow is carried on from the trusted flow around, hardly across edges
+of the image: a thing keeps its motion up to its outline, and what is behind it has its own. It is a diffusion
+that stops at edges, on a pyramid of trust-weighted means: each level starts from the filled coarser one, and
+a few sweeps do the rest (after Bornemann, Deuflhard, "The cascadic multigrid method for elliptic problems",
+1996). The place of what moved by itself (movers.py) is filled with wide means, without regard to edges: what
+is beside it was matched half with it.
 """
 
 from __future__ import annotations
@@ -24,13 +24,14 @@ from hugin_abflow.pyramid import Level
 # Pixels between start and return that leave a sixteenth of the trust. What is far off must leave next to
 # nothing: many such pixels would outweigh the few around them.
 _TOLERANCE = 2.2
-# What a fully trusted pixel's own flow counts, against what one neighbour has to say.
-_OWN = 20.0
-# Difference of log brightness between neighbours that halves what is carried from one to the other, and what
-# is carried across any edge: what is enclosed by edges is filled, too.
-_EDGE = (0.08, 0.003)
-# Sweeps per level, and how far each goes (successive over-relaxation). A few are enough, as they begin near
-# the solution; on levels of fewer pixels than this nothing is told apart.
+# What a pixel's own flow counts where its trust is a half, against what one neighbour has to say; else it
+# counts by the odds of its trust. Less, and thin things lose theirs; more, and a line on which wrong flows
+# happen to lead back fills all that is around it.
+_OWN = 16.0
+# Difference of log brightness between neighbours that halves what is carried from one to the other.
+_EDGE = 0.08
+# Sweeps per level, and how far each goes (successive over-relaxation); on levels of fewer pixels than this
+# nothing is told apart.
 _SWEEPS, _RELAXATION, _LEAST_PIXELS = 4, 1.5, 64
 
 
@@ -52,8 +53,8 @@ def trust(
 ) -> Buffer:
     """float32 (height, width, 4): flow in px, trust 0..1, and brightness, which tells where edges are.
 
-    image: log brightness of the layer that the flow starts on, float32 (height, width). moved: cells that
-    have no trust, and whose brightness tells nothing.
+    image: log brightness of the layer that the flow starts on, float32 (height, width), 0 where it shows
+    nothing. moved: cells that have no trust, and whose brightness tells nothing.
     """
     trusted = device.empty((*flow.shape[:2], 4))
     grid = _grid(flow, wraps)
@@ -74,29 +75,27 @@ def _fill(device: Device, trusted: Buffer, wraps: bool, moved: bool) -> Buffer:
         size = _grid(small, wraps)[:2]
         device.run("consistency", "consistency_push", size, fine, _grid(fine, wraps), small, size)
         levels.append(small)
-    filled = _carried(device, levels, wraps, _OWN)
-    around = _carried(device, levels, wraps, 0.0) if moved else filled
+    filled = _carried(device, levels, wraps, _SWEEPS)
+    wide = _carried(device, levels, wraps, sweeps=0) if moved else filled
     grid = _grid(trusted, wraps)
-    device.run("consistency", "consistency_mix", grid[:2], trusted, grid, around, filled)
+    device.run("consistency", "consistency_mix", grid[:2], trusted, grid, wide, filled)
     return filled
 
 
-def _carried(device: Device, levels: Sequence[Buffer], wraps: bool, own: float) -> Buffer:
-    """The finest level's flow, filled coarse to fine. own: what trust counts there, against one neighbour; 0:
-    nothing but wide means of what is around.
-    """
-    coarse = device.zeros((1, 1, 2))
-    for number, level in reversed([*enumerate(levels)]):
-        grid, counts = _grid(level, wraps), own * 4.0**number
+def _carried(device: Device, levels: Sequence[Buffer], wraps: bool, sweeps: int) -> Buffer:
+    """The finest level's flow, filled coarse to fine; without sweeps by wide means of what is around."""
+    coarse = device.empty((1, 1, 2))
+    device.run("consistency", "consistency_flow", (1, 1), levels[-1], (1, 1, 0, 0), coarse)
+    for level in levels[::-1]:
+        grid = _grid(level, wraps)
         filled = device.empty((*level.shape[:2], 2))
         device.run(
-            "consistency", "consistency_pull", grid[:2], level, grid, counts, coarse, _grid(coarse, wraps),
-            filled,
-        )  # fmt: skip
-        if own and grid[0] * grid[1] >= _LEAST_PIXELS:
-            calls = [(level, grid, counts, _EDGE, colour, _RELAXATION, filled) for colour in (0, 1)]
+            "consistency", "consistency_pull", grid[:2], level, grid, coarse, _grid(coarse, wraps), filled
+        )
+        if sweeps and grid[0] * grid[1] >= _LEAST_PIXELS:
+            calls = [(level, grid, _OWN, _EDGE, colour, _RELAXATION, filled) for colour in (0, 1)]
             half = (-(-grid[0] // 2), grid[1])
-            device.repeat("consistency", "consistency_relax", half, calls, _SWEEPS)
+            device.repeat("consistency", "consistency_relax", half, calls, sweeps)
         coarse = filled
     return coarse
 

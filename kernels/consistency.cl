@@ -13,7 +13,7 @@ __kernel void consistency_trust(__global const float2 *flow, /* (grid.y, grid.x)
                                 float tolerance,             /* px that leave a sixteenth of the trust */
                                 __global const uchar *moved, /* (cells.y, cells.x): what moved by itself */
                                 int4 cells,                  /* width, height, px of the chart per cell, 0 */
-                                __global const float *image, /* (grid.y, grid.x) a: log brightness */
+                                __global const float *image, /* (grid.y, grid.x) a: log brightness, 0 outside */
                                 __global float4 *trusted)    /* (grid.y, grid.x) F_ab, trust, brightness */
 {
     const int x = get_global_id(0), y = get_global_id(1);
@@ -63,37 +63,44 @@ __kernel void consistency_push(__global const float4 *trusted, /* (fine.y, fine.
                                      told > 0.0f ? brightness / told : UNTOLD);
 }
 
-/* With what a level starts: its own flow as far as that is trusted, else the coarser one's. */
+/* The flow alone. */
+__kernel void consistency_flow(__global const float4 *trusted, /* (grid.y, grid.x) flow, trust, brightness */
+                               int4 grid,                      /* run size */
+                               __global float2 *flow)          /* (grid.y, grid.x) px */
+{
+    const int x = get_global_id(0), y = get_global_id(1);
+    if (x < grid.x && y < grid.y)
+        flow[y * grid.x + x] = trusted[y * grid.x + x].xy;
+}
+
+/* A level's own flow as far as that is trusted, else the filled coarser one's. */
 __kernel void consistency_pull(__global const float4 *trusted, /* (fine.y, fine.x) flow, trust, brightness */
                                int4 fine,                      /* width, height, wraps, 0; run size */
-                               float own, /* what trust counts, against one neighbour; 0: as its share of 1 */
-                               __global const float2 *coarse, /* (size.y, size.x) filled flow */
-                               int4 size,                     /* width, height, wraps, 0 */
-                               __global float2 *filled)       /* (fine.y, fine.x) */
+                               __global const float2 *coarse,  /* (size.y, size.x) filled flow */
+                               int4 size,                      /* width, height, wraps, 0 */
+                               __global float2 *filled)        /* (fine.y, fine.x) */
 {
     const int x = get_global_id(0), y = get_global_id(1);
     if (x >= fine.x || y >= fine.y)
         return;
     const float4 its = trusted[y * fine.x + x];
     const float2 below = bilinear_flow(coarse, 0.5f * (float2)(x + 0.5f, y + 0.5f), size);
-    const float share = own > 0.0f ? own * its.z / (own * its.z + 1.0f) : its.z;
-    filled[y * fine.x + x] = share * its.xy + (1.0f - share) * below;
+    filled[y * fine.x + x] = its.z * its.xy + (1.0f - its.z) * below;
 }
 
 /* How well flow is carried from a pixel to the next, by their brightness: 1 where it is equal. */
-static inline float conductance(float a, float b, float2 edge) {
-    const float d = GREATEST(a, b) < UNTOLD ? (a - b) / edge.x : 0.0f;
-    return 1.0f / (1.0f + d * d) + edge.y;
+static inline float conductance(float a, float b, float edge) {
+    const float d = GREATEST(a, b) < UNTOLD ? (a - b) / edge : 0.0f;
+    return 1.0f / (1.0f + d * d);
 }
 
 /* Half a sweep, in place: each pixel of one colour of a chessboard goes to, and beyond, the mean of its own flow,
-   as far as it is trusted, and its neighbours'. Around a grid of odd width pixels of one colour would meet:
-   nothing is carried there. */
+   which counts by the odds of its trust, and its neighbours'. Around a grid of odd width pixels of one colour
+   would meet: nothing is carried there. */
 __kernel void consistency_relax(__global const float4 *trusted, /* (grid.y, grid.x) flow, trust, brightness */
-                                int4 grid,                      /* width, height, wraps, 0; run size: half as wide */
-                                float own,                      /* what trust counts, against one neighbour */
-                                float2 edge,      /* difference of log brightness that halves what is carried, and
-                                                     what is carried across any */
+                                int4 grid,        /* width, height, wraps, 0; run size: half as wide */
+                                float own,        /* what a trust of a half counts, against one neighbour */
+                                float edge,       /* difference of log brightness that halves what is carried */
                                 int colour,       /* 0 or 1 */
                                 float relaxation, /* how far to go: 1 to the mean */
                                 __global float2 *filled) /* (grid.y, grid.x) */
@@ -106,8 +113,8 @@ __kernel void consistency_relax(__global const float4 *trusted, /* (grid.y, grid
                            at - grid.x, at + grid.x};
     const bool there[4] = {x > 0 || turn, x < grid.x - 1 || turn, y > 0, y < grid.y - 1};
     const float4 its = trusted[at];
-    float2 sum = own * its.z * its.xy;
-    float weight = own * its.z;
+    float weight = own * its.z / (1.001f - its.z);
+    float2 sum = weight * its.xy;
     for (int i = 0; i < 4; ++i) {
         const int n = there[i] ? beside[i] : at;
         const float w = there[i] ? conductance(trusted[n].w, its.w, edge) : 0.0f;
@@ -121,7 +128,7 @@ __kernel void consistency_relax(__global const float4 *trusted, /* (grid.y, grid
 /* The flow where it is trusted, else what was filled in, in place. */
 __kernel void consistency_mix(__global const float4 *trusted, /* (grid.y, grid.x) flow, trust, brightness */
                               int4 grid,                      /* run size */
-                              __global const float2 *around,  /* (grid.y, grid.x) for what moved by itself */
+                              __global const float2 *wide,    /* (grid.y, grid.x) for what moved by itself */
                               __global float2 *filled)        /* (grid.y, grid.x) for all else */
 {
     const int x = get_global_id(0), y = get_global_id(1);
@@ -129,6 +136,6 @@ __kernel void consistency_mix(__global const float4 *trusted, /* (grid.y, grid.x
         return;
     const int at = y * grid.x + x;
     const float4 its = trusted[at];
-    const float2 other = its.w < UNTOLD ? filled[at] : around[at];
+    const float2 other = its.w < UNTOLD ? filled[at] : wide[at];
     filled[at] = its.z * its.xy + (1.0f - its.z) * other;
 }

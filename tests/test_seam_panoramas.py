@@ -99,8 +99,8 @@ def test_what_only_one_layer_shows_is_whole_or_absent(name: str, who: int) -> No
     """As it is stored, where exposures are left as they are."""
     layers, canvas, away, plain = scene(name, who)
     result = merged(layers, canvas, seam=True, exposure=False)
-    unsure = doubt(result, plain, away)  # every pixel is one layer's, but for an outline that flow moves
-    assert (unsure > 8).mean() < 2e-3
+    unsure = doubt(result, plain, away)  # every pixel is one layer's, but for what flow moves a little
+    assert (unsure > 8).mean() < 3e-3
     assert unsure.max() <= 32
     assert (off(result, DISC)[away < RADIUS - 1] <= 8).mean() in (0, 1)
     assert off(result, plain)[away >= RADIUS + 16].max() <= 8

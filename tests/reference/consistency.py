@@ -59,24 +59,24 @@ def consistency_push(trusted: Array, fine: Sequence[int]) -> Array:
     return np.dstack([mean, total[..., 2] / total[..., 5], brightness])
 
 
-def consistency_pull(
-    trusted: Array, fine: Sequence[int], own: float, coarse: Array, size: Sequence[int]
-) -> Array:
-    """A level's flow mixed by trust with that of the coarser level, which is read bilinearly; own: what trust
-    counts against that, 0: trust is its own share of 1.
-    """
+def consistency_flow(trusted: Array) -> Array:
+    """The flow alone, (height, width, 2)."""
+    return trusted[..., :2]
+
+
+def consistency_pull(trusted: Array, fine: Sequence[int], coarse: Array, size: Sequence[int]) -> Array:
+    """A level's flow mixed by trust with that of the coarser level, which is read bilinearly."""
     columns, rows = pixels(fine[0], fine[1])
-    below, weight = bilinear(coarse, size, (columns + 0.5) / 2, (rows + 0.5) / 2)
+    below, share = bilinear(coarse, size, (columns + 0.5) / 2, (rows + 0.5) / 2)
     trust = trusted[..., 2:3].astype(np.float64)
-    share = own * trust / (own * trust + 1) if own else trust
-    return share * trusted[..., :2] + (1 - share) * below / weight[..., None]
+    return trust * trusted[..., :2] + (1 - trust) * below / share[..., None]
 
 
 def consistency_relax(
     trusted: Array,
     grid: Sequence[int],
     own: float,
-    edge: Sequence[float],
+    edge: float,
     colour: int,
     relaxation: float,
     filled: Array,
@@ -84,25 +84,26 @@ def consistency_relax(
     """`filled` with the pixels of one colour moved to, and beyond, the mean of what they are drawn to."""
     width, height = grid[:2]
     columns, rows = pixels(width, height)
-    counts = own * trusted[..., 2].astype(np.float64)
-    total, weight = counts[..., None] * trusted[..., :2], counts
+    trust = trusted[..., 2].astype(np.float64)
+    weight = own * trust / (1.001 - trust)
+    total = weight[..., None] * trusted[..., :2]
     joined = bool(grid[2]) and width % 2 == 0
     for dx, dy in ((-1, 0), (1, 0), (0, -1), (0, 1)):
         x, y = columns + dx, rows + dy
         there = (y >= 0) & (y < height) & (joined | ((x >= 0) & (x < width)))
         x, y = np.where(there, x % width, columns), np.where(there, y, rows)
         told = np.maximum(trusted[y, x, 3], trusted[..., 3]) < UNTOLD
-        difference = told * (trusted[y, x, 3].astype(np.float64) - trusted[..., 3]) / edge[0]
-        carried = there * (1 / (1 + difference**2) + edge[1])
+        difference = told * (trusted[y, x, 3].astype(np.float64) - trusted[..., 3]) / edge
+        carried = there / (1 + difference**2)
         total, weight = total + carried[..., None] * filled[y, x], weight + carried
     mean = np.where(weight[..., None] > 0, total / np.where(weight > 0, weight, 1)[..., None], filled)
     turn = ((columns + rows) % 2 == colour)[..., None]
     return np.where(turn, filled + relaxation * (mean - filled), filled)
 
 
-def consistency_mix(trusted: Array, around: Array, filled: Array) -> Array:
-    """The flow as far as it is trusted, else what was filled in, `around` where something moved; (height,
+def consistency_mix(trusted: Array, wide: Array, filled: Array) -> Array:
+    """The flow as far as it is trusted, else what was filled in, `wide` where something moved; (height,
     width, 2).
     """
     trust = trusted[..., 2:3]
-    return trust * trusted[..., :2] + (1 - trust) * np.where(trusted[..., 3:] < UNTOLD, filled, around)
+    return trust * trusted[..., :2] + (1 - trust) * np.where(trusted[..., 3:] < UNTOLD, filled, wide)
