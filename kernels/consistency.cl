@@ -95,8 +95,8 @@ static inline float conductance(float a, float b, float edge) {
 }
 
 /* Half a sweep, in place: each pixel of one colour of a chessboard goes to, and beyond, the mean of its own flow,
-   which counts by the odds of its trust, and its neighbours'. Around a grid of odd width pixels of one colour
-   would meet: nothing is carried there. */
+   which counts by the odds of its trust (finite where that is 1), and its neighbours'. Around a grid of odd width
+   pixels of one colour would meet: nothing is carried there. */
 __kernel void consistency_relax(__global const float4 *trusted, /* (grid.y, grid.x) flow, trust, brightness */
                                 int4 grid,        /* width, height, wraps, 0; run size: half as wide */
                                 float own,        /* what a trust of a half counts, against one neighbour */
