@@ -24,9 +24,11 @@ from hugin_abflow.pyramid import Level
 # Pixels between start and return that leave a sixteenth of the trust. What is far off must leave next to
 # nothing: many such pixels would outweigh the few around them.
 _TOLERANCE = 2.2
+# The level whose mean tells how much is trusted around a pixel, and the mean that is enough: less is found on
+# islands and lines on which wrong flows happen to lead back.
+_AROUND, _ENOUGH = 2, 0.3
 # What a pixel's own flow counts where its trust is a half, against what one neighbour has to say; else it
-# counts by the odds of its trust. Less, and thin things lose theirs; more, and a line on which wrong flows
-# happen to lead back fills all that is around it.
+# counts by the odds of its trust. Less, and thin things lose theirs; more, and what is wrong is spread.
 _OWN = 16.0
 # Difference of log brightness between neighbours that halves what is carried from one to the other.
 _EDGE = 0.08
@@ -68,18 +70,28 @@ def trust(
 
 
 def _fill(device: Device, trusted: Buffer, wraps: bool, moved: bool) -> Buffer:
+    around, grid = _pushed(device, trusted, wraps, _AROUND)[-1], _grid(trusted, wraps)
+    device.run(
+        "consistency", "consistency_support", grid[:2], around, _grid(around, wraps), 2.0**_AROUND, _ENOUGH,
+        trusted, grid,
+    )  # fmt: skip
+    levels = _pushed(device, trusted, wraps)
+    filled = _carried(device, levels, wraps, _SWEEPS)
+    wide = _carried(device, levels, wraps, sweeps=0) if moved else filled
+    device.run("consistency", "consistency_mix", grid[:2], trusted, grid, wide, filled)
+    return filled
+
+
+def _pushed(device: Device, trusted: Buffer, wraps: bool, coarser: int = 0) -> list[Buffer]:
+    """The pyramid, finest level first: so many coarser levels, or down to one pixel."""
     levels = [trusted]
-    while max(levels[-1].shape[:2]) > 1:
+    while len(levels) <= coarser if coarser else max(levels[-1].shape[:2]) > 1:
         fine = levels[-1]
         small = device.empty(((fine.shape[0] + 1) // 2, (fine.shape[1] + 1) // 2, 4))
         size = _grid(small, wraps)[:2]
         device.run("consistency", "consistency_push", size, fine, _grid(fine, wraps), small, size)
         levels.append(small)
-    filled = _carried(device, levels, wraps, _SWEEPS)
-    wide = _carried(device, levels, wraps, sweeps=0) if moved else filled
-    grid = _grid(trusted, wraps)
-    device.run("consistency", "consistency_mix", grid[:2], trusted, grid, wide, filled)
-    return filled
+    return levels
 
 
 def _carried(device: Device, levels: Sequence[Buffer], wraps: bool, sweeps: int) -> Buffer:

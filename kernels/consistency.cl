@@ -63,6 +63,25 @@ __kernel void consistency_push(__global const float4 *trusted, /* (fine.y, fine.
                                      told > 0.0f ? brightness / told : UNTOLD);
 }
 
+/* Less trust, in place, where there is little around: between two wrong flows lies a line on which they happen to
+   lead back. */
+__kernel void consistency_support(__global const float4 *coarse, /* (size.y, size.x) flow, trust, brightness */
+                                  int4 size,                     /* width, height, wraps, 0 */
+                                  float times,                   /* finer pixels in the width of one of its */
+                                  float enough,                  /* mean trust around that takes nothing away */
+                                  __global float4 *trusted,      /* (fine.y, fine.x) flow, trust, brightness */
+                                  int4 fine)                     /* width, height, wraps, 0; run size */
+{
+    const int x = get_global_id(0), y = get_global_id(1);
+    if (x >= fine.x || y >= fine.y)
+        return;
+    int4 at;
+    const float4 w = bilinear_taps((float2)(x + 0.5f, y + 0.5f) / times, size, &at);
+    const float mean = w.x * coarse[at.x].z + w.y * coarse[at.y].z + w.z * coarse[at.z].z + w.w * coarse[at.w].z;
+    const float support = LEAST(mean / enough, 1.0f);
+    trusted[y * fine.x + x].z *= support * support;
+}
+
 /* The flow alone. */
 __kernel void consistency_flow(__global const float4 *trusted, /* (grid.y, grid.x) flow, trust, brightness */
                                int4 grid,                      /* run size */

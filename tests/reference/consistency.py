@@ -59,6 +59,17 @@ def consistency_push(trusted: Array, fine: Sequence[int]) -> Array:
     return np.dstack([mean, total[..., 2] / total[..., 5], brightness])
 
 
+def consistency_support(
+    coarse: Array, size: Sequence[int], times: float, enough: float, trusted: Array, fine: Sequence[int]
+) -> Array:
+    """`trusted` with less trust where its mean around, bilinear from a coarser level, is not enough."""
+    columns, rows = pixels(fine[0], fine[1])
+    mean, share = bilinear(coarse[..., 2:3], size, (columns + 0.5) / times, (rows + 0.5) / times)
+    result = trusted.astype(np.float64)
+    result[..., 2] *= np.minimum(mean[..., 0] / share / enough, 1) ** 2
+    return result
+
+
 def consistency_flow(trusted: Array) -> Array:
     """The flow alone, (height, width, 2)."""
     return trusted[..., :2]
