@@ -70,36 +70,36 @@ def trust(
 
 
 def _fill(device: Device, trusted: Buffer, wraps: bool, moved: bool) -> Buffer:
-    around, grid = _pushed(device, trusted, wraps, _AROUND)[-1], _grid(trusted, wraps)
+    around, grid = trusted, _grid(trusted, wraps)
+    for _ in range(_AROUND):
+        around = _coarser(device, around, wraps)
     device.run(
         "consistency", "consistency_support", grid[:2], around, _grid(around, wraps), 2.0**_AROUND, _ENOUGH,
         trusted, grid,
     )  # fmt: skip
-    levels = _pushed(device, trusted, wraps)
+    levels = [trusted]
+    while max(levels[-1].shape[:2]) > 1:
+        levels.append(_coarser(device, levels[-1], wraps))
     filled = _carried(device, levels, wraps, _SWEEPS)
     wide = _carried(device, levels, wraps, sweeps=0) if moved else filled
     device.run("consistency", "consistency_mix", grid[:2], trusted, grid, wide, filled)
     return filled
 
 
-def _pushed(device: Device, trusted: Buffer, wraps: bool, coarser: int = 0) -> list[Buffer]:
-    """The pyramid, finest level first: so many coarser levels, or down to one pixel."""
-    levels = [trusted]
-    while len(levels) <= coarser if coarser else max(levels[-1].shape[:2]) > 1:
-        fine = levels[-1]
-        small = device.empty(((fine.shape[0] + 1) // 2, (fine.shape[1] + 1) // 2, 4))
-        size = _grid(small, wraps)[:2]
-        device.run("consistency", "consistency_push", size, fine, _grid(fine, wraps), small, size)
-        levels.append(small)
-    return levels
+def _coarser(device: Device, fine: Buffer, wraps: bool) -> Buffer:
+    """The next level of the pyramid."""
+    small = device.empty(((fine.shape[0] + 1) // 2, (fine.shape[1] + 1) // 2, 4))
+    size = _grid(small, wraps)[:2]
+    device.run("consistency", "consistency_push", size, fine, _grid(fine, wraps), small, size)
+    return small
 
 
 def _carried(device: Device, levels: Sequence[Buffer], wraps: bool, sweeps: int) -> Buffer:
     """The finest level's flow, filled coarse to fine; without sweeps by wide means of what is around."""
-    coarse = device.empty((1, 1, 2))
-    device.run("consistency", "consistency_flow", (1, 1), levels[-1], (1, 1, 0, 0), coarse)
-    for level in levels[::-1]:
-        grid = _grid(level, wraps)
+    filled = device.empty((1, 1, 2))
+    device.run("consistency", "consistency_flow", (1, 1), levels[-1], (1, 1, 0, 0), filled)
+    for level in levels[-2::-1]:
+        grid, coarse = _grid(level, wraps), filled
         filled = device.empty((*level.shape[:2], 2))
         device.run(
             "consistency", "consistency_pull", grid[:2], level, grid, coarse, _grid(coarse, wraps), filled
@@ -108,8 +108,7 @@ def _carried(device: Device, levels: Sequence[Buffer], wraps: bool, sweeps: int)
             calls = [(level, grid, _OWN, _EDGE, colour, _RELAXATION, filled) for colour in (0, 1)]
             half = (-(-grid[0] // 2), grid[1])
             device.repeat("consistency", "consistency_relax", half, calls, sweeps)
-        coarse = filled
-    return coarse
+    return filled
 
 
 def _grid(buffer: Buffer, wraps: bool) -> tuple[int, int, int, int]:
