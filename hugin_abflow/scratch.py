@@ -32,13 +32,13 @@ _ours: set[Path] = set()  # what this process may have made and not yet removed
 @atexit.register
 def tidy() -> None:
     """Remove what this process left where Ctrl-C came between making and using, or while it was removed."""
-    while _ours:
-        path = _ours.pop()
+    for path in tuple(_ours):
         if path.is_dir():
             shutil.rmtree(path, ignore_errors=True)
         else:
             with suppress(OSError):
                 path.unlink(missing_ok=True)
+        _ours.discard(path)  # not before: this, too, may be broken off, and begun anew
 
 
 @contextmanager

@@ -61,7 +61,7 @@ def encode(rows: Pixels, compression: str, quality: int) -> bytes:
 class TiffWriter:
     """Write rows from top to bottom. Errors of the file (`OSError`) are raised by any later call.
 
-    path            the file, which is overwritten. shape: (height, width, samples), alpha last.
+    path            an empty file, which is there already. shape: (height, width, samples), alpha last.
     compression     one of `COMPRESSIONS`; JPEG is for 8-bit RGB. quality: of JPEG, 1..100.
     offset          (x, y) on the canvas, at 150 dpi. big: BigTIFF, for more than 4 GB.
     threads         cores that encode.
@@ -109,7 +109,8 @@ class TiffWriter:
         try:
             import tifffile
 
-            with tifffile.TiffWriter(path, bigtiff=big) as file:
+            # not "w": after a Ctrl-C while this thread starts, it would make the file anew that was removed
+            with path.open("r+b") as stream, tifffile.TiffWriter(stream, bigtiff=big) as file:
                 file.write(self._encoded(), shape=self._shape, dtype=self._dtype, **tags)
         except BaseException as error:
             self._error = error

@@ -149,6 +149,8 @@ def test_control_c_while_a_folder_is_removed(root: Path, monkeypatch: pytest.Mon
         patch.setattr(shutil, "rmtree", interrupted)
         with pytest.raises(KeyboardInterrupt), work_folder():
             pass
+        with pytest.raises(KeyboardInterrupt):
+            scratch.tidy()
     assert len(names_in(root)) == 1
     scratch.tidy()
     assert names_in(root) == []

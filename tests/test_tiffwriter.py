@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import threading
+
 import numpy as np
 import pytest
 import tifffile
@@ -65,4 +67,29 @@ def test_what_fails_in_the_background_is_told(tmp_path, monkeypatch):
     with pytest.raises(OutputError, match=r"a\.tif cannot be written: No space left on device"), writer:
         for _ in range(100):
             writer.write_rows(noise(np.uint8))
+    assert not list(tmp_path.iterdir())
+
+
+def test_control_c_while_the_thread_starts_leaves_nothing(tmp_path, monkeypatch):
+    """The thread may open the file when it has been removed already."""
+    removed, opened = threading.Event(), threading.Event()
+    start, open_tiff = threading.Thread.start, tifffile.TiffWriter
+
+    def interrupted(thread):
+        start(thread)
+        raise KeyboardInterrupt
+
+    def late(*arguments, **more):
+        removed.wait(10)
+        try:
+            return open_tiff(*arguments, **more)
+        finally:
+            opened.set()
+
+    monkeypatch.setattr(threading.Thread, "start", interrupted)
+    monkeypatch.setattr(tifffile, "TiffWriter", late)
+    with pytest.raises(KeyboardInterrupt), ImageWriter(tmp_path / "a.tif", 131, 77, 3, np.uint8):
+        pass
+    removed.set()
+    assert opened.wait(10)
     assert not list(tmp_path.iterdir())
