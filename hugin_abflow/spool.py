@@ -14,7 +14,7 @@ import threading
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import replace
-from typing import IO, Any
+from typing import IO, Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -27,6 +27,8 @@ _log = logging.getLogger(__name__)
 # The share of the memory that nobody uses, and of the free space on disk, that the file may take. Where new
 # files take a tenth of that memory, Linux begins to write them to the disk; this one shall be gone before.
 _SHARE = 10
+# Columns of zeros between others that are not worth a call of their own.
+_GAP = 256
 
 
 @contextmanager
@@ -50,12 +52,22 @@ def spooled(layers: Sequence[Layer]) -> Iterator[list[Layer]]:
                     result[index] = replace(layer, read=rows.read)
                     end += size
         if end:
-            _log.info("spool: %s of decoded layers in a temporary file in %s", memory.size(end), folder)
+            _log.info("spool: up to %s of decoded layers in a temporary file in %s", memory.size(end), folder)
         yield result
 
 
 def _row_bytes(layer: Layer) -> int:
     return layer.box.width * (layer.channels + 1) * layer.dtype.itemsize
+
+
+class _Block(NamedTuple):
+    """Rows that are stored: `first` to `end`, and of these the columns `left` to `right` from a place in the
+    file on, for each (left, right, place) of `spans`; all else is 0.
+    """
+
+    first: int
+    end: int
+    spans: list[tuple[int, int, int]]
 
 
 class _Rows:
@@ -65,7 +77,9 @@ class _Rows:
         self._layer, self._start = layer, start
         self._file: IO[bytes] | None = file
         self._row = _row_bytes(layer)
-        self._stored = np.zeros(layer.box.height, np.bool_)
+        self._pixel = self._row // layer.box.width
+        self._blocks: list[_Block] = []
+        self._block_of = np.full(layer.box.height, -1)  # each row's; -1: it is not stored
         # a file is closed when nobody is at it: after two Ctrl-C threads may still read, and somebody else's
         # file have the number of ours
         self._lock = threading.Lock()
@@ -73,8 +87,9 @@ class _Rows:
     def read(self, top: int, bottom: int) -> npt.NDArray[Any]:
         """Rows `top` to `bottom`, see `Layer.read`."""
         with self._lock:
-            if self._file and 0 <= top < bottom <= len(self._stored) and self._stored[top:bottom].all():
-                rows = self._recall(self._file, top, bottom)
+            if self._file and 0 <= top < bottom <= len(self._block_of):
+                blocks = np.unique(self._block_of[top:bottom])
+                rows = self._recall(self._file, blocks, top, bottom) if blocks[0] >= 0 else None
                 if rows is not None:
                     return rows
         rows = self._layer.read(top, bottom)
@@ -88,26 +103,56 @@ class _Rows:
         with self._lock:
             self._file = None
 
-    def _recall(self, file: IO[bytes], top: int, bottom: int) -> npt.NDArray[Any] | None:
-        """Stored rows; None if the disk fails."""
+    def _recall(
+        self, file: IO[bytes], blocks: npt.NDArray[Any], top: int, bottom: int
+    ) -> npt.NDArray[Any] | None:
+        """Rows of stored blocks; None if the disk fails."""
         shape = (bottom - top, self._layer.box.width, self._layer.channels + 1)
-        rows, place = np.empty(shape, self._layer.dtype), self._start + top * self._row
-        with trace.span("recall", trace.FILE, file=self._layer.name, rows=bottom - top), suppress(OSError):
-            if os.preadv(file.fileno(), [_bytes(rows)], place) == rows.nbytes:
-                return rows
+        rows = np.zeros(shape, self._layer.dtype)
+        with trace.span("recall", trace.FILE, file=self._layer.name, rows=len(rows)), suppress(OSError):
+            for block in (self._blocks[index] for index in blocks):
+                first, end = max(top, block.first), min(bottom, block.end)
+                for left, right, place in block.spans:
+                    part = np.empty((end - first, right - left, shape[2]), rows.dtype)
+                    place += (first - block.first) * (right - left) * self._pixel
+                    if os.preadv(file.fileno(), [_bytes(part).data], place) != part.nbytes:
+                        return None
+                    rows[first - top : end - top, left:right] = part
+            return rows
         return None
 
     def _keep(self, file: IO[bytes], rows: npt.NDArray[Any], top: int) -> None:
-        """Store rows from the first one on that is not stored."""
-        missing = np.flatnonzero(~self._stored[top : top + len(rows)])
-        if not len(missing):
+        """Store rows from the first one that is not stored up to the next that is."""
+        missing = self._block_of[top : top + len(rows)] < 0
+        if not missing.any():
             return
-        first, rows = top + int(missing[0]), rows[missing[0] :]
+        first = int(missing.argmax())
+        rows = rows[first:][: int(np.append(missing[first:], False).argmin())]
+        first += top
+        block, place = _Block(first, first + len(rows), []), self._start + first * self._row
         with trace.span("keep", trace.FILE, file=self._layer.name, rows=len(rows)), suppress(OSError):
-            # less is written than there is, or nothing, where the disk is full
-            written = os.pwrite(file.fileno(), _bytes(rows), self._start + first * self._row)
-            self._stored[first : first + written // self._row] = True
+            for left, right in self._spans(rows):
+                part = np.ascontiguousarray(rows[:, left:right])
+                # less is written than there is, or nothing, where the disk is full
+                if os.pwrite(file.fileno(), _bytes(part).data, place) != part.nbytes:
+                    return
+                block.spans.append((left, right, place))
+                place += part.nbytes
+            self._block_of[block.first : block.end] = len(self._blocks)
+            self._blocks.append(block)
+
+    def _spans(self, rows: npt.NDArray[Any]) -> list[tuple[int, int]]:
+        """The columns (left, right) in which not all of `rows` is 0. On a sphere most of a layer is: to write
+        to new memory takes longer than to look.
+        """
+        set_ = np.bitwise_or.reduce(_bytes(np.ascontiguousarray(rows)).reshape(len(rows), -1), axis=0)
+        columns = np.flatnonzero(set_.reshape(-1, self._pixel).any(axis=1))
+        if not len(columns):
+            return []
+        ends = np.flatnonzero(np.diff(columns) > _GAP)
+        lefts, rights = columns[[0, *(ends + 1)]], columns[[*ends, -1]] + 1
+        return [(int(left), int(right)) for left, right in zip(lefts, rights, strict=True)]
 
 
-def _bytes(rows: npt.NDArray[Any]) -> memoryview:
-    return rows.reshape(-1).view(np.uint8).data
+def _bytes(rows: npt.NDArray[Any]) -> npt.NDArray[np.uint8]:
+    return rows.reshape(-1).view(np.uint8)

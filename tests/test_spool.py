@@ -72,6 +72,36 @@ def test_rows_are_decoded_once_and_stay_the_same(dtype: npt.DTypeLike) -> None:
     assert times_a == times_b == [2] * HEIGHT  # with `want`
 
 
+def sparse() -> Layer:
+    """Nothing in its upper rows, then in the middle of wide rows, then on both sides, then but one value."""
+    pixels = np.zeros((HEIGHT, 9 * spool._GAP, 4), np.uint8)
+    noise = np.random.default_rng(3).integers(0, 256, pixels.shape)
+    pixels[3:7, 1000:1300] = noise[3:7, 1000:1300]
+    pixels[6:9, :77], pixels[6:9, -91:] = noise[6:9, :77], noise[6:9, -91:]
+    pixels[10, 500, 1] = 1  # transparent, and not black
+    return Layer.from_array("sparse", pixels)
+
+
+@pytest.mark.parametrize("step", [1, 4, HEIGHT])
+def test_zeros_take_no_room(monkeypatch: pytest.MonkeyPatch, step: int) -> None:
+    write, written = os.pwrite, [0]
+
+    def pwrite(file: int, rows: memoryview, place: int) -> int:
+        written[0] += rows.nbytes
+        return write(file, rows, place)
+
+    monkeypatch.setattr(os, "pwrite", pwrite)
+    layer, times = counting(sparse())
+    want = sparse().read(0, HEIGHT)
+    with spooled([layer]) as (kept,):
+        for first in range(0, HEIGHT, step):
+            kept.read(first, min(first + step, HEIGHT))
+        assert 0 < written[0] < (HEIGHT * (300 + 77 + 91 + 2 * spool._GAP)) * 4
+        for top, bottom in ((0, HEIGHT), (5, 11), (7, 8), (0, 3)):
+            np.testing.assert_array_equal(kept.read(top, bottom), want[top:bottom])
+    assert times == [1] * HEIGHT
+
+
 @given(
     st.lists(
         st.tuples(st.integers(0, HEIGHT), st.integers(0, HEIGHT)).map(lambda span: tuple(sorted(span))),
@@ -79,10 +109,16 @@ def test_rows_are_decoded_once_and_stay_the_same(dtype: npt.DTypeLike) -> None:
     )
 )
 def test_rows_are_right_in_any_order(spans: list[tuple[int, int]]) -> None:
-    layer, _ = counted()
-    with spooled([layer]) as (kept,):
-        for top, bottom in spans:
-            np.testing.assert_array_equal(kept.read(top, bottom), layer.read(top, bottom))
+    for want in (counted()[0], sparse()):
+        layer, times = counting(want)
+        with spooled([layer]) as (kept,):
+            for top, bottom in spans:
+                np.testing.assert_array_equal(kept.read(top, bottom), want.read(top, bottom))
+            for row in range(HEIGHT):
+                np.testing.assert_array_equal(kept.read(row, row + 1), want.read(row, row + 1))
+            before = list(times)
+            np.testing.assert_array_equal(kept.read(0, HEIGHT), want.read(0, HEIGHT))
+        assert times == before
 
 
 def test_errors_of_the_layer_are_its_own() -> None:
@@ -131,8 +167,7 @@ def test_a_full_disk_costs_time_alone(monkeypatch: pytest.MonkeyPatch, left: int
     with spooled([layer]) as (kept,):
         for _ in range(2):
             np.testing.assert_array_equal(kept.read(0, 9), want(0, 9))
-        np.testing.assert_array_equal(kept.read(0, 2), want(0, 2))
-    assert times[:2] == [1 + (2 if left else 3)] * 2  # `want` has read them, too
+    assert times[:9] == [3] * 9  # `want` has read them, too
 
 
 @pytest.mark.parametrize("left", [0, 2 * WIDTH * 4 + 5])
