@@ -178,7 +178,7 @@ def _bands(
         for band in plan:
             part = band.part
             size = part.width, part.height
-            pairs = -(-part.width // 2), part.height
+            fours = -(-part.width // 4), part.height
             store.next()
             way_starts = _lines(device, fields, part, full, grid, share, ways)
             gain_starts = _lines(device, gains, part, full, gain_grid, 0.0, gained)
@@ -196,7 +196,7 @@ def _bands(
             latitudes = _turn(device, full.lens[2], -full.lens[3], part.top, part.height)
             out = device.empty((part.height, part.width, first.channels + 1), device_dtype(first))
             device.run(
-                "blend", "blend_band", pairs, store.rows, device.upload(table[used]), len(used), ways, gained,
+                "blend", "blend_band", fours, store.rows, device.upload(table[used]), len(used), ways, gained,
                 added, longitudes, latitudes, full.border, full.lens, grid.border, gain_grid.border,
                 offset_grid.border,
                 (part.left, part.top, *size), (region.left, region.top),

@@ -1,26 +1,23 @@
 /* The full-resolution pass over one band of rows. Built with PIXEL (stored sample type), SAMPLES (2 or 4, alpha
    last), WHITE (full scale) and INTEGER (1: round and saturate). Places are pixels of the region.
 
-   A work item makes two pixels side by side: what is known of each is float2 or int2, their colours are float8, r, g,
-   b and one value more of the left one, then of the right one. PoCL's compiler makes vectors of no more than what
-   is written as vectors, and those of one pixel are half as long as a processor's. */
+   A work item makes four pixels side by side: what is known of each is float4 or int4, their colours are float16, r,
+   g, b and one value more of the first, then of the next. PoCL's compiler makes vectors of no more than what is
+   written as vectors, and a processor waits less where there is more to do at a time. */
 
 /* Of the cubic that layers are sampled with: Catmull-Rom's -1/2 loses a twentieth of fine texture's gradients over
    all fractions, this next to nothing; a ramp stays one to 0.03 px. */
 #define BLEND_SLOPE (-2.0f / 3.0f)
 
 #if SAMPLES > 2
-#define BLEND_TWO 8
-#define BLEND_FOUR 16
+#define BLEND_SAMPLES 16
 #define BLEND_ALPHAS s37bf
 #else
-#define BLEND_TWO 4
-#define BLEND_FOUR 8
+#define BLEND_SAMPLES 8
 #define BLEND_ALPHAS s1357
 #endif
 
-typedef PIXEL_VECTOR(PIXEL, BLEND_TWO) blend_pixels; /* two as stored */
-typedef PIXEL_VECTOR(PIXEL, BLEND_FOUR) blend_row;   /* four */
+typedef PIXEL_VECTOR(PIXEL, BLEND_SAMPLES) blend_pixels; /* four as stored */
 
 /* One layer as a band needs it: 64 bytes, made by hugin_abflow/blend.py. */
 typedef struct {
@@ -33,43 +30,41 @@ typedef struct {
     int unused[2];
 } blend_layer;
 
-/* pixel_samples of common.cl for two pixels: in OpenCL C no text says which samples go where for both. */
-static inline float8 blend_colours(blend_pixels p) {
+/* pixel_samples of common.cl for four pixels: in OpenCL C no text says which samples go where for both. */
+static inline float16 blend_colours(blend_pixels p) {
 #if SAMPLES > 2
-    return convert_float8(p);
+    return convert_float16(p);
 #else
-    return convert_float4(p).s00012223;
+    return convert_float8(p).s0001222344456667;
 #endif
 }
 
-static inline blend_pixels blend_stored(float8 v) {
+static inline blend_pixels blend_stored(float16 v) {
 #if SAMPLES > 2
-    return PIXEL_VECTOR(convert_, PIXEL_VECTOR(PIXEL, 8))(v);
+    return PIXEL_VECTOR(convert_, PIXEL_VECTOR(PIXEL, 16))(v);
 #else
-    return PIXEL_VECTOR(convert_, PIXEL_VECTOR(PIXEL, 4))(v.s0347);
+    return PIXEL_VECTOR(convert_, PIXEL_VECTOR(PIXEL, 8))(v.s03478bcf);
 #endif
 }
 
-/* What is known of two pixels, for each of their samples. */
-#define BLEND_EACH(v) (v).s00001111
+/* What is known of four pixels, for each of their samples. */
+#define BLEND_EACH(v) (v).s0000111122223333
 
-/* Whether it is so for one of two pixels at least. */
-static inline bool blend_some(int2 v) {
-    return (v.x | v.y) != 0;
+/* Whether it is so for one of four pixels at least. */
+static inline bool blend_some(int4 v) {
+    return (v.x | v.y | v.z | v.w) != 0;
 }
 
 /* Where r, g or b is not 0. */
-static inline int2 blend_any(float8 v) {
-    const int8 set = v != 0.0f;
-    return set.s04 | set.s15 | set.s26;
+static inline int4 blend_any(float16 v) {
+    const int16 set = v != 0.0f;
+    return set.s048c | set.s159d | set.s26ae;
 }
 
-/* Where a layer's stored row lies; its rows go round. */
-static inline __global const pixel_stored *blend_line(__global const pixel_stored *stored,
-                                                     __global const blend_layer *layer, int row) {
+/* Which row of its ring a layer's row is. */
+static inline int blend_turned(__global const blend_layer *layer, int row) {
     row += layer->turn;
-    row -= row >= layer->ring ? layer->ring : 0;
-    return stored + layer->rows + row * layer->place.z;
+    return row - (row >= layer->ring ? layer->ring : 0);
 }
 
 /* r, g, b in stored units and 1 for a valid pixel, else zeros. */
@@ -78,28 +73,30 @@ static inline float4 blend_tap(__global const pixel_stored *stored, __global con
     const int x = p.x - place.x, y = p.y - place.y;
     if (x < 0 || y < 0 || x >= place.z || y >= place.w)
         return (float4)(0.0f);
-    const float4 c = pixel_samples(blend_line(stored, layer, y)[x]);
+    const float4 c = pixel_samples(stored[layer->rows + blend_turned(layer, y) * place.z + x]);
     return c.w >= 0.5f * WHITE ? (float4)(c.xyz, 1.0f) : (float4)(0.0f);
 }
 
-/* The same for p and the pixel to its right. */
-static inline float8 blend_taps(__global const pixel_stored *stored, __global const blend_layer *layer, int2 p) {
-    const int4 place = layer->place;
-    const int x = p.x - place.x, y = p.y - place.y;
-    if (x < -1 || y < 0 || x >= place.z || y >= place.w)
-        return (float8)(0.0f);
-    if (x < 0 || x + 1 >= place.z)
-        return (float8)(blend_tap(stored, layer, p), blend_tap(stored, layer, p + (int2)(1, 0)));
-    __global const pixel_stored *first = blend_line(stored, layer, y) + x;
-    float8 c = blend_colours((blend_pixels)(first[0], first[1]));
-    const int2 valid = c.s37 >= 0.5f * WHITE;
-    c.s37 = (float2)(1.0f);
-    return BLEND_EACH(valid) ? c : (float8)(0.0f);
+/* Four pixels of a row as stored; handed on by its address, as charts are in common.cl. */
+static inline void blend_four(__global const pixel_stored *p, blend_pixels *row) {
+    *row = (blend_pixels)(p[0], p[1], p[2], p[3]);
 }
 
-/* Four pixels of a row as stored; handed on by its address, as charts are in common.cl. */
-static inline void blend_four(__global const pixel_stored *p, blend_row *row) {
-    *row = (blend_row)(p[0], p[1], p[2], p[3]);
+/* blend_tap for p and the three pixels to its right. */
+static inline float16 blend_taps(__global const pixel_stored *stored, __global const blend_layer *layer, int2 p) {
+    const int4 place = layer->place;
+    const int x = p.x - place.x, y = p.y - place.y;
+    if (x < -3 || y < 0 || x >= place.z || y >= place.w)
+        return (float16)(0.0f);
+    if (x < 0 || x + 3 >= place.z)
+        return (float16)(blend_tap(stored, layer, p), blend_tap(stored, layer, p + (int2)(1, 0)),
+                         blend_tap(stored, layer, p + (int2)(2, 0)), blend_tap(stored, layer, p + (int2)(3, 0)));
+    blend_pixels four;
+    blend_four(stored + layer->rows + blend_turned(layer, y) * place.z + x, &four);
+    float16 c = blend_colours(four);
+    const int4 valid = c.s37bf >= 0.5f * WHITE;
+    c.s37bf = (float4)(1.0f);
+    return BLEND_EACH(valid) ? c : (float16)(0.0f);
 }
 
 /* Sample where taps may be missing or go across the canvas's border: bicubic if all are there, else bilinear over the
@@ -135,20 +132,21 @@ static inline float4 blend_sample(__global const pixel_stored *stored, __global 
     const int2 first = corner - 1 - place.xy;
     if (first.x >= 0 && first.y >= 0 && first.x + 3 < place.z && first.y + 3 < place.w) {
         /* nearly all samples: every tap is stored, no border rule is needed */
-        blend_row r0, r1, r2, r3;
-        blend_four(blend_line(stored, layer, first.y) + first.x, &r0);
-        blend_four(blend_line(stored, layer, first.y + 1) + first.x, &r1);
-        blend_four(blend_line(stored, layer, first.y + 2) + first.x, &r2);
-        blend_four(blend_line(stored, layer, first.y + 3) + first.x, &r3);
-        const blend_row least = LEAST(LEAST(r0, r1), LEAST(r2, r3));
+        blend_pixels r0, r1, r2, r3;
+        const int row = blend_turned(layer, first.y), wide = place.z;
+        const int rest = layer->ring - row, all = layer->ring * wide; /* rows until they begin anew */
+        __global const pixel_stored *p = stored + layer->rows + row * wide + first.x;
+        blend_four(p, &r0);
+        blend_four(p + (rest > 1 ? wide : wide - all), &r1);
+        blend_four(p + (rest > 2 ? 2 * wide : 2 * wide - all), &r2);
+        blend_four(p + (rest > 3 ? 3 * wide : 3 * wide - all), &r3);
+        const blend_pixels least = LEAST(LEAST(r0, r1), LEAST(r2, r3));
         const int4 valid = convert_float4(least.BLEND_ALPHAS) >= 0.5f * WHITE;
         if (valid.x & valid.y & valid.z & valid.w) {
             const float4 wx = cubic_taps(t.x, BLEND_SLOPE), wy = cubic_taps(t.y, BLEND_SLOPE);
-            const float8 left = wy.x * blend_colours(r0.lo) + wy.y * blend_colours(r1.lo) +
-                                wy.z * blend_colours(r2.lo) + wy.w * blend_colours(r3.lo);
-            const float8 right = wy.x * blend_colours(r0.hi) + wy.y * blend_colours(r1.hi) +
-                                 wy.z * blend_colours(r2.hi) + wy.w * blend_colours(r3.hi);
-            const float4 sum = wx.x * left.lo + wx.y * left.hi + wx.z * right.lo + wx.w * right.hi;
+            const float16 sums = wy.x * blend_colours(r0) + wy.y * blend_colours(r1) + wy.z * blend_colours(r2) +
+                                 wy.w * blend_colours(r3);
+            const float4 sum = wx.x * sums.s0123 + wx.y * sums.s4567 + wx.z * sums.s89ab + wx.w * sums.scdef;
             return (float4)(sum.xyz, 1.0f);
         }
     }
@@ -194,18 +192,18 @@ __kernel void blend_rows(__global const float4 *values, /* arrays one after the 
     }
 }
 
-/* Which columns of a coarse line two positions lie between, and how far. */
+/* Which columns of a coarse line four positions lie between, and how far. */
 typedef struct {
-    int2 left, right;
-    float2 t;
+    int4 left, right;
+    float4 t;
 } blend_between;
 
 /* The columns of a whole grid. */
-static inline blend_between blend_columns(float2 q) {
-    const float2 p = q - 0.5f;
-    int2 left = convert_int2(p);
-    left += p < convert_float2(left); /* true is -1 */
-    const blend_between at = {left, left + 1, p - convert_float2(left)};
+static inline blend_between blend_columns(float4 q) {
+    const float4 p = q - 0.5f;
+    int4 left = convert_int4(p);
+    left += p < convert_float4(left); /* true is -1 */
+    const blend_between at = {left, left + 1, p - convert_float4(left)};
     return at;
 }
 
@@ -223,19 +221,21 @@ static inline blend_between blend_within(blend_between at, int2 span, int4 borde
 }
 
 /* Linear reading of a line of values. */
-static inline float8 blend_read(__global const float4 *line, blend_between at) {
-    const float8 a = (float8)(line[at.left.x], line[at.left.y]), b = (float8)(line[at.right.x], line[at.right.y]);
+static inline float16 blend_read(__global const float4 *line, blend_between at) {
+    const int4 l = at.left, r = at.right;
+    const float16 a = (float16)(line[l.x], line[l.y], line[l.z], line[l.w]);
+    const float16 b = (float16)(line[r.x], line[r.y], line[r.z], line[r.w]);
     return a + BLEND_EACH(at.t) * (b - a);
 }
 
-/* How two pixels are corrected: what odds are multiplied by, less 1, then what is added, for floats to the logarithms
-   of exposure_scale; where there is something. */
+/* How four pixels are corrected: what odds are multiplied by, less 1, then what is added, for floats to the
+   logarithms of exposure_scale; where there is something. */
 typedef struct {
-    float8 rise, offset;
-    int2 some;
+    float16 rise, offset;
+    int4 some;
 } blend_correction;
 
-/* Where corrections of two pixels are read: arrays, columns, the row of gains and that of the band. */
+/* Where corrections of four pixels are read: arrays, columns, the row of gains and that of the band. */
 typedef struct {
     __global const float4 *gains, *offsets;
     blend_between cell, column;
@@ -244,76 +244,76 @@ typedef struct {
 } blend_corrections;
 
 static inline blend_correction blend_corrected(const blend_corrections *from, __global const blend_layer *layer) {
-    blend_correction result = {(float8)(0.0f), (float8)(0.0f), (int2)(0)};
+    blend_correction result = {(float16)(0.0f), (float16)(0.0f), (int4)(0)};
     if (layer->gains >= 0) {
-        const float8 gain = blend_read(from->gains + layer->gains + from->gain_row, from->cell);
-        result.rise = exponential8(gain) - 1.0f;
+        const float16 gain = blend_read(from->gains + layer->gains + from->gain_row, from->cell);
+        result.rise = exponential16(gain) - 1.0f;
         result.some = blend_any(gain);
     }
     if (layer->offsets >= 0) {
-        const float8 offset = blend_read(from->offsets + layer->offsets + from->row * layer->span.y,
+        const float16 offset = blend_read(from->offsets + layer->offsets + from->row * layer->span.y,
                                          blend_within(from->column, layer->span, from->offset_border));
-        result.offset = INTEGER ? WHITE * offset : exponential8(offset) - 1.0f;
+        result.offset = INTEGER ? WHITE * offset : exponential16(offset) - 1.0f;
         result.some |= blend_any(offset);
     }
     return result;
 }
 
-static inline float8 blend_correct(float8 c, blend_correction by, float shoulder) {
-    c = exposure_raise8(c, by.rise, WHITE, shoulder);
+static inline float16 blend_correct(float16 c, blend_correction by, float shoulder) {
+    c = exposure_raise16(c, by.rise, WHITE, shoulder);
     if (INTEGER)
         return c + by.offset;
-    const float8 light = GREATEST(c, (float8)(0.0f)), v = c + (light + EXPOSURE_FLOOR) * by.offset;
-    return v < 0.0f && c >= 0.0f ? (float8)(0.0f) : v;
+    const float16 light = GREATEST(c, (float16)(0.0f)), v = c + (light + EXPOSURE_FLOOR) * by.offset;
+    return v < 0.0f && c >= 0.0f ? (float16)(0.0f) : v;
 }
 
 /* atan2 of positive x; a few terms of the series do where angles are small, as they nearly always are. */
-static inline float2 blend_angles(float2 y, float2 x) {
-    const float2 t = y / x, t2 = t * t;
-    const int2 small = x > 0.0f && t2 < 0.01f;
-    const float2 angle = t * (1.0f - t2 * (1.0f / 3.0f - t2 * (0.2f - t2 / 7.0f)));
+static inline float4 blend_angles(float4 y, float4 x) {
+    const float4 t = y / x, t2 = t * t;
+    const int4 small = x > 0.0f && t2 < 0.01f;
+    const float4 angle = t * (1.0f - t2 * (1.0f / 3.0f - t2 * (0.2f - t2 * (1.0f / 7.0f))));
     if (!blend_some(!small))
         return angle;
-    return small ? angle : (float2)(atan2(y.x, x.x), atan2(y.y, x.y));
+    return small ? angle : atan2(y, x);
 }
 
 /* Where a layer is sampled for pixels at (px, py): the field's displacements d carried to full resolution.
    sl, cl, sp, cp: sine and cosine of the pixels' longitudes and latitude. */
-static inline void blend_positions(float2 px, float py, float8 d, float2 scale, float4 lens, float2 sl, float2 cl,
-                                   float sp, float cp, float2 *x, float2 *y) {
-    const float2 dx = d.s04, dy = d.s15, dz = d.s26;
+static inline void blend_positions(float4 px, float py, float16 d, float2 scale, float4 lens, float4 sl, float4 cl,
+                                   float sp, float cp, float4 *x, float4 *y) {
+    const float4 dx = d.s048c, dy = d.s159d, dz = d.s26ae;
     if (lens.y == 0.0f) {
         *x = px + dx * scale.x;
         *y = py + dy * scale.y;
         return;
     }
     /* in the frame of p (east, north, up) the change of longitude is small, hence exact in float32 */
-    const float2 east = cl * dx - sl * dy, out = cp + sl * dx + cl * dy;
-    const float2 north = sp + dz, squared = east * east + out * out;
-    const float2 level = (float2)(ROOT(squared.x), ROOT(squared.y));
+    const float4 east = cl * dx - sl * dy, out = cp + sl * dx + cl * dy;
+    const float4 north = sp + dz, squared = east * east + out * out;
+    const float4 level = root4(squared);
     *x = px + blend_angles(east, out) / lens.y;
     *y = py - blend_angles(north * cp - level * sp, level * cp + north * sp) / lens.w;
 }
 
-/* The fractions above which r, g, b are rounded up at canvas pixels (x, y) and (x + 1, y): uniform in 0..1, so that
+/* The fractions above which r, g, b are rounded up at canvas pixels (x, y) to (x + 3, y): uniform in 0..1, so that
    the mean of many rounded pixels is right. Steps of the golden ratio spread them evenly along a row, which halves
    the noise that is coarse enough to be seen; where rows begin is mixed from all bits of y and channel. */
-static inline float8 blend_thresholds(int x, int y) {
+static inline float16 blend_thresholds(int x, int y) {
     uint4 h = (uint)y * 4u + (uint4)(0, 1, 2, 3);
     h = (h ^ (h >> 16)) * 0x85ebca6bu;
     h = (h ^ (h >> 13)) * 0xc2b2ae35u;
     h ^= h >> 16;
-    const uint8 across = (uint8)((uint4)x, (uint4)(x + 1)) * 0x9e3779b9u;
-    return (convert_float8((h.s01230123 + across) >> 16) + 0.5f) / 65536.0f;
+    const uint16 across = (uint16)((uint4)x, (uint4)(x + 1), (uint4)(x + 2), (uint4)(x + 3)) * 0x9e3779b9u;
+    return (convert_float16((h.s0123012301230123 + across) >> 16) + 0.5f) / 65536.0f;
 }
 
 /* Whole numbers from 0 to full scale, rounded to nearest, or by dither where a threshold says so. What is whole
    but for the rounding of float32 stays as it is. */
-static inline float8 blend_round(float8 v, float8 thresholds, int8 dithered) {
+static inline float16 blend_round(float16 v, float16 thresholds, int16 dithered) {
     v = v < 0.0f ? 0.0f : v > WHITE ? WHITE : v;
-    const float8 nearest = (v + 8388608.0f) - 8388608.0f, off = v - nearest; /* 2^23 leaves no bits below 1 */
-    const float8 below = convert_float8(convert_int8(v));
-    const float8 spread = v - below > thresholds ? below + 1.0f : below;
+    const float16 nearest = (v + 8388608.0f) - 8388608.0f, off = v - nearest; /* 2^23 leaves no bits below 1 */
+    const float16 below = convert_float16(convert_int16(v));
+    const float16 spread = v - below > thresholds ? below + 1.0f : below;
     return dithered ? (off <= 2e-7f * WHITE && off >= -2e-7f * WHITE ? nearest : spread) : nearest;
 }
 
@@ -330,18 +330,18 @@ __kernel void blend_band(
     __global const float2 *lines,        /* (band.w) sine and cosine of latitude; plane: not used */
     int4 border, float4 lens,            /* full-resolution grid of the region */
     int4 field_border, int4 gain_border, int4 offset_border, /* working grid; colour grid; grid of offsets */
-    int4 band,                           /* its place: left, top, width, height; run size: pairs of columns, rows */
+    int4 band,                           /* its place: left, top, width, height; run size: fours of columns, rows */
     int2 origin,                         /* the region's place on the canvas */
     float shoulder,                      /* of the exposure scale */
     int nearest,                         /* 1: nearest-neighbour sampling */
     float share,                         /* of all weight, below which a layer is hidden */
     __global pixel_stored *out)          /* (band.w, band.z) */
 {
-    const int x = 2 * get_global_id(0), y = get_global_id(1);
+    const int x = 4 * get_global_id(0), y = get_global_id(1);
     if (x >= band.z || y >= band.w)
         return;
     const int2 place = (int2)(x + band.x, y + band.y);
-    const float2 px = convert_float2(place.x + (int2)(0, 1)) + 0.5f;
+    const float4 px = convert_float4(place.x + (int4)(0, 1, 2, 3)) + 0.5f;
     const float py = place.y + 0.5f;
     const float2 scale = (float2)((float)border.x / field_border.x, (float)border.y / field_border.y);
     const blend_corrections corrections = {
@@ -351,11 +351,11 @@ __kernel void blend_band(
 
     int first = count;
     blend_correction correction, first_correction;
-    int2 known = (int2)(0), several = (int2)(0), corrected = (int2)(0);
-    float8 reference = (float8)(0.0f);
+    int4 known = (int4)(0), several = (int4)(0), corrected = (int4)(0);
+    float16 reference = (float16)(0.0f);
     for (int k = 0; k < count && blend_some(!several); ++k) {
-        float8 own = blend_taps(stored, layers + k, place);
-        const int2 seen = own.s37 != 0.0f, fresh = seen & ~known;
+        float16 own = blend_taps(stored, layers + k, place);
+        const int4 seen = own.s37bf != 0.0f, fresh = seen & ~known;
         several |= seen & known;
         known |= seen;
         if (!blend_some(fresh))
@@ -369,68 +369,78 @@ __kernel void blend_band(
         corrected |= fresh & correction.some;
         reference = BLEND_EACH(fresh) ? own : reference;
     }
-    float8 sum = (float8)(0.0f);
+    float16 sum = (float16)(0.0f);
     if (blend_some(several)) {
         const blend_between column = blend_columns(px / scale.x);
-        float2 sl = (float2)(0.0f), cl = sl;
+        float4 sl = (float4)(0.0f), cl = sl;
         float sp = 0.0f, cp = 0.0f;
         if (lens.y != 0.0f) {
-            const float2 left = columns[x], right = columns[LEAST(x + 1, band.z - 1)];
-            sl = (float2)(left.x, right.x);
-            cl = (float2)(left.y, right.y);
+            const int last = band.z - 1;
+            const float8 turns = (float8)(columns[x], columns[LEAST(x + 1, last)], columns[LEAST(x + 2, last)],
+                                          columns[LEAST(x + 3, last)]);
+            sl = turns.even;
+            cl = turns.odd;
             sp = lines[y].x;
             cp = lines[y].y;
         }
-        float2 hidden = (float2)(0.0f);
-        int2 open = several;
+        float4 hidden = (float4)(0.0f);
+        int4 open = several;
         /* a second time with all layers, if most of what is seen lies outside its layer */
         for (int round = 0; round < 2 && blend_some(open); ++round) {
-            float2 total = (float2)(0.0f);
-            float8 all = (float8)(0.0f);
+            float4 total = (float4)(0.0f);
+            float16 all = (float16)(0.0f);
             for (int k = first; k < count; ++k) {
-                float8 c = blend_taps(stored, layers + k, place);
-                int2 seen = open & (c.s37 != 0.0f);
+                float16 c = blend_taps(stored, layers + k, place);
+                int4 seen = open & (c.s37bf != 0.0f);
                 if (!blend_some(seen))
                     continue;
                 __global const float4 *line = ways + layers[k].ways + y * layers[k].way.y;
-                const float8 way = blend_read(line, blend_within(column, layers[k].way, field_border));
-                float2 w = way.s37 + hidden;
+                const float16 way = blend_read(line, blend_within(column, layers[k].way, field_border));
+                float4 w = way.s37bf + hidden;
                 seen &= w > 0.0f;
                 if (!blend_some(seen))
                     continue;
                 w = seen ? w : 0.0f;
                 total += w;
-                const int2 moved = seen & blend_any(way);
+                const int4 moved = seen & blend_any(way);
                 if (blend_some(moved)) {
-                    float2 qx, qy;
+                    float4 qx, qy;
                     blend_positions(px, py, way, scale, lens, sl, cl, sp, cp, &qx, &qy);
                     if (moved.x)
-                        c.lo = blend_sample(stored, layers + k, (float2)(qx.x, qy.x), border, nearest);
+                        c.s0123 = blend_sample(stored, layers + k, (float2)(qx.x, qy.x), border, nearest);
                     if (moved.y)
-                        c.hi = blend_sample(stored, layers + k, (float2)(qx.y, qy.y), border, nearest);
+                        c.s4567 = blend_sample(stored, layers + k, (float2)(qx.y, qy.y), border, nearest);
+                    if (moved.z)
+                        c.s89ab = blend_sample(stored, layers + k, (float2)(qx.z, qy.z), border, nearest);
+                    if (moved.w)
+                        c.scdef = blend_sample(stored, layers + k, (float2)(qx.w, qy.w), border, nearest);
                 }
                 /* a sample that falls outside its layer counts smoothly less */
-                w *= c.s37 * c.s37;
+                w *= c.s37bf * c.s37bf;
                 correction = k == first ? first_correction : blend_corrected(&corrections, layers + k);
                 c = blend_correct(c, correction, shoulder);
                 corrected |= correction.some & (w > 0.0f);
-                float8 part = (c - reference) * BLEND_EACH(w);
-                part.s37 = w;
+                float16 part = (c - reference) * BLEND_EACH(w);
+                part.s37bf = w;
                 all += part;
             }
             sum = BLEND_EACH(open) ? all : sum;
-            open &= !(all.s37 >= 0.5f * total);
+            open &= !(all.s37bf >= 0.5f * total);
             hidden = share * total;
         }
     }
-    const int2 mixed = sum.s37 > 1e-30f;
-    float8 v = BLEND_EACH(mixed) ? reference + sum / BLEND_EACH(sum.s37) : reference;
-    v.s37 = known ? (float2)(WHITE) : (float2)(0.0f);
+    const int4 mixed = sum.s37bf > 1e-30f;
+    float16 v = BLEND_EACH(mixed) ? reference + sum / BLEND_EACH(sum.s37bf) : reference;
+    v.s37bf = known ? (float4)(WHITE) : (float4)(0.0f);
     if (INTEGER)
         v = blend_round(v, blend_thresholds(place.x + origin.x, place.y + origin.y), BLEND_EACH(corrected));
     const blend_pixels made = blend_stored(v);
     __global pixel_stored *target = out + y * band.z + x;
-    target[0] = made.lo;
+    target[0] = made.lo.lo;
     if (x + 1 < band.z)
-        target[1] = made.hi;
+        target[1] = made.lo.hi;
+    if (x + 2 < band.z)
+        target[2] = made.hi.lo;
+    if (x + 3 < band.z)
+        target[3] = made.hi.hi;
 }

@@ -61,7 +61,7 @@ static inline float square3(float3 a) {
     }
 EXPONENTIAL()
 EXPONENTIAL(4)
-EXPONENTIAL(8)
+EXPONENTIAL(16)
 
 /* The natural logarithm of a normal number above 0, to 1e-7: of its power of two, and of what is left, between the
    roots of 1/2 and 2, by the series of the inverse hyperbolic tangent. */
@@ -374,7 +374,7 @@ static inline float3 exposure_scale(float3 c, float shoulder) {
         return shoulder > 0.0f && v > white ? (c < white ? white : c) : v;                                         \
     }
 EXPOSURE_RAISE(3)
-EXPOSURE_RAISE(8)
+EXPOSURE_RAISE(16)
 
 /* Add a gain on the exposure scale. */
 static inline float3 exposure_shift(float3 c, float3 gain, float shoulder) {

@@ -179,7 +179,7 @@ def test_a_band_of_three_layers_equals_its_twin(
     ]
     rows, lines, factors, summands = (device.upload(a) for a in packed)
     device.run(
-        "blend", "blend_band", (-(-band[2] // 2), band[3]), rows, device.upload(table), 3, lines, factors,
+        "blend", "blend_band", (-(-band[2] // 4), band[3]), rows, device.upload(table), 3, lines, factors,
         summands, *axes, full.border, full.lens, grid.border, cells.border, halves.border, band, origin,
         shoulder, nearest, share, out, options=options,
     )  # fmt: skip
