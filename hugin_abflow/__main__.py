@@ -1,16 +1,29 @@
-"""The command ``hugin-abflow``, which is also ``python -m hugin_abflow``."""
+"""The commands. What they load takes most of a second, in which Ctrl-C may come as well."""
 
+import os
 import sys
+from importlib import import_module
 
 
 def main() -> int:
-    """Run the command with the process's own arguments and return its exit code."""
+    """Run ``hugin-abflow``, which is also ``python -m hugin_abflow``; gives its exit code."""
+    return _run("hugin-abflow", "hugin_abflow.cli")
+
+
+def enblend() -> int:
+    """Run ``abflow-enblend``; gives its exit code."""
+    return _run("abflow-enblend", "hugin_abflow.dropin.enblend")
+
+
+def _run(program: str, module: str) -> int:
+    # before NumPy is loaded: idle threads of its BLAS turn round and round, on cores that others need
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     try:
-        from hugin_abflow.cli import main as run  # takes most of a second, in which Ctrl-C may come as well
+        command = import_module(module).main
     except KeyboardInterrupt:
-        print("hugin-abflow: interrupted", file=sys.stderr)
+        print(f"{program}: interrupted", file=sys.stderr)
         return 130  # ExitCode.INTERRUPTED
-    return run()
+    return int(command())
 
 
 if __name__ == "__main__":

@@ -246,12 +246,13 @@ def test_verbose_says_what_is_merged(folder: Path, capsys: pytest.CaptureFixture
     assert lines[len(expected) + 1] == "read ..."
 
 
-def test_interruption_while_modules_load_is_no_traceback(tmp_path: Path) -> None:
-    (tmp_path / "click.py").write_text("raise KeyboardInterrupt")
-    command = [sys.executable, "-m", "hugin_abflow", "--version"]
+@pytest.mark.parametrize(("function", "program"), [("main", "hugin-abflow"), ("enblend", "abflow-enblend")])
+def test_interruption_while_modules_load_is_no_traceback(tmp_path: Path, function: str, program: str) -> None:
+    (tmp_path / "numpy.py").write_text("raise KeyboardInterrupt")
+    command = [sys.executable, "-c", f"from hugin_abflow import __main__; exit(__main__.{function}())"]
     done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=60)
     assert done.returncode == ExitCode.INTERRUPTED
-    assert (done.stdout, done.stderr) == ("", "hugin-abflow: interrupted\n")
+    assert (done.stdout, done.stderr) == ("", f"{program}: interrupted\n")
 
 
 @pytest.mark.skipif(os.name == "nt", reason="Windows has no such signals")
