@@ -1,8 +1,9 @@
-"""The OpenCL device: choose, build, run. The only module that uses pyopencl."""
+"""The OpenCL device: choose, build, run. With `launch` the only module that uses pyopencl."""
 
 from __future__ import annotations
 
 import logging
+import math
 import os
 import sys
 import threading
@@ -12,7 +13,7 @@ from collections import deque
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from functools import cache, lru_cache
+from functools import cache
 from pathlib import Path
 from typing import Any
 from weakref import WeakSet
@@ -21,7 +22,7 @@ import numpy as np
 import numpy.typing as npt
 import pyopencl as cl
 
-from hugin_abflow import memory, trace
+from hugin_abflow import launch, memory, trace
 from hugin_abflow.errors import DeviceError
 from hugin_abflow.spare import Spare
 
@@ -173,7 +174,7 @@ class Buffer:
 
     def __init__(self, device: Device, shape: tuple[int, ...], dtype: npt.DTypeLike) -> None:
         self.shape, self.dtype = shape, np.dtype(dtype)
-        self.nbytes = int(np.prod(shape, dtype=np.int64)) * self.dtype.itemsize
+        self.nbytes = math.prod(map(int, shape)) * self.dtype.itemsize
         self._device = device
         self.data = device.spare.take(self.nbytes)
         if self.data is None:
@@ -369,8 +370,8 @@ class Device:
             return
         with self._arguments, _device_errors(f"running {name}"):
             kernel = self.kernel(module, name, options)
-            kernel.set_args(*(_argument(a) for a in args))
-            event = cl.enqueue_nd_range_kernel(self.queue, kernel, *_launch(size, group))
+            launch.set_arguments(kernel, _values(args))
+            event = cl.enqueue_nd_range_kernel(self.queue, kernel, *launch.work_groups(size, group))
         self.timed(name, trace.KERNEL, event)
 
     def repeat(
@@ -387,14 +388,14 @@ class Device:
 
         Arguments are set once: on small grids that is most of what a launch costs.
         """
-        launch = _launch(size, group)
+        groups = launch.work_groups(size, group)
         with self._arguments, _device_errors(f"running {name}"):
             kernels = self._instances(module, name, options, len(calls))
             for kernel, args in zip(kernels, calls, strict=True):
-                kernel.set_args(*(_argument(a) for a in args))
+                launch.set_arguments(kernel, _values(args))
             for _ in range(times):
                 for kernel in kernels:
-                    event = cl.enqueue_nd_range_kernel(self.queue, kernel, *launch)
+                    event = cl.enqueue_nd_range_kernel(self.queue, kernel, *groups)
                     self.timed(name, trace.KERNEL, event)
 
     def _instances(self, module: str, name: str, options: str, count: int) -> list[cl.Kernel]:
@@ -426,25 +427,5 @@ class Device:
             self._times.tell()
 
 
-def _launch(size: Sequence[int], group: int) -> tuple[tuple[int, ...], tuple[int, ...]]:
-    """A run size in whole work-groups, and the size of these."""
-    columns, *others = map(int, size)
-    return (-(-columns // group) * group, *others), (group, *(1 for _ in others))
-
-
-def _argument(value: Any) -> Any:
-    if isinstance(value, Buffer):
-        return value.data
-    if isinstance(value, bool | int | np.integer):
-        return np.int32(value)
-    if isinstance(value, float | np.floating):
-        return np.float32(value)
-    kind = "int" if np.asarray(value).dtype.kind in "iu" else "float"
-    return _vector(kind, tuple(value))
-
-
-# pyopencl takes a tenth of a millisecond for each, and grids come again and again. The kind is part of the
-# key, because (1, 1) equals (1.0, 1.0)
-@lru_cache(maxsize=1024)
-def _vector(kind: str, values: tuple[float, ...]) -> Any:
-    return getattr(cl.cltypes, f"make_{kind}{len(values)}")(*(np.asarray(values).tolist()))
+def _values(arguments: Sequence[object]) -> list[object]:
+    return [value.data if isinstance(value, Buffer) else value for value in arguments]

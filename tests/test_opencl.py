@@ -251,17 +251,6 @@ def test_parts_of_buffers_are_copied(device: Device) -> None:
     assert np.array_equal(target.get(), expected)
 
 
-def test_vectors_are_of_their_numbers_kind() -> None:
-    """(1, 1) equals (1.0, 1.0), but a kernel reads other bits."""
-    for values in ((1, 1), (1.0, 1.0), (1, 2, 3, 4), (1.0, 2.0, 3.0, 4.0), np.arange(16, dtype=np.float32)):
-        vector = opencl._argument(values)
-        kind = np.int32 if isinstance(values[0], int) else np.float32
-        assert vector.tobytes()[: 4 * len(values)] == np.array(values, kind).tobytes()
-    assert opencl._argument(True).dtype == np.int32
-    assert opencl._argument(2).dtype == np.int32
-    assert opencl._argument(2.0).dtype == np.float32
-
-
 def test_running_over_nothing_does_nothing(device: Device) -> None:
     image = device.empty((0, 7))
     device.run("pyramid", "pyramid_reduce", (7, 0), image, image, (7, 0, 0, 0), image, image, (4, 0))

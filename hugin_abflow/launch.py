@@ -1,0 +1,45 @@
+"""What a kernel is started with: its work-groups and arguments."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+import pyopencl as cl
+
+
+def work_groups(size: Sequence[int], group: int) -> tuple[tuple[int, ...], tuple[int, ...]]:
+    """A run size in whole work-groups, and the size of these."""
+    columns, *others = map(int, size)
+    return (-(-columns // group) * group, *others), (group, *(1 for _ in others))
+
+
+def set_arguments(kernel: cl.Kernel, values: Sequence[object]) -> None:
+    """Set a kernel's arguments: `cl.Buffer`, int (int32), float (float32), or a tuple / array of 2, 4 or 16
+    numbers, an int or float vector. Each has the type that it had the first time.
+    """
+    arguments = [value if isinstance(value, cl.Buffer) else argument(value) for value in values]
+    if not hasattr(kernel, "abflow_typed"):
+        # told once: to find types out each time takes forty times as long as all that is left
+        kernel.set_arg_types([None if isinstance(one, cl.Buffer) else one.dtype for one in arguments])
+        kernel.abflow_typed = True
+    kernel.set_args(*arguments)
+
+
+def argument(value: Any) -> Any:
+    """A number or several as a kernel takes them."""
+    if isinstance(value, bool | int | np.integer):
+        return np.int32(value)
+    if isinstance(value, float | np.floating):
+        return np.float32(value)
+    kind = "int" if np.asarray(value).dtype.kind in "iu" else "float"
+    return _vector(kind, tuple(value))
+
+
+# pyopencl takes a tenth of a millisecond for each, and grids come again and again. The kind is part of the
+# key, because (1, 1) equals (1.0, 1.0)
+@lru_cache(maxsize=1024)
+def _vector(kind: str, values: tuple[float, ...]) -> Any:
+    return getattr(cl.cltypes, f"make_{kind}{len(values)}")(*(np.asarray(values).tolist()))
