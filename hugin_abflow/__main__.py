@@ -1,4 +1,4 @@
-"""The commands. What they load takes most of a second, in which Ctrl-C may come as well."""
+"""``hugin-abflow`` and ``abflow-enblend``: to load what they need takes a while, in which Ctrl-C may come."""
 
 import os
 import sys

@@ -160,7 +160,8 @@ def _bands(
     """Bands of `height` rows."""
     region, first = full.region, layers[0].layer
     pixel, white = pixel_options(first)
-    options = f"{pixel} -DWHITE={white:.1f}f -DINTEGER={int(first.dtype.kind == 'u')}"
+    together = 4 if device.has_long_vectors else 2  # pixels
+    options = f"{pixel} -DWHITE={white:.1f}f -DINTEGER={int(first.dtype.kind == 'u')} -DPIXELS={together}"
     share = _QUARTER_LEVEL.get(first.dtype, _QUARTER_FINE_LEVEL)
     whole = (0, 0, gain_grid.width, gain_grid.height)
     fields = [(layer.box, layer.field) for layer in layers]
@@ -178,7 +179,7 @@ def _bands(
         for band in plan:
             part = band.part
             size = part.width, part.height
-            fours = -(-part.width // 4), part.height
+            groups = -(-part.width // together), part.height
             store.next()
             way_starts = _lines(device, fields, part, full, grid, share, ways)
             gain_starts = _lines(device, gains, part, full, gain_grid, 0.0, gained)
@@ -196,8 +197,8 @@ def _bands(
             latitudes = _turn(device, full.lens[2], -full.lens[3], part.top, part.height)
             out = device.empty((part.height, part.width, first.channels + 1), device_dtype(first))
             device.run(
-                "blend", "blend_band", fours, store.rows, device.upload(table[used]), len(used), ways, gained,
-                added, longitudes, latitudes, full.border, full.lens, grid.border, gain_grid.border,
+                "blend", "blend_band", groups, store.rows, device.upload(table[used]), len(used), ways,
+                gained, added, longitudes, latitudes, full.border, full.lens, grid.border, gain_grid.border,
                 offset_grid.border,
                 (part.left, part.top, *size), (region.left, region.top),
                 shoulder, int(settings.interpolation == "nearest"), share, out, options=options,
@@ -234,7 +235,7 @@ def _lines(
     device.run(
         "blend", "blend_rows", (grid.width, part.height), packed, device.upload(table), len(table),
         (grid.width, part.height), part.top, scale, share, result,
-        options="-DPIXEL=float -DSAMPLES=4 -DWHITE=1.0f -DINTEGER=0",
+        options="-DPIXEL=float -DSAMPLES=4 -DWHITE=1.0f -DINTEGER=0 -DPIXELS=2",
     )  # fmt: skip
     starts: list[int] = table[:, 5].tolist()
     return starts

@@ -303,6 +303,11 @@ class Device:
         return 0 if shared else sum(buffer.nbytes for buffer in self.buffers)
 
     @property
+    def has_long_vectors(self) -> bool:
+        """Whether it calculates with 16 floats at a time, as processors with AVX-512 do."""
+        return bool(self.device.native_vector_width_float >= 16)
+
+    @property
     def kind(self) -> str:
         """ "GPU", "CPU" or "other"."""
         return _kind(self.device)

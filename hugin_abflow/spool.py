@@ -71,7 +71,7 @@ class _Block(NamedTuple):
 
 
 class _Rows:
-    """Rows of one layer; the `read` of a `Layer`. start: where row 0 is in the file."""
+    """Rows of one layer; the `read` of a `Layer`. start: where the room for them begins in the file."""
 
     def __init__(self, layer: Layer, file: IO[bytes], start: int) -> None:
         self._layer, self._start = layer, start
@@ -113,11 +113,14 @@ class _Rows:
             for block in (self._blocks[index] for index in blocks):
                 first, end = max(top, block.first), min(bottom, block.end)
                 for left, right, place in block.spans:
-                    part = np.empty((end - first, right - left, shape[2]), rows.dtype)
+                    target = part = rows[first - top : end - top, left:right]
+                    if not part.flags.c_contiguous:
+                        part = np.empty(part.shape, part.dtype)
                     place += (first - block.first) * (right - left) * self._pixel
                     if os.preadv(file.fileno(), [_bytes(part).data], place) != part.nbytes:
                         return None
-                    rows[first - top : end - top, left:right] = part
+                    if part is not target:
+                        target[:] = part
             return rows
         return None
 

@@ -1,23 +1,13 @@
 /* The full-resolution pass over one band of rows. Built with PIXEL (stored sample type), SAMPLES (2 or 4, alpha
-   last), WHITE (full scale) and INTEGER (1: round and saturate). Places are pixels of the region.
+   last), WHITE (full scale), INTEGER (1: round and saturate) and PIXELS (2 or 4). Places are pixels of the region.
 
-   A work item makes four pixels side by side: what is known of each is float4 or int4, their colours are float16, r,
-   g, b and one value more of the first, then of the next. PoCL's compiler makes vectors of no more than what is
-   written as vectors, and a processor waits less where there is more to do at a time. */
+   A work item makes PIXELS pixels side by side: what is known of each is blend_real or blend_int, their colours are
+   blend_samples, r, g, b and one value more of the first, then of the next. PoCL's compiler makes vectors of no more
+   than what is written as vectors, so these are as long as a processor's: with 4 pixels 64 bytes. */
 
 /* Of the cubic that layers are sampled with: Catmull-Rom's -1/2 loses a twentieth of fine texture's gradients over
    all fractions, this next to nothing; a ramp stays one to 0.03 px. */
 #define BLEND_SLOPE (-2.0f / 3.0f)
-
-#if SAMPLES > 2
-#define BLEND_SAMPLES 16
-#define BLEND_ALPHAS s37bf
-#else
-#define BLEND_SAMPLES 8
-#define BLEND_ALPHAS s1357
-#endif
-
-typedef PIXEL_VECTOR(PIXEL, BLEND_SAMPLES) blend_pixels; /* four as stored */
 
 /* One layer as a band needs it: 64 bytes, made by hugin_abflow/blend.py. */
 typedef struct {
@@ -30,35 +20,36 @@ typedef struct {
     int unused[2];
 } blend_layer;
 
-/* pixel_samples of common.cl for four pixels: in OpenCL C no text says which samples go where for both. */
-static inline float16 blend_colours(blend_pixels p) {
+/* pixel_samples of common.cl for two pixels: in OpenCL C no text says which samples go where for both. */
+static inline float8 blend_pair(blend_two p) {
 #if SAMPLES > 2
-    return convert_float16(p);
+    return convert_float8(p);
 #else
-    return convert_float8(p).s0001222344456667;
+    return convert_float4(p).s00012223;
 #endif
 }
 
-static inline blend_pixels blend_stored(float16 v) {
+/* The same for PIXELS, and back. */
+static inline blend_samples blend_colours(blend_pixels p) {
 #if SAMPLES > 2
-    return PIXEL_VECTOR(convert_, PIXEL_VECTOR(PIXEL, 16))(v);
+    return BLEND_FLOATS(p);
 #else
-    return PIXEL_VECTOR(convert_, PIXEL_VECTOR(PIXEL, 8))(v.s03478bcf);
+    return PIXEL_VECTOR(convert_float, BLEND_STORED)(p).BLEND_SPREAD;
 #endif
 }
 
-/* What is known of four pixels, for each of their samples. */
-#define BLEND_EACH(v) (v).s0000111122223333
-
-/* Whether it is so for one of four pixels at least. */
-static inline bool blend_some(int4 v) {
-    return (v.x | v.y | v.z | v.w) != 0;
+static inline blend_pixels blend_stored(blend_samples v) {
+#if SAMPLES > 2
+    return PIXEL_VECTOR(convert_, PIXEL_VECTOR(PIXEL, BLEND_STORED))(v);
+#else
+    return PIXEL_VECTOR(convert_, PIXEL_VECTOR(PIXEL, BLEND_STORED))(v.BLEND_PACKED);
+#endif
 }
 
 /* Where r, g or b is not 0. */
-static inline int4 blend_any(float16 v) {
-    const int16 set = v != 0.0f;
-    return set.s048c | set.s159d | set.s26ae;
+static inline blend_int blend_any(blend_samples v) {
+    const blend_marks set = v != 0.0f;
+    return set.REDS | set.GREENS | set.BLUES;
 }
 
 /* Which row of its ring a layer's row is. */
@@ -77,26 +68,27 @@ static inline float4 blend_tap(__global const pixel_stored *stored, __global con
     return c.w >= 0.5f * WHITE ? (float4)(c.xyz, 1.0f) : (float4)(0.0f);
 }
 
-/* Four pixels of a row as stored; handed on by its address, as charts are in common.cl. */
-static inline void blend_four(__global const pixel_stored *p, blend_pixels *row) {
-    *row = (blend_pixels)(p[0], p[1], p[2], p[3]);
-}
-
-/* blend_tap for p and the three pixels to its right. */
-static inline float16 blend_taps(__global const pixel_stored *stored, __global const blend_layer *layer, int2 p) {
+/* blend_tap for p and the pixels to its right. */
+static inline blend_samples blend_taps(__global const pixel_stored *stored, __global const blend_layer *layer,
+                                       int2 p) {
     const int4 place = layer->place;
     const int x = p.x - place.x, y = p.y - place.y;
-    if (x < -3 || y < 0 || x >= place.z || y >= place.w)
-        return (float16)(0.0f);
-    if (x < 0 || x + 3 >= place.z)
-        return (float16)(blend_tap(stored, layer, p), blend_tap(stored, layer, p + (int2)(1, 0)),
-                         blend_tap(stored, layer, p + (int2)(2, 0)), blend_tap(stored, layer, p + (int2)(3, 0)));
-    blend_pixels four;
-    blend_four(stored + layer->rows + blend_turned(layer, y) * place.z + x, &four);
-    float16 c = blend_colours(four);
-    const int4 valid = c.s37bf >= 0.5f * WHITE;
-    c.s37bf = (float4)(1.0f);
-    return BLEND_EACH(valid) ? c : (float16)(0.0f);
+    if (x <= -PIXELS || y < 0 || x >= place.z || y >= place.w)
+        return (blend_samples)(0.0f);
+#define BLEND_TAP(n, i) blend_tap(stored, layer, p + (int2)(n, 0))
+    if (x < 0 || x + PIXELS > place.z)
+        return (blend_samples)(BLEND_LIST(BLEND_TAP));
+    __global const pixel_stored *first = stored + layer->rows + blend_turned(layer, y) * place.z + x;
+#define BLEND_NEXT(n, i) first[n]
+    blend_samples c = blend_colours((blend_pixels)(BLEND_LIST(BLEND_NEXT)));
+    const blend_int valid = c.FOURTHS >= 0.5f * WHITE;
+    c.FOURTHS = (blend_real)(1.0f);
+    return BLEND_EACH(valid) ? c : (blend_samples)(0.0f);
+}
+
+/* Four pixels of a row as stored; handed on by its address, as charts are in common.cl. */
+static inline void blend_row(__global const pixel_stored *p, blend_four *row) {
+    *row = (blend_four)(p[0], p[1], p[2], p[3]);
 }
 
 /* Sample where taps may be missing or go across the canvas's border: bicubic if all are there, else bilinear over the
@@ -132,21 +124,23 @@ static inline float4 blend_sample(__global const pixel_stored *stored, __global 
     const int2 first = corner - 1 - place.xy;
     if (first.x >= 0 && first.y >= 0 && first.x + 3 < place.z && first.y + 3 < place.w) {
         /* nearly all samples: every tap is stored, no border rule is needed */
-        blend_pixels r0, r1, r2, r3;
+        blend_four r0, r1, r2, r3;
         const int row = blend_turned(layer, first.y), wide = place.z;
         const int rest = layer->ring - row, all = layer->ring * wide; /* rows until they begin anew */
         __global const pixel_stored *p = stored + layer->rows + row * wide + first.x;
-        blend_four(p, &r0);
-        blend_four(p + (rest > 1 ? wide : wide - all), &r1);
-        blend_four(p + (rest > 2 ? 2 * wide : 2 * wide - all), &r2);
-        blend_four(p + (rest > 3 ? 3 * wide : 3 * wide - all), &r3);
-        const blend_pixels least = LEAST(LEAST(r0, r1), LEAST(r2, r3));
+        blend_row(p, &r0);
+        blend_row(p + (rest > 1 ? wide : wide - all), &r1);
+        blend_row(p + (rest > 2 ? 2 * wide : 2 * wide - all), &r2);
+        blend_row(p + (rest > 3 ? 3 * wide : 3 * wide - all), &r3);
+        const blend_four least = LEAST(LEAST(r0, r1), LEAST(r2, r3));
         const int4 valid = convert_float4(least.BLEND_ALPHAS) >= 0.5f * WHITE;
         if (valid.x & valid.y & valid.z & valid.w) {
             const float4 wx = cubic_taps(t.x, BLEND_SLOPE), wy = cubic_taps(t.y, BLEND_SLOPE);
-            const float16 sums = wy.x * blend_colours(r0) + wy.y * blend_colours(r1) + wy.z * blend_colours(r2) +
-                                 wy.w * blend_colours(r3);
-            const float4 sum = wx.x * sums.s0123 + wx.y * sums.s4567 + wx.z * sums.s89ab + wx.w * sums.scdef;
+            const float8 left = wy.x * blend_pair(r0.lo) + wy.y * blend_pair(r1.lo) + wy.z * blend_pair(r2.lo) +
+                                wy.w * blend_pair(r3.lo);
+            const float8 right = wy.x * blend_pair(r0.hi) + wy.y * blend_pair(r1.hi) + wy.z * blend_pair(r2.hi) +
+                                 wy.w * blend_pair(r3.hi);
+            const float4 sum = wx.x * left.lo + wx.y * left.hi + wx.z * right.lo + wx.w * right.hi;
             return (float4)(sum.xyz, 1.0f);
         }
     }
@@ -192,18 +186,18 @@ __kernel void blend_rows(__global const float4 *values, /* arrays one after the 
     }
 }
 
-/* Which columns of a coarse line four positions lie between, and how far. */
+/* Which columns of a coarse line PIXELS positions lie between, and how far. */
 typedef struct {
-    int4 left, right;
-    float4 t;
+    blend_int left, right;
+    blend_real t;
 } blend_between;
 
 /* The columns of a whole grid. */
-static inline blend_between blend_columns(float4 q) {
-    const float4 p = q - 0.5f;
-    int4 left = convert_int4(p);
-    left += p < convert_float4(left); /* true is -1 */
-    const blend_between at = {left, left + 1, p - convert_float4(left)};
+static inline blend_between blend_columns(blend_real q) {
+    const blend_real p = q - 0.5f;
+    blend_int left = BLEND_INTS(p);
+    left += p < BLEND_REALS(left); /* true is -1 */
+    const blend_between at = {left, left + 1, p - BLEND_REALS(left)};
     return at;
 }
 
@@ -221,21 +215,21 @@ static inline blend_between blend_within(blend_between at, int2 span, int4 borde
 }
 
 /* Linear reading of a line of values. */
-static inline float16 blend_read(__global const float4 *line, blend_between at) {
-    const int4 l = at.left, r = at.right;
-    const float16 a = (float16)(line[l.x], line[l.y], line[l.z], line[l.w]);
-    const float16 b = (float16)(line[r.x], line[r.y], line[r.z], line[r.w]);
+static inline blend_samples blend_read(__global const float4 *line, blend_between at) {
+#define BLEND_LEFT(n, i) line[at.left.i]
+#define BLEND_RIGHT(n, i) line[at.right.i]
+    const blend_samples a = (blend_samples)(BLEND_LIST(BLEND_LEFT)), b = (blend_samples)(BLEND_LIST(BLEND_RIGHT));
     return a + BLEND_EACH(at.t) * (b - a);
 }
 
-/* How four pixels are corrected: what odds are multiplied by, less 1, then what is added, for floats to the
+/* How pixels are corrected: what odds are multiplied by, less 1, then what is added, for floats to the
    logarithms of exposure_scale; where there is something. */
 typedef struct {
-    float16 rise, offset;
-    int4 some;
+    blend_samples rise, offset;
+    blend_int some;
 } blend_correction;
 
-/* Where corrections of four pixels are read: arrays, columns, the row of gains and that of the band. */
+/* Where their corrections are read: arrays, columns, the row of gains and that of the band. */
 typedef struct {
     __global const float4 *gains, *offsets;
     blend_between cell, column;
@@ -244,76 +238,81 @@ typedef struct {
 } blend_corrections;
 
 static inline blend_correction blend_corrected(const blend_corrections *from, __global const blend_layer *layer) {
-    blend_correction result = {(float16)(0.0f), (float16)(0.0f), (int4)(0)};
+    blend_correction result = {(blend_samples)(0.0f), (blend_samples)(0.0f), (blend_int)(0)};
     if (layer->gains >= 0) {
-        const float16 gain = blend_read(from->gains + layer->gains + from->gain_row, from->cell);
-        result.rise = exponential16(gain) - 1.0f;
+        const blend_samples gain = blend_read(from->gains + layer->gains + from->gain_row, from->cell);
+        result.rise = BLEND_EXPONENTIAL(gain) - 1.0f;
         result.some = blend_any(gain);
     }
     if (layer->offsets >= 0) {
-        const float16 offset = blend_read(from->offsets + layer->offsets + from->row * layer->span.y,
+        const blend_samples offset = blend_read(from->offsets + layer->offsets + from->row * layer->span.y,
                                          blend_within(from->column, layer->span, from->offset_border));
-        result.offset = INTEGER ? WHITE * offset : exponential16(offset) - 1.0f;
+        result.offset = INTEGER ? WHITE * offset : BLEND_EXPONENTIAL(offset) - 1.0f;
         result.some |= blend_any(offset);
     }
     return result;
 }
 
-static inline float16 blend_correct(float16 c, blend_correction by, float shoulder) {
-    c = exposure_raise16(c, by.rise, WHITE, shoulder);
+static inline blend_samples blend_correct(blend_samples c, blend_correction by, float shoulder) {
+    c = BLEND_RAISE(c, by.rise, WHITE, shoulder);
     if (INTEGER)
         return c + by.offset;
-    const float16 light = GREATEST(c, (float16)(0.0f)), v = c + (light + EXPOSURE_FLOOR) * by.offset;
-    return v < 0.0f && c >= 0.0f ? (float16)(0.0f) : v;
+    const blend_samples light = GREATEST(c, (blend_samples)(0.0f)), v = c + (light + EXPOSURE_FLOOR) * by.offset;
+    return v < 0.0f && c >= 0.0f ? (blend_samples)(0.0f) : v;
 }
 
 /* atan2 of positive x; a few terms of the series do where angles are small, as they nearly always are. */
-static inline float4 blend_angles(float4 y, float4 x) {
-    const float4 t = y / x, t2 = t * t;
-    const int4 small = x > 0.0f && t2 < 0.01f;
-    const float4 angle = t * (1.0f - t2 * (1.0f / 3.0f - t2 * (0.2f - t2 * (1.0f / 7.0f))));
-    if (!blend_some(!small))
+static inline blend_real blend_angles(blend_real y, blend_real x) {
+    const blend_real t = y / x, t2 = t * t;
+    const blend_int small = x > 0.0f && t2 < 0.01f;
+    const blend_real angle = t * (1.0f - t2 * (1.0f / 3.0f - t2 * (0.2f - t2 * (1.0f / 7.0f))));
+    if (!BLEND_SOME(!small))
         return angle;
     return small ? angle : atan2(y, x);
 }
 
 /* Where a layer is sampled for pixels at (px, py): the field's displacements d carried to full resolution.
    sl, cl, sp, cp: sine and cosine of the pixels' longitudes and latitude. */
-static inline void blend_positions(float4 px, float py, float16 d, float2 scale, float4 lens, float4 sl, float4 cl,
-                                   float sp, float cp, float4 *x, float4 *y) {
-    const float4 dx = d.s048c, dy = d.s159d, dz = d.s26ae;
+static inline void blend_positions(blend_real px, float py, blend_samples d, float2 scale, float4 lens, blend_real sl,
+                                   blend_real cl, float sp, float cp, blend_real *x, blend_real *y) {
+    const blend_real dx = d.REDS, dy = d.GREENS, dz = d.BLUES;
     if (lens.y == 0.0f) {
         *x = px + dx * scale.x;
         *y = py + dy * scale.y;
         return;
     }
     /* in the frame of p (east, north, up) the change of longitude is small, hence exact in float32 */
-    const float4 east = cl * dx - sl * dy, out = cp + sl * dx + cl * dy;
-    const float4 north = sp + dz, squared = east * east + out * out;
-    const float4 level = root4(squared);
+    const blend_real east = cl * dx - sl * dy, out = cp + sl * dx + cl * dy;
+    const blend_real north = sp + dz, squared = east * east + out * out;
+#define BLEND_ROOT(n, i) ROOT(squared.i)
+    const blend_real level = (blend_real)(BLEND_LIST(BLEND_ROOT));
     *x = px + blend_angles(east, out) / lens.y;
     *y = py - blend_angles(north * cp - level * sp, level * cp + north * sp) / lens.w;
 }
 
-/* The fractions above which r, g, b are rounded up at canvas pixels (x, y) to (x + 3, y): uniform in 0..1, so that
+/* The fractions above which r, g, b are rounded up at canvas pixels from (x, y) on: uniform in 0..1, so that
    the mean of many rounded pixels is right. Steps of the golden ratio spread them evenly along a row, which halves
    the noise that is coarse enough to be seen; where rows begin is mixed from all bits of y and channel. */
-static inline float16 blend_thresholds(int x, int y) {
+static inline blend_samples blend_thresholds(int x, int y) {
     uint4 h = (uint)y * 4u + (uint4)(0, 1, 2, 3);
     h = (h ^ (h >> 16)) * 0x85ebca6bu;
     h = (h ^ (h >> 13)) * 0xc2b2ae35u;
     h ^= h >> 16;
-    const uint16 across = (uint16)((uint4)x, (uint4)(x + 1), (uint4)(x + 2), (uint4)(x + 3)) * 0x9e3779b9u;
-    return (convert_float16((h.s0123012301230123 + across) >> 16) + 0.5f) / 65536.0f;
+    typedef PIXEL_VECTOR(uint, BLEND_SAMPLES) blend_bits;
+#define BLEND_COLUMN(n, i) (uint4)(x + n)
+#define BLEND_SAME(n, i) h
+    const blend_bits same = (blend_bits)(BLEND_LIST(BLEND_SAME));
+    const blend_bits across = (blend_bits)(BLEND_LIST(BLEND_COLUMN)) * 0x9e3779b9u;
+    return (BLEND_FLOATS((same + across) >> 16) + 0.5f) / 65536.0f;
 }
 
 /* Whole numbers from 0 to full scale, rounded to nearest, or by dither where a threshold says so. What is whole
    but for the rounding of float32 stays as it is. */
-static inline float16 blend_round(float16 v, float16 thresholds, int16 dithered) {
+static inline blend_samples blend_round(blend_samples v, blend_samples thresholds, blend_marks dithered) {
     v = v < 0.0f ? 0.0f : v > WHITE ? WHITE : v;
-    const float16 nearest = (v + 8388608.0f) - 8388608.0f, off = v - nearest; /* 2^23 leaves no bits below 1 */
-    const float16 below = convert_float16(convert_int16(v));
-    const float16 spread = v - below > thresholds ? below + 1.0f : below;
+    const blend_samples nearest = (v + 8388608.0f) - 8388608.0f, off = v - nearest; /* 2^23 leaves no bits below 1 */
+    const blend_samples below = BLEND_FLOATS(PIXEL_VECTOR(convert_int, BLEND_SAMPLES)(v));
+    const blend_samples spread = v - below > thresholds ? below + 1.0f : below;
     return dithered ? (off <= 2e-7f * WHITE && off >= -2e-7f * WHITE ? nearest : spread) : nearest;
 }
 
@@ -330,18 +329,19 @@ __kernel void blend_band(
     __global const float2 *lines,        /* (band.w) sine and cosine of latitude; plane: not used */
     int4 border, float4 lens,            /* full-resolution grid of the region */
     int4 field_border, int4 gain_border, int4 offset_border, /* working grid; colour grid; grid of offsets */
-    int4 band,                           /* its place: left, top, width, height; run size: fours of columns, rows */
+    int4 band,                           /* its place: left, top, width, height; run size: columns / PIXELS, rows */
     int2 origin,                         /* the region's place on the canvas */
     float shoulder,                      /* of the exposure scale */
     int nearest,                         /* 1: nearest-neighbour sampling */
     float share,                         /* of all weight, below which a layer is hidden */
     __global pixel_stored *out)          /* (band.w, band.z) */
 {
-    const int x = 4 * get_global_id(0), y = get_global_id(1);
+    const int x = PIXELS * get_global_id(0), y = get_global_id(1);
     if (x >= band.z || y >= band.w)
         return;
     const int2 place = (int2)(x + band.x, y + band.y);
-    const float4 px = convert_float4(place.x + (int4)(0, 1, 2, 3)) + 0.5f;
+#define BLEND_NUMBER(n, i) n
+    const blend_real px = BLEND_REALS(place.x + (blend_int)(BLEND_LIST(BLEND_NUMBER))) + 0.5f;
     const float py = place.y + 0.5f;
     const float2 scale = (float2)((float)border.x / field_border.x, (float)border.y / field_border.y);
     const blend_corrections corrections = {
@@ -351,14 +351,14 @@ __kernel void blend_band(
 
     int first = count;
     blend_correction correction, first_correction;
-    int4 known = (int4)(0), several = (int4)(0), corrected = (int4)(0);
-    float16 reference = (float16)(0.0f);
-    for (int k = 0; k < count && blend_some(!several); ++k) {
-        float16 own = blend_taps(stored, layers + k, place);
-        const int4 seen = own.s37bf != 0.0f, fresh = seen & ~known;
+    blend_int known = (blend_int)(0), several = (blend_int)(0), corrected = (blend_int)(0);
+    blend_samples reference = (blend_samples)(0.0f);
+    for (int k = 0; k < count && BLEND_SOME(!several); ++k) {
+        blend_samples own = blend_taps(stored, layers + k, place);
+        const blend_int seen = own.FOURTHS != 0.0f, fresh = seen & ~known;
         several |= seen & known;
         known |= seen;
-        if (!blend_some(fresh))
+        if (!BLEND_SOME(fresh))
             continue;
         correction = blend_corrected(&corrections, layers + k);
         if (first == count) {
@@ -369,78 +369,80 @@ __kernel void blend_band(
         corrected |= fresh & correction.some;
         reference = BLEND_EACH(fresh) ? own : reference;
     }
-    float16 sum = (float16)(0.0f);
-    if (blend_some(several)) {
+    blend_samples sum = (blend_samples)(0.0f);
+    if (BLEND_SOME(several)) {
         const blend_between column = blend_columns(px / scale.x);
-        float4 sl = (float4)(0.0f), cl = sl;
+        blend_real sl = (blend_real)(0.0f), cl = sl;
         float sp = 0.0f, cp = 0.0f;
         if (lens.y != 0.0f) {
             const int last = band.z - 1;
-            const float8 turns = (float8)(columns[x], columns[LEAST(x + 1, last)], columns[LEAST(x + 2, last)],
-                                          columns[LEAST(x + 3, last)]);
-            sl = turns.even;
-            cl = turns.odd;
+#define BLEND_SINE(n, i) columns[LEAST(x + n, last)].x
+#define BLEND_COSINE(n, i) columns[LEAST(x + n, last)].y
+            sl = (blend_real)(BLEND_LIST(BLEND_SINE));
+            cl = (blend_real)(BLEND_LIST(BLEND_COSINE));
             sp = lines[y].x;
             cp = lines[y].y;
         }
-        float4 hidden = (float4)(0.0f);
-        int4 open = several;
+        blend_real hidden = (blend_real)(0.0f);
+        blend_int open = several;
         /* a second time with all layers, if most of what is seen lies outside its layer */
-        for (int round = 0; round < 2 && blend_some(open); ++round) {
-            float4 total = (float4)(0.0f);
-            float16 all = (float16)(0.0f);
+        for (int round = 0; round < 2 && BLEND_SOME(open); ++round) {
+            blend_real total = (blend_real)(0.0f);
+            blend_samples all = (blend_samples)(0.0f);
             for (int k = first; k < count; ++k) {
-                float16 c = blend_taps(stored, layers + k, place);
-                int4 seen = open & (c.s37bf != 0.0f);
-                if (!blend_some(seen))
+                blend_samples c = blend_taps(stored, layers + k, place);
+                blend_int seen = open & (c.FOURTHS != 0.0f);
+                if (!BLEND_SOME(seen))
                     continue;
                 __global const float4 *line = ways + layers[k].ways + y * layers[k].way.y;
-                const float16 way = blend_read(line, blend_within(column, layers[k].way, field_border));
-                float4 w = way.s37bf + hidden;
+                const blend_samples way = blend_read(line, blend_within(column, layers[k].way, field_border));
+                blend_real w = way.FOURTHS + hidden;
                 seen &= w > 0.0f;
-                if (!blend_some(seen))
+                if (!BLEND_SOME(seen))
                     continue;
                 w = seen ? w : 0.0f;
                 total += w;
-                const int4 moved = seen & blend_any(way);
-                if (blend_some(moved)) {
-                    float4 qx, qy;
+                const blend_int moved = seen & blend_any(way);
+                if (BLEND_SOME(moved)) {
+                    blend_real qx, qy;
                     blend_positions(px, py, way, scale, lens, sl, cl, sp, cp, &qx, &qy);
                     if (moved.x)
                         c.s0123 = blend_sample(stored, layers + k, (float2)(qx.x, qy.x), border, nearest);
                     if (moved.y)
                         c.s4567 = blend_sample(stored, layers + k, (float2)(qx.y, qy.y), border, nearest);
+#if PIXELS == 4
                     if (moved.z)
                         c.s89ab = blend_sample(stored, layers + k, (float2)(qx.z, qy.z), border, nearest);
                     if (moved.w)
                         c.scdef = blend_sample(stored, layers + k, (float2)(qx.w, qy.w), border, nearest);
+#endif
                 }
                 /* a sample that falls outside its layer counts smoothly less */
-                w *= c.s37bf * c.s37bf;
+                w *= c.FOURTHS * c.FOURTHS;
                 correction = k == first ? first_correction : blend_corrected(&corrections, layers + k);
                 c = blend_correct(c, correction, shoulder);
                 corrected |= correction.some & (w > 0.0f);
-                float16 part = (c - reference) * BLEND_EACH(w);
-                part.s37bf = w;
+                blend_samples part = (c - reference) * BLEND_EACH(w);
+                part.FOURTHS = w;
                 all += part;
             }
             sum = BLEND_EACH(open) ? all : sum;
-            open &= !(all.s37bf >= 0.5f * total);
+            open &= !(all.FOURTHS >= 0.5f * total);
             hidden = share * total;
         }
     }
-    const int4 mixed = sum.s37bf > 1e-30f;
-    float16 v = BLEND_EACH(mixed) ? reference + sum / BLEND_EACH(sum.s37bf) : reference;
-    v.s37bf = known ? (float4)(WHITE) : (float4)(0.0f);
+    const blend_int mixed = sum.FOURTHS > 1e-30f;
+    blend_samples v = BLEND_EACH(mixed) ? reference + sum / BLEND_EACH(sum.FOURTHS) : reference;
+    v.FOURTHS = known ? (blend_real)(WHITE) : (blend_real)(0.0f);
     if (INTEGER)
         v = blend_round(v, blend_thresholds(place.x + origin.x, place.y + origin.y), BLEND_EACH(corrected));
     const blend_pixels made = blend_stored(v);
     __global pixel_stored *target = out + y * band.z + x;
-    target[0] = made.lo.lo;
-    if (x + 1 < band.z)
-        target[1] = made.lo.hi;
-    if (x + 2 < band.z)
-        target[2] = made.hi.lo;
-    if (x + 3 < band.z)
-        target[3] = made.hi.hi;
+#if PIXELS == 4
+    const pixel_stored each[PIXELS] = {made.lo.lo, made.lo.hi, made.hi.lo, made.hi.hi};
+#else
+    const pixel_stored each[PIXELS] = {made.lo, made.hi};
+#endif
+    for (int n = 0; n < PIXELS && x + n < band.z; ++n)
+        target[n] = each[n];
 }

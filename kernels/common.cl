@@ -61,7 +61,6 @@ static inline float square3(float3 a) {
     }
 EXPONENTIAL()
 EXPONENTIAL(4)
-EXPONENTIAL(16)
 
 /* The natural logarithm of a normal number above 0, to 1e-7: of its power of two, and of what is left, between the
    roots of 1/2 and 2, by the series of the inverse hyperbolic tangent. */
@@ -374,7 +373,6 @@ static inline float3 exposure_scale(float3 c, float shoulder) {
         return shoulder > 0.0f && v > white ? (c < white ? white : c) : v;                                         \
     }
 EXPOSURE_RAISE(3)
-EXPOSURE_RAISE(16)
 
 /* Add a gain on the exposure scale. */
 static inline float3 exposure_shift(float3 c, float3 gain, float shoulder) {
@@ -388,3 +386,63 @@ static inline float4 cubic_taps(float t, float a) {
     const float4 second = (float4)(-2.0f * a, -a - 3.0f, 2.0f * a + 3.0f, a);
     return (float4)(0.0f, 1.0f, 0.0f, 0.0f) + t * ((float4)(a, 0.0f, -a, 0.0f) + t * (second + t * third));
 }
+
+#ifdef PIXELS
+/* PIXELS pixels at a time (blend.cl). Vectors of 64 bytes are for processors that have them: for others compilers
+   warn of such arguments. */
+#if PIXELS == 4
+#define BLEND_SAMPLES 16
+#define BLEND_EACH(v) (v).s0000111122223333 /* what is known of pixels, for each of their samples */
+#define BLEND_LIST(each) each(0, x), each(1, y), each(2, z), each(3, w)
+#define BLEND_SOME(v) (((v).x | (v).y | (v).z | (v).w) != 0) /* whether it is so for one pixel at least */
+#define REDS s048c
+#define GREENS s159d
+#define BLUES s26ae
+#define FOURTHS s37bf
+#define BLEND_SPREAD s0001222344456667 /* grey and alpha as r, g, b, alpha, and back */
+#define BLEND_PACKED s03478bcf
+EXPONENTIAL(16)
+EXPOSURE_RAISE(16)
+#else
+#define BLEND_SAMPLES 8
+#define BLEND_EACH(v) (v).s00001111
+#define BLEND_LIST(each) each(0, x), each(1, y)
+#define BLEND_SOME(v) (((v).x | (v).y) != 0)
+#define REDS s04
+#define GREENS s15
+#define BLUES s26
+#define FOURTHS s37
+#define BLEND_SPREAD s00012223
+#define BLEND_PACKED s0347
+EXPONENTIAL(8)
+EXPOSURE_RAISE(8)
+#endif
+
+#if SAMPLES > 2
+#define BLEND_TWO 8 /* stored samples of two pixels, of four, of PIXELS */
+#define BLEND_FOUR 16
+#define BLEND_ALPHAS s37bf
+#else
+#define BLEND_TWO 4
+#define BLEND_FOUR 8
+#define BLEND_ALPHAS s1357
+#endif
+#if PIXELS == 4
+#define BLEND_STORED BLEND_FOUR
+#else
+#define BLEND_STORED BLEND_TWO
+#endif
+
+typedef PIXEL_VECTOR(float, PIXELS) blend_real;
+typedef PIXEL_VECTOR(int, PIXELS) blend_int;
+typedef PIXEL_VECTOR(float, BLEND_SAMPLES) blend_samples;
+typedef PIXEL_VECTOR(int, BLEND_SAMPLES) blend_marks;
+typedef PIXEL_VECTOR(PIXEL, BLEND_TWO) blend_two;
+typedef PIXEL_VECTOR(PIXEL, BLEND_FOUR) blend_four;
+typedef PIXEL_VECTOR(PIXEL, BLEND_STORED) blend_pixels;
+#define BLEND_REALS PIXEL_VECTOR(convert_float, PIXELS)
+#define BLEND_INTS PIXEL_VECTOR(convert_int, PIXELS)
+#define BLEND_FLOATS PIXEL_VECTOR(convert_float, BLEND_SAMPLES)
+#define BLEND_EXPONENTIAL PIXEL_VECTOR(exponential, BLEND_SAMPLES)
+#define BLEND_RAISE PIXEL_VECTOR(exposure_raise, BLEND_SAMPLES)
+#endif

@@ -247,12 +247,19 @@ def test_verbose_says_what_is_merged(folder: Path, capsys: pytest.CaptureFixture
 
 
 @pytest.mark.parametrize(("function", "program"), [("main", "hugin-abflow"), ("enblend", "abflow-enblend")])
-def test_interruption_while_modules_load_is_no_traceback(tmp_path: Path, function: str, program: str) -> None:
-    (tmp_path / "numpy.py").write_text("raise KeyboardInterrupt")
+def test_interruption_while_modules_load_is_no_traceback(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, function: str, program: str
+) -> None:
+    stub = "import os; assert os.environ['OPENBLAS_NUM_THREADS'] == '1'; raise KeyboardInterrupt"
+    (tmp_path / "numpy.py").write_text(stub)
+    monkeypatch.delenv("OPENBLAS_NUM_THREADS", raising=False)
     command = [sys.executable, "-c", f"from hugin_abflow import __main__; exit(__main__.{function}())"]
     done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=60)
     assert done.returncode == ExitCode.INTERRUPTED
     assert (done.stdout, done.stderr) == ("", f"{program}: interrupted\n")
+    (tmp_path / "numpy.py").unlink()
+    done = subprocess.run([*command, "--version"], cwd=tmp_path, capture_output=True, text=True, timeout=60)
+    assert done.returncode == 0 and done.stdout.startswith(program)
 
 
 @pytest.mark.skipif(os.name == "nt", reason="Windows has no such signals")

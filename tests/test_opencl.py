@@ -32,10 +32,10 @@ def option_sets(module: str) -> list[str]:
     if module not in ("working", "blend"):
         return [""]
     sets = []
-    for (name, white), samples in product(working.PIXEL.values(), (2, 4)):
-        full_scale = f" -DWHITE={white:.1f}f -DINTEGER={int(white > 1)}" if module == "blend" else ""
-        sets.append(f"-DPIXEL={name} -DSAMPLES={samples}{full_scale}")
-    return sets
+    for (name, white), samples, together in product(working.PIXEL.values(), (2, 4), (2, 4)):
+        full_scale = f" -DWHITE={white:.1f}f -DINTEGER={int(white > 1)} -DPIXELS={together}"
+        sets.append(f"-DPIXEL={name} -DSAMPLES={samples}{full_scale if module == 'blend' else ''}")
+    return sorted(set(sets))
 
 
 @pytest.mark.parametrize("module", MODULES)

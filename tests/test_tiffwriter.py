@@ -71,25 +71,19 @@ def test_what_fails_in_the_background_is_told(tmp_path, monkeypatch):
 
 
 def test_control_c_while_the_thread_starts_leaves_nothing(tmp_path, monkeypatch):
-    """The thread may open the file when it has been removed already."""
-    removed, opened = threading.Event(), threading.Event()
-    start, open_tiff = threading.Thread.start, tifffile.TiffWriter
+    """The thread may run for the first time when the file has been removed already."""
+    late, start = [], threading.Thread.start
 
     def interrupted(thread):
-        start(thread)
+        late.append(thread)
         raise KeyboardInterrupt
 
-    def late(*arguments, **more):
-        removed.wait(10)
-        try:
-            return open_tiff(*arguments, **more)
-        finally:
-            opened.set()
-
-    monkeypatch.setattr(threading.Thread, "start", interrupted)
-    monkeypatch.setattr(tifffile, "TiffWriter", late)
-    with pytest.raises(KeyboardInterrupt), ImageWriter(tmp_path / "a.tif", 131, 77, 3, np.uint8):
-        pass
-    removed.set()
-    assert opened.wait(10)
-    assert not list(tmp_path.iterdir())
+    with monkeypatch.context() as patch:
+        patch.setattr(threading.Thread, "start", interrupted)
+        with pytest.raises(KeyboardInterrupt), ImageWriter(tmp_path / "a.tif", 131, 77, 3, np.uint8):
+            pass
+    for thread in late:
+        start(thread)
+        thread.join(10)
+        assert not thread.is_alive()
+    assert late and not list(tmp_path.iterdir())
