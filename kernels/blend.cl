@@ -245,8 +245,8 @@ static inline blend_correction blend_corrected(const blend_corrections *from, __
         result.some = blend_any(gain);
     }
     if (layer->offsets >= 0) {
-        const blend_samples offset = blend_read(from->offsets + layer->offsets + from->row * layer->span.y,
-                                         blend_within(from->column, layer->span, from->offset_border));
+        const blend_between column = blend_within(from->column, layer->span, from->offset_border);
+        const blend_samples offset = blend_read(from->offsets + layer->offsets + from->row * layer->span.y, column);
         result.offset = INTEGER ? WHITE * offset : BLEND_EXPONENTIAL(offset) - 1.0f;
         result.some |= blend_any(offset);
     }

@@ -37,7 +37,9 @@ __kernel void guidance_start(__global const float2 *flow,   /* (grid.y, grid.x) 
         nearest = fmax(nearest, g);
     }
     const float2 residual = total > 0.0f ? guidance_share(nearest) * sum / total : (float2)(0.0f);
-    start[y * size.x + x] = (bilinear_flow(flow, q, grid) + residual) / scale;
+    /* the last pixels of a coarse level may lie beyond the chart */
+    const float2 last = (float2)(grid.z ? q.x : grid.x - 0.5f, grid.y - 0.5f);
+    start[y * size.x + x] = (bilinear_flow(flow, LEAST(q, last), grid) + residual) / scale;
     near[y * size.x + x] = nearest;
 }
 

@@ -50,6 +50,17 @@ def test_start_equals_its_twin(device: Device, name: str, scale: int) -> None:
     assert_close(near.get(), expected[1], TRIGONOMETRY)
 
 
+@pytest.mark.parametrize("width", [64, 65, 66, 67])
+def test_flow_starts_as_it_was_found_up_to_the_rim(device: Device, width: int) -> None:
+    """A coarse level's last pixels may lie beyond the chart."""
+    grid, size = (width, 33, 0, 0), (-(-width // 8), 5)
+    found = device.upload(np.full((33, width, 2), 24, np.float32))
+    guide, sigma = device.upload(np.zeros((1, 4), np.float32)), device.upload(np.ones(1, np.float32))
+    start, near = device.empty((size[1], size[0], 2)), device.empty((size[1], size[0]))
+    device.run("guidance", "guidance_start", size, found, grid, guide, sigma, 1, 8.0, start, near, size)
+    np.testing.assert_allclose(start.get(), 3, rtol=1e-6)
+
+
 def test_twin_of_start_by_hand() -> None:
     """At a guide all of its residual, far away none, around the border of a cylinder too."""
     grid = (80, 60, 1, 0)

@@ -23,7 +23,7 @@ def assert_close(
 ) -> None:
     """Kernel and twin agree within tolerance x max(scale, |twin|), but for a share of pixels."""
     assert kernel.shape == twin.shape
-    assert np.isfinite(kernel).all()
+    assert np.isfinite(kernel).all() and np.isfinite(twin).all()
     off = np.abs(kernel.astype(np.float64) - twin) > tolerance * np.maximum(scale, np.abs(twin))
     wrong = np.argwhere(off)
     assert off.mean() <= decisions, (

@@ -23,7 +23,10 @@ def guidance_start(
     """Start (height, width, 2), px of the level, and nearness (height, width)."""
     x, y = pixels(size[0], size[1])
     x, y = scale * (x + 0.5), scale * (y + 0.5)
-    total, taps = bilinear(flow, grid, x, y)
+    # the last pixels of a coarse level may lie beyond the chart
+    total, taps = bilinear(
+        flow, grid, x if grid[2] else np.minimum(x, grid[0] - 0.5), np.minimum(y, grid[1] - 0.5)
+    )
     across = x[..., None] - guides[:, 0]
     if grid[2]:
         across = (across + grid[0] / 2) % grid[0] - grid[0] / 2
