@@ -58,13 +58,19 @@ static inline int blend_turned(__global const blend_layer *layer, int row) {
     return row - (row >= layer->ring ? layer->ring : 0);
 }
 
+/* Where it lies. */
+static inline __global const pixel_stored *blend_line(__global const pixel_stored *stored,
+                                                     __global const blend_layer *layer, int row) {
+    return stored + layer->rows + blend_turned(layer, row) * layer->place.z;
+}
+
 /* r, g, b in stored units and 1 for a valid pixel, else zeros. */
 static inline float4 blend_tap(__global const pixel_stored *stored, __global const blend_layer *layer, int2 p) {
     const int4 place = layer->place;
     const int x = p.x - place.x, y = p.y - place.y;
     if (x < 0 || y < 0 || x >= place.z || y >= place.w)
         return (float4)(0.0f);
-    const float4 c = pixel_samples(stored[layer->rows + blend_turned(layer, y) * place.z + x]);
+    const float4 c = pixel_samples(blend_line(stored, layer, y)[x]);
     return c.w >= 0.5f * WHITE ? (float4)(c.xyz, 1.0f) : (float4)(0.0f);
 }
 
@@ -78,7 +84,7 @@ static inline blend_samples blend_taps(__global const pixel_stored *stored, __gl
 #define BLEND_TAP(n, i) blend_tap(stored, layer, p + (int2)(n, 0))
     if (x < 0 || x + PIXELS > place.z)
         return (blend_samples)(BLEND_LIST(BLEND_TAP));
-    __global const pixel_stored *first = stored + layer->rows + blend_turned(layer, y) * place.z + x;
+    __global const pixel_stored *first = blend_line(stored, layer, y) + x;
 #define BLEND_NEXT(n, i) first[n]
     blend_samples c = blend_colours((blend_pixels)(BLEND_LIST(BLEND_NEXT)));
     const blend_int valid = c.FOURTHS >= 0.5f * WHITE;
@@ -125,9 +131,9 @@ static inline float4 blend_sample(__global const pixel_stored *stored, __global 
     if (first.x >= 0 && first.y >= 0 && first.x + 3 < place.z && first.y + 3 < place.w) {
         /* nearly all samples: every tap is stored, no border rule is needed */
         blend_four r0, r1, r2, r3;
-        const int row = blend_turned(layer, first.y), wide = place.z;
-        const int rest = layer->ring - row, all = layer->ring * wide; /* rows until they begin anew */
-        __global const pixel_stored *p = stored + layer->rows + row * wide + first.x;
+        const int wide = place.z, all = layer->ring * wide;
+        const int rest = layer->ring - blend_turned(layer, first.y); /* rows until they begin anew */
+        __global const pixel_stored *p = blend_line(stored, layer, first.y) + first.x;
         blend_row(p, &r0);
         blend_row(p + (rest > 1 ? wide : wide - all), &r1);
         blend_row(p + (rest > 2 ? 2 * wide : 2 * wide - all), &r2);
@@ -438,11 +444,6 @@ __kernel void blend_band(
         v = blend_round(v, blend_thresholds(place.x + origin.x, place.y + origin.y), BLEND_EACH(corrected));
     const blend_pixels made = blend_stored(v);
     __global pixel_stored *target = out + y * band.z + x;
-#if PIXELS == 4
-    const pixel_stored each[PIXELS] = {made.lo.lo, made.lo.hi, made.hi.lo, made.hi.hi};
-#else
-    const pixel_stored each[PIXELS] = {made.lo, made.hi};
-#endif
     for (int n = 0; n < PIXELS && x + n < band.z; ++n)
-        target[n] = each[n];
+        target[n] = ((const pixel_stored *)&made)[n];
 }
