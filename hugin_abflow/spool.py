@@ -126,12 +126,12 @@ class _Rows:
 
     def _keep(self, file: IO[bytes], rows: npt.NDArray[Any], top: int) -> None:
         """Store rows from the first one that is not stored up to the next that is."""
-        missing = self._block_of[top : top + len(rows)] < 0
-        if not missing.any():
+        missing = np.flatnonzero(self._block_of[top : top + len(rows)] < 0)
+        if not len(missing):
             return
-        first = int(missing.argmax())
-        rows = rows[first:][: int(np.append(missing[first:], False).argmin())]
-        first += top
+        skipped = int(missing[0])
+        count = np.count_nonzero(missing == skipped + np.arange(len(missing)))
+        first, rows = top + skipped, rows[skipped : skipped + count]
         block, place = _Block(first, first + len(rows), []), self._start + first * self._row
         with trace.span("keep", trace.FILE, file=self._layer.name, rows=len(rows)), suppress(OSError):
             for left, right in self._spans(rows):
