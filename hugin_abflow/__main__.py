@@ -1,4 +1,4 @@
-"""``hugin-abflow`` and ``abflow-enblend``: to load what they need takes a while, in which Ctrl-C may come."""
+"""The commands: to load what they need takes a while, in which Ctrl-C may come."""
 
 import os
 import sys
@@ -15,6 +15,11 @@ def enblend() -> int:
     return _run("abflow-enblend", "hugin_abflow.dropin.enblend")
 
 
+def setup() -> int:
+    """Run ``hugin-abflow-setup``; gives its exit code."""
+    return _run("hugin-abflow-setup", "hugin_abflow.dropin.setup")
+
+
 def _run(program: str, module: str) -> int:
     # before NumPy is loaded: idle threads of its BLAS turn round and round, on cores that others need
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
@@ -23,7 +28,19 @@ def _run(program: str, module: str) -> int:
     except KeyboardInterrupt:
         print(f"{program}: interrupted", file=sys.stderr)
         return 130  # ExitCode.INTERRUPTED
-    return int(command())
+    try:
+        return int(command())
+    finally:
+        _drop_what_nobody_reads()
+
+
+def _drop_what_nobody_reads() -> None:
+    """Python itself would try to write that once more when it ends, and then make the exit code 120."""
+    for stream in filter(None, (sys.stdout, sys.stderr)):
+        try:
+            stream.flush()
+        except OSError:
+            os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
 
 
 if __name__ == "__main__":

@@ -23,7 +23,7 @@ from hugin_abflow.nona import Remap
 from hugin_abflow.opencl import list_devices
 from hugin_abflow.options import ARGUMENTS, Command, NewFile, Option, Size
 from hugin_abflow.settings import FlowQuality, LargeMotion, MergeMode, Settings
-from hugin_abflow.terminal import complain, interruptible, say
+from hugin_abflow.terminal import complain, interruptible, print_result, say
 
 EXIT_CODES = {
     ExitCode.OK: "every panorama was written",
@@ -59,9 +59,8 @@ def _print_devices(context: click.Context, parameter: click.Parameter, wanted: b
     if not wanted or context.resilient_parsing:
         return
     for device in list_devices():
-        default = ", default" if device.default else ""
-        memory = f"{device.memory / 2**30:.1f} GiB"
-        click.echo(f"{device.index}: {device.name} ({device.kind}, {memory}, {device.platform}{default})")
+        kind = f"{device.kind}, {device.memory / 2**30:.1f} GiB, {device.platform}"
+        print_result(f"{device.index}: {device.name} ({kind}{', default' if device.default else ''})")
     context.exit(ExitCode.OK)
 
 
@@ -352,7 +351,7 @@ def _print_configs(chosen: Mapping[Path, tuple[Path | None, dict[str, Any]]]) ->
     """Answer --print-config, once for each file of settings."""
     for file in dict.fromkeys(file for file, _ in chosen.values()):
         projects = [project for project, (its_file, _) in chosen.items() if its_file == file]
-        click.echo(config_text(command, file, chosen[projects[0]][1], [p for p in projects if p.name]))
+        print_result(config_text(command, file, chosen[projects[0]][1], [p for p in projects if p.name]))
     return ExitCode.OK
 
 
@@ -432,9 +431,10 @@ def _run(arguments: Sequence[str] | None) -> int:
         say(f"{PROGRAM}: interrupted")
         return ExitCode.INTERRUPTED
     except OSError as error:
-        if not isinstance(error.__context__, KeyboardInterrupt):
-            raise
-        return ExitCode.INTERRUPTED  # with a terminal that is gone, which click would write to
+        if isinstance(error.__context__, KeyboardInterrupt):
+            return ExitCode.INTERRUPTED  # with a terminal that is gone, which click would write to
+        complain(str(error))
+        return ExitCode.FAILED
     except click.ClickException as error:
         complain(f"{error.format_message()}\nTry '{PROGRAM} --help'.")
         return ExitCode.USAGE

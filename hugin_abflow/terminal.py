@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, Any, TextIO, cast
 
 import click
 
-from hugin_abflow.errors import AbflowError, ExitCode
+from hugin_abflow.errors import AbflowError, ExitCode, OutputError
 from hugin_abflow.metadata import PROGRAM
 from hugin_abflow.progress import Advance, Progress, silent
 
@@ -46,12 +46,17 @@ def print_path(path: Path) -> None:
 
 
 def print_result(text: str) -> None:
-    """Print text to stdout; names of files in it in their own bytes whatever the locale."""
+    """Print text to stdout; names of files in it in their own bytes whatever the locale.
+
+    That nobody reads it any more (`| head -1`) is no error. Raises `OutputError` where it cannot be written.
+    """
     try:
-        click.echo(text if os.name == "nt" else os.fsencode(text))
-    except BrokenPipeError:
-        # Nobody reads stdout any more (`| head -1`): go on, and keep Python's own flush at exit quiet.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        with suppress(BrokenPipeError):
+            click.echo(text if os.name == "nt" else os.fsencode(text))
+    except OSError as error:
+        raise OutputError(
+            f"stdout cannot be written: {error.strerror}; make room, or lead it elsewhere"
+        ) from error
 
 
 @contextmanager

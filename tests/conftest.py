@@ -21,6 +21,9 @@ from hugin_abflow.project import Plan
 DTYPES = [np.uint8, np.uint16, np.float16, np.float32]
 ICC = bytes(range(256)) * 3  # carried, never interpreted
 
+# Programs that tests start write as a user's do, not as where containers and CI set it.
+os.environ.pop("PYTHONUNBUFFERED", None)
+
 # A shell's background jobs ignore it, and would hand that on to the programs that tests interrupt.
 if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)

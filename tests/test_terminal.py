@@ -106,12 +106,12 @@ def test_phases_of_several_projects_name_them(replace: Replace, capsys: pytest.C
 CHILD = """
 import os, signal, sys, time
 from pathlib import Path
-from hugin_abflow import cli
+from hugin_abflow import __main__
 from hugin_abflow.batch import pool, run, task
 {merge}
 task.stitch_project = lambda path, **keywords: [merge(path, **keywords)]
 run.Pool = pool.Alone
-sys.exit(cli.main(sys.argv[1:]))
+sys.exit(__main__.main())
 """
 
 
@@ -215,6 +215,38 @@ def test_closed_stderr_does_not_lose_the_panorama() -> None:
     os.close(write)
     out, _ = process.communicate(timeout=30)
     assert (process.returncode, out) == (0, b"a.tif\n")
+
+
+FULL = Path("/dev/full")
+UNPRINTED = b"error: stdout cannot be written: No space left on device; make room, or lead it elsewhere\n"
+
+
+@pytest.mark.skipif(not FULL.exists(), reason="needs a device that is always full")
+@pytest.mark.parametrize("unbuffered", ["", "1"])
+def test_full_disk_under_stdout_is_told_when_all_is_done(unbuffered: str) -> None:
+    environment = os.environ | {"PYTHONUNBUFFERED": unbuffered}
+    command = child(PHASES, "-v", "a.pto", "b.pto")
+    with FULL.open("wb") as full:
+        done = subprocess.run(command, stdout=full, stderr=subprocess.PIPE, env=environment, timeout=30)
+    assert done.returncode == ExitCode.OUTPUT
+    assert b"b.pto: Blend: " in done.stderr and done.stderr.endswith(b"\nhugin-abflow: " + UNPRINTED)
+
+
+@pytest.mark.skipif(not FULL.exists(), reason="needs a device that is always full")
+@pytest.mark.parametrize(
+    ("function", "argument", "code", "message"),
+    [
+        ("main", "--list-devices", ExitCode.OUTPUT, b"hugin-abflow: " + UNPRINTED),
+        ("main", "--help", ExitCode.FAILED, b"hugin-abflow: error: [Errno 28] No space left on device\n"),
+        ("enblend", "--help", ExitCode.FAILED, b"abflow-enblend: " + UNPRINTED),
+    ],
+)
+def test_answer_that_cannot_be_printed(function: str, argument: str, code: int, message: bytes) -> None:
+    call = f"from hugin_abflow import __main__; exit(__main__.{function}())"
+    with FULL.open("wb") as full:
+        command = [sys.executable, "-c", call, argument]
+        done = subprocess.run(command, stdout=full, stderr=subprocess.PIPE, timeout=30)
+    assert (done.returncode, done.stderr) == (code, message)
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="only Linux has names that are not UTF-8")

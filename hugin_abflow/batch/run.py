@@ -17,7 +17,7 @@ from hugin_abflow.batch.pool import Alone, Pool
 from hugin_abflow.batch.record import Record
 from hugin_abflow.batch.report import print_table, write_report
 from hugin_abflow.batch.task import Task
-from hugin_abflow.errors import AbflowError, ExitCode
+from hugin_abflow.errors import AbflowError, ExitCode, OutputError
 from hugin_abflow.stitch import show_project
 from hugin_abflow.terminal import complain, messages, print_path, print_result
 
@@ -51,7 +51,7 @@ def default_jobs() -> int:
 
 def run(tasks: Iterable[Task | None], how: Run, lone: bool = False) -> ExitCode:
     """Perform tasks; print the panoramas' names on stdout. Raises `OutputError` for a log or a report that
-    cannot be written.
+    cannot be written, and, in the end, for stdout.
 
     tasks       None means that there is none at the moment.
     lone        there is but one: it is done in this process, and no table follows.
@@ -59,6 +59,7 @@ def run(tasks: Iterable[Task | None], how: Run, lone: bool = False) -> ExitCode:
     records: list[Record] = []
     order: dict[Path, int] = {}
     running: set[Path] = set()
+    unprinted: OutputError | None = None
     with ExitStack() as stack:
         log = stack.enter_context(open_log(how.log))
         stack.enter_context(trace.recording(how.profile))
@@ -76,14 +77,19 @@ def run(tasks: Iterable[Task | None], how: Run, lone: bool = False) -> ExitCode:
                         records.append(record)
                         running.discard(record.project)
                         if not how.quiet:
-                            for file in record.files:
-                                print_path(file)
+                            try:
+                                for file in record.files:
+                                    print_path(file)
+                            except OutputError as error:
+                                unprinted = error  # the panoramas are there, and others wait
         finally:
             records.sort(key=lambda record: order.get(record.project, 0))
             if records and not lone and not how.quiet:
                 print_table(records)
             if how.report:
                 write_report(how.report, records, how.arguments)
+    if unprinted:
+        raise unprinted
     return combine([record.exit_code for record in records])
 
 

@@ -65,8 +65,9 @@ def _run(arguments: Sequence[str]) -> bool:
     if failures:
         return False
     if request.answer:
-        print_result(HELP if request.answer == "help" else f"{NAME} {version()}, in place of enblend 4.2")
-        return True
+        with catching(NAME, verbose=False, program=NAME) as failures:
+            print_result(HELP if request.answer == "help" else f"{NAME} {version()}, in place of enblend 4.2")
+        return not failures
     verbose = request.verbosity > 1
     with (
         # that a layer is left out is known to `joint`, which tells it to those who ask; enblend warns of it
