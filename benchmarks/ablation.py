@@ -26,6 +26,7 @@ PARTS: dict[str, Mapping[str, Any]] = {
     "no flow, no seam": {"flow": False, "seam": False},
     "no seam": {"seam": False},
     "no movers": {"movers": False},
+    "no foreground": {"foreground": False},
     "no exposure": {"exposure": False},
     "no highlights": {"highlights": False},
     "transition as published": {"transition_strain": 0.0},

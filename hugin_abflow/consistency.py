@@ -5,8 +5,8 @@ A flow from a to b and the flow from b to a undo each other where both are right
 of the image: a thing keeps its motion up to its outline, and what is behind it has its own. It is a diffusion
 that stops at edges, on a pyramid of trust-weighted means: each level starts from the filled coarser one, and
 a few sweeps do the rest (after Bornemann, Deuflhard, "The cascadic multigrid method for elliptic problems",
-1996). The place of what moved by itself (movers.py) is filled with wide means, without regard to edges: what
-is beside it was matched half with it.
+1996). The place of what is taken from one photo (single.py) is filled with wide means, without regard to
+edges: what is beside it was matched half with it.
 """
 
 from __future__ import annotations
@@ -16,8 +16,8 @@ from dataclasses import replace
 
 import numpy as np
 
+from hugin_abflow.cells import CELL, Mask, Whole
 from hugin_abflow.geometry import PairFlow
-from hugin_abflow.movers import CELL, Mask, Movers
 from hugin_abflow.opencl import Buffer, Device
 from hugin_abflow.pyramid import Level
 
@@ -37,30 +37,30 @@ _EDGE = 0.08
 _SWEEPS, _RELAXATION, _LEAST_PIXELS = 4, 1.5, 64
 
 
-def mend(device: Device, pair: PairFlow, images: Sequence[Level], moved: Movers | None = None) -> PairFlow:
-    """The pair's flows, filled where they disagree and where things moved by themselves.
+def mend(device: Device, pair: PairFlow, images: Sequence[Level], whole: Whole | None = None) -> PairFlow:
+    """The pair's flows, filled where they disagree and in the place of what is taken from one photo.
 
     images: log brightness of both layers on the pair's chart.
     """
     wraps = pair.chart.wraps
-    first, second = (moved.first, moved.second) if moved else (None, None)
+    first, second = (whole.first, whole.second) if whole else (None, None)
     a, b = (level.image for level in images)
-    forward = _fill(device, trust(device, pair.forward, pair.backward, wraps, a, first), wraps, bool(moved))
-    backward = _fill(device, trust(device, pair.backward, pair.forward, wraps, b, second), wraps, bool(moved))
+    forward = _fill(device, trust(device, pair.forward, pair.backward, wraps, a, first), wraps, bool(whole))
+    backward = _fill(device, trust(device, pair.backward, pair.forward, wraps, b, second), wraps, bool(whole))
     return replace(pair, forward=forward, backward=backward)
 
 
 def trust(
-    device: Device, flow: Buffer, back: Buffer, wraps: bool, image: Buffer, moved: Mask | None = None
+    device: Device, flow: Buffer, back: Buffer, wraps: bool, image: Buffer, whole: Mask | None = None
 ) -> Buffer:
     """float32 (height, width, 4): flow in px, trust 0..1, and brightness, which tells where edges are.
 
     image: log brightness of the layer that the flow starts on, float32 (height, width), 0 where it shows
-    nothing. moved: cells that have no trust, and whose brightness tells nothing.
+    nothing. whole: cells that have no trust, and whose brightness tells nothing.
     """
     trusted = device.empty((*flow.shape[:2], 4))
     grid = _grid(flow, wraps)
-    distrusted = device.upload(np.zeros((1, 1), np.uint8) if moved is None else moved.astype(np.uint8))
+    distrusted = device.upload(np.zeros((1, 1), np.uint8) if whole is None else whole.astype(np.uint8))
     cells = (*distrusted.shape[::-1], CELL, 0)
     device.run(
         "consistency", "consistency_trust", grid[:2], flow, back, grid, _TOLERANCE, distrusted, cells, image,
@@ -69,7 +69,7 @@ def trust(
     return trusted
 
 
-def _fill(device: Device, trusted: Buffer, wraps: bool, moved: bool) -> Buffer:
+def _fill(device: Device, trusted: Buffer, wraps: bool, whole: bool) -> Buffer:
     around, grid = trusted, _grid(trusted, wraps)
     for _ in range(_AROUND):
         around = _coarser(device, around, wraps)
@@ -81,7 +81,7 @@ def _fill(device: Device, trusted: Buffer, wraps: bool, moved: bool) -> Buffer:
     while max(levels[-1].shape[:2]) > 1:
         levels.append(_coarser(device, levels[-1], wraps))
     filled = _carried(device, levels, wraps, _SWEEPS)
-    wide = _carried(device, levels, wraps, sweeps=0) if moved else filled
+    wide = _carried(device, levels, wraps, sweeps=0) if whole else filled
     device.run("consistency", "consistency_mix", grid[:2], trusted, grid, wide, filled)
     return filled
 

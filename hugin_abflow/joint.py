@@ -29,21 +29,21 @@ from hugin_abflow import (
     guidance,
     highlights,
     memory,
-    movers,
     multiband,
     quality,
     seam,
+    single,
     transition,
     working,
 )
 from hugin_abflow.blend import BlendLayer
+from hugin_abflow.cells import View, Whole
 from hugin_abflow.coefficient import Masks
 from hugin_abflow.colour import Correction
 from hugin_abflow.errors import DeviceError, SettingsError
 from hugin_abflow.geometry import Pair, PairFlow
 from hugin_abflow.guides import Guide, by_pair
 from hugin_abflow.layer import Canvas, Layer
-from hugin_abflow.movers import Movers
 from hugin_abflow.opencl import Buffer, Device, DeviceMemoryError
 from hugin_abflow.progress import Progress
 from hugin_abflow.pyramid import Level
@@ -149,21 +149,21 @@ def prepare(
     overlaps = _overlaps(device, reduced, masks)
     _check_memory(device, reduced, overlaps, masks, grid, settings)
     its_guides = by_pair(guides if settings.guides else ())
-    flows, shifts, moving = (
+    flows, shifts, singles = (
         _flows(device, reduced, masks, grid, overlaps, progress, settings, its_guides, numbers)
         if settings.flow
         else ([], [], [])
     )
     with progress("align", 1) as advance:
-        moved = _moved(flows, moving, grid)
+        once = single.on_canvas(singles, [flow.chart for flow in flows], seam.seam_grid(grid))
         pairs = [pair for pair, _ in overlaps]
-        fields, correction, whole = _align(device, reduced, pairs, flows, moved, masks, grid, settings)
+        fields, correction, whole = _align(device, reduced, pairs, flows, once, masks, grid, settings)
         if _log.isEnabledFor(logging.INFO):
             _tell_overlaps(reduced, overlaps, shifts, grid, whole)
         del masks, overlaps  # what comes takes the most memory
         offsets = multiband.none(grid, len(reduced))
         if settings.exposure and pairs:
-            offsets = multiband.offsets(device, reduced, fields, correction, grid, moved)
+            offsets = multiband.offsets(device, reduced, fields, correction, grid, once)
         final = [
             BlendLayer(
                 layer.layer, layer.box, field, geometry.reach(device, layer, field, grid), gain, offset
@@ -208,7 +208,7 @@ def _align(
     layers: Sequence[WorkingLayer],
     pairs: Sequence[Pair],
     flows: list[PairFlow],
-    moved: seam.Cells | None,
+    once: seam.Cells | None,
     masks: Masks,
     grid: Grid,
     settings: Settings,
@@ -237,7 +237,7 @@ def _align(
         strict = correct(exposure, regions, strict=True)
         device.give_back()
         residual = seam.residuals(device, layers, fields, pairs, strict, grid)
-        found = seam.regions(residual, grid, aligned=settings.flow, moved=moved)
+        found = seam.regions(residual, grid, aligned=settings.flow, once=once)
         grown = found if regions is None else found | regions
         if not grown.any() or (regions is not None and np.array_equal(grown, regions)):
             break
@@ -250,7 +250,7 @@ def _align(
         whole = regions
         with ThreadPoolExecutor(1, "gains") as beside:  # solved on one core: the device cuts meanwhile
             gains = beside.submit(correct, settings, regions)
-            seam.cut(device, layers, fields, residual, regions, masks, grid, moved)
+            seam.cut(device, layers, fields, residual, regions, masks, grid, once)
             return fields, gains.result(), whole
     return fields, correct(settings, regions), whole
 
@@ -388,8 +388,9 @@ def _flows(
     settings: Settings,
     guides: Mapping[tuple[int, int], Sequence[Guide]],
     numbers: Sequence[int],
-) -> tuple[list[PairFlow], list[figures.Parallax], list[Movers | None]]:
-    """Flow of every pair of layers, on its own chart, mended; figures of it, if somebody listens; and movers.
+) -> tuple[list[PairFlow], list[figures.Parallax], list[Whole | None]]:
+    """Flow of every pair of layers, on its own chart, mended; figures of it, if somebody listens; and what is
+    taken from one of them, whole.
 
     overlaps    the pairs, and where they overlap on the grid of `masks`.
     guides      of each two layers, by their numbers; numbers: what guides call each of `layers`.
@@ -398,18 +399,18 @@ def _flows(
     coarse = quality.coarseness(settings.flow_quality, grid.width * grid.height)
     largest = _REACH * (grid.canvas_width or grid.region.width) * grid.width / grid.region.width
     reach = largest / coarse if settings.large_motion != "off" else 0.0
-    result, moving, shifts = list[PairFlow](), list[Movers | None](), list[figures.Parallax]()
-    waiting: list[tuple[PairFlow, tuple[Level, Level], Future[Movers | None] | None]] = []
+    result, singles, shifts = list[PairFlow](), list[Whole | None](), list[figures.Parallax]()
+    waiting: list[tuple[PairFlow, tuple[Level, Level], Future[Whole | None] | None]] = []
 
     def mend() -> None:
         while waiting:  # one at most: a pair's images are large
             pair, images, job = waiting.pop()
-            moving.append(job.result() if job else None)
-            result.append(consistency.mend(device, pair, images, moving[-1]))
+            singles.append(job.result() if job else None)
+            result.append(consistency.mend(device, pair, images, singles[-1]))
 
     with (
         ThreadPoolExecutor(1, "chart") as drawing,
-        ThreadPoolExecutor(1, "movers") as looking,
+        ThreadPoolExecutor(1, "single") as looking,
         progress("flow", len(overlaps)) as advance,
     ):
         charts = drawing.map(lambda overlap: chart.pair_chart(overlap[1], masks.grid, grid, coarse), overlaps)
@@ -427,10 +428,10 @@ def _flows(
             its_flow = PairFlow(pair.a, pair.b, its_chart, *found)
             mend()
             job = None
-            if settings.seam and settings.movers and its_chart.eye:
-                views = (movers.View.of(images[0]), movers.View.of(images[1]))
+            if settings.seam and (settings.movers or settings.foreground):
+                views = (View.of(images[0]), View.of(images[1]))
                 arrays, vouched = (found[0].get(), found[1].get()), (placed.at_a, placed.at_b)
-                job = looking.submit(movers.find, its_chart, arrays, views, vouched, solved.refused)
+                job = looking.submit(single.find, its_chart, arrays, views, vouched, solved.refused, settings)
             waiting.append((its_flow, images, job))
             if _log.isEnabledFor(logging.INFO):
                 shifts.append(figures.parallax(device, its_flow, images, grid))
@@ -438,13 +439,4 @@ def _flows(
         mend()
         device.finish()  # kernels are only queued: the last pair's time would be told as that of what follows
     device.give_back()
-    return result, shifts, moving
-
-
-def _moved(flows: Sequence[PairFlow], moving: Sequence[Movers | None], grid: Grid) -> seam.Cells | None:
-    """Where on the seam grid something moved by itself between any two layers; None: nowhere."""
-    cells = seam.seam_grid(grid)
-    places = [
-        movers.on_canvas(one, flow.chart, cells) for flow, one in zip(flows, moving, strict=True) if one
-    ]
-    return np.logical_or.reduce(places) if places else None
+    return result, shifts, singles

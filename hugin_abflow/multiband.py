@@ -63,11 +63,11 @@ def offsets(
     fields: Sequence[Buffer],
     correction: Correction,
     grid: Grid,
-    moved: npt.NDArray[np.bool_] | None = None,
+    once: npt.NDArray[np.bool_] | None = None,
 ) -> Offsets:
     """Those that make of the weighted mean of the layers a multi-band blend. fields: of geometry.py.
 
-    moved: cells of the region, as many as there may be, in which something moved by itself.
+    once: cells of the region, as many as there may be, of what is taken from one layer, whole.
     """
     grids = levels(grid)
     if len(grids) < 2:
@@ -85,7 +85,7 @@ def offsets(
         for k, (layer, field) in enumerate(zip(layers, fields, strict=True))
     ]
     del total
-    _differ(device, finest, widths[1], np.zeros((1, 1)) if moved is None else moved)
+    _differ(device, finest, widths[1], np.zeros((1, 1)) if once is None else once)
     blend = _blend(device, finest, grids[1:], widths[1:])
     result = []
     while finest:  # each makes room for the next one's
@@ -132,10 +132,10 @@ def _finest(
     return _spread(device, level, widths)
 
 
-def _differ(device: Device, finest: list[_Level], widths: Widths, moved: npt.NDArray[Any]) -> None:
-    """Have each entry be how it differs from the weighted mean of all; not where something moved."""
+def _differ(device: Device, finest: list[_Level], widths: Widths, once: npt.NDArray[Any]) -> None:
+    """Have each entry be how it differs from the weighted mean of all; not in cells of `once`."""
     grid = finest[0].grid
-    alone, cells = device.upload(moved, np.float32), (*moved.shape[::-1], *grid.border[2:])
+    alone, cells = device.upload(once, np.float32), (*once.shape[::-1], *grid.border[2:])
     mean = device.zeros((*grid.shape, 4))
     for level in finest:
         _add(device, level, None, mean)

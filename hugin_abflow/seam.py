@@ -57,7 +57,7 @@ _FINE_CUT = 120.0
 _SHORTER = 0.005
 # No layer is taken where it is not.
 _FORBIDDEN = 1e4
-# How much more a region may cost if that shows what moved by itself once, from a layer that has most of it.
+# How much more a region may cost if that shows things once and whole, from a layer that has most of it.
 _ONCE, _MOSTLY = 2.0, 0.5
 # Capacities are integers; residuals are around 1.
 _UNIT = 1000
@@ -106,12 +106,12 @@ def residuals(
     return Residuals(mean, np.sqrt(square))
 
 
-def regions(residual: Residuals, grid: Grid, aligned: bool = True, moved: Cells | None = None) -> Cells:
+def regions(residual: Residuals, grid: Grid, aligned: bool = True, once: Cells | None = None) -> Cells:
     """Where layers differ too much to be blended, of the same shape; unless they are aligned, texture differs
-    everywhere and tells nothing. moved: cells that belong to a region whatever the layers show there.
+    everywhere and tells nothing. once: cells that belong to a region whatever the layers show there.
     """
     told = residual if aligned else Residuals(residual.mean, residual.mean)
-    found = _regions(told, seam_grid(grid), np.zeros(residual.mean.shape, bool) if moved is None else moved)
+    found = _regions(told, seam_grid(grid), np.zeros(residual.mean.shape, bool) if once is None else once)
     return np.logical_or.reduce(found) if found else np.zeros(residual.mean.shape, bool)
 
 
@@ -123,13 +123,13 @@ def cut(
     whole: Cells,
     masks: Masks,
     grid: Grid,
-    moved: Cells | None = None,
+    once: Cells | None = None,
 ) -> None:
     """Give each cell of the regions `whole` to one layer: the others lose their colour weight there
-    (fields[...].w, in place). A region of which cells moved is cut in two only if that is much better.
+    (fields[...].w, in place). A region that has cells of `once` is cut in two only if that is much better.
     """
     cells = seam_grid(grid)
-    owner = _owners(layers, fields, residual, whole, masks, grid, cells, _CUT, moved)
+    owner = _owners(layers, fields, residual, whole, masks, grid, cells, _CUT, once)
     yields = [_soften((whole & (owner != k)).astype(np.float32), cells.wraps) for k in range(len(layers))]
     _yield(device, layers, fields, yields, grid, cells)
 
@@ -164,7 +164,7 @@ def _owners(
     grid: Grid,
     cells: Grid,
     cut_price: float,
-    moved: Cells | None = None,
+    once: Cells | None = None,
 ) -> npt.NDArray[np.intp]:
     """The layer of each cell, (height, width): in the regions `whole` the one it is taken from, elsewhere the
     one that the softmax favours, -1 where none is.
@@ -177,8 +177,8 @@ def _owners(
     owner = np.where(cover.any(0), (shares * cover).argmax(0), -1)
     for region in _connected(whole, cells.wraps):
         rows, columns = np.nonzero(region)
-        once = moved is not None and bool(moved[region].any())
-        owner[rows, columns] = label(rows, columns, residual, shares, cover, cells.wraps, cut_price, once)
+        one = once is not None and bool(once[region].any())
+        owner[rows, columns] = label(rows, columns, residual, shares, cover, cells.wraps, cut_price, one)
     return owner
 
 
@@ -239,9 +239,9 @@ def _padded(values: npt.NDArray[Any], by: int, wraps: bool) -> npt.NDArray[Any]:
     return np.pad(values, ((0, 0), (by, by), *beyond), mode="wrap" if wraps else "constant")
 
 
-def _regions(residual: Residuals, cells: Grid, moved: Cells) -> list[Cells]:
-    """Connected outskirts that hold enough of strong residual, or anything that moved, grown by a cell."""
-    weak = (residual.mean > _WEAK) | (residual.rms > _STRONG) | moved
+def _regions(residual: Residuals, cells: Grid, once: Cells) -> list[Cells]:
+    """Connected outskirts that hold enough of strong residual, or anything of `once`, grown by a cell."""
+    weak = (residual.mean > _WEAK) | (residual.rms > _STRONG) | once
     weak = _padded(weak.astype(np.uint8), 1, cells.wraps)
     grown = np.asarray(cv2.dilate(weak, np.ones((3, 3), np.uint8)))[1:-1, 1:-1] > 0
     latitude = cells.lens[2] - (np.arange(cells.height) + 0.5) * cells.lens[3]
@@ -250,7 +250,7 @@ def _regions(residual: Residuals, cells: Grid, moved: Cells) -> list[Cells]:
     return [
         region
         for region in _connected(grown, cells.wraps)
-        if strong[region].sum() >= _LEAST or moved[region].any()
+        if strong[region].sum() >= _LEAST or once[region].any()
     ]
 
 

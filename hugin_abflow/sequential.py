@@ -33,7 +33,7 @@ def merge(
     """The panorama's crop, in bands as `joint.merge` gives them."""
     order = _order(device, layers, canvas, settings)
     if len(order) > 2:  # a mosaic was seen from several places: what stands still moves in several ways
-        settings = replace(settings, movers=False)
+        settings = replace(settings, movers=False, foreground=False)
     mosaic = layers[order[0]]
     guides = list(guides) if settings.guides else []
     with progress("merge", len(order) - 1) as advance:

@@ -39,6 +39,7 @@ class Settings:
     seam                take from one layer, whole, what flow cannot explain (people who moved, occlusions).
     movers              with it, take so, too, what flow matches although it moved by itself, where flow tells
                         how the camera moved.
+    foreground          and near things that would be bent, where one layer shows all of them.
     transition_strain   how much changing over from one layer's geometry to the next may stretch it, where
                         the overlap is wider than that takes; 0..1, 0: the whole overlap, as published.
     guides              let control points lead the flow where it goes astray.
@@ -67,6 +68,7 @@ class Settings:
     highlights: bool = True
     seam: bool = True
     movers: bool = True
+    foreground: bool = True
     transition_strain: float = 0.085
     guides: bool = True
     interpolation: Interpolation = "bicubic"
@@ -108,7 +110,7 @@ class Settings:
             if not isinstance(value, str) or value not in choices:
                 expected = " or ".join(map(repr, choices))
                 raise SettingsError(f"{name} is {value!r}; choose {expected}")
-        for name in ("flow", "exposure", "highlights", "seam", "movers", "guides"):
+        for name in ("flow", "exposure", "highlights", "seam", "movers", "foreground", "guides"):
             if not isinstance(getattr(self, name), bool):
                 raise SettingsError(f"{name} is {getattr(self, name)!r}; choose True or False")
         if self.device is not None and not isinstance(self.device, str):

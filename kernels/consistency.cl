@@ -1,17 +1,18 @@
 /* Where the two flows of a pair do not lead back to the start they are not to be trusted; there flow is filled
    from where it is: coarse to fine, on every level by sweeps that carry it on, but hardly across edges of the
-   image. Where something moved by itself, edges are its own and tell nothing of what is around. */
+   image. In the place of what is taken from one photo, edges are its own and tell nothing of what
+   is around. */
 
 /* Brightness of what tells nothing. */
 #define UNTOLD 1e3f
 
-/* Trust in a flow, 1 / (1 + (e / tolerance)^2)^4 with e = |F_ab(q) + F_ba(q + F_ab(q))|; none in that of what
-   moved by itself. */
+/* Trust in a flow, 1 / (1 + (e / tolerance)^2)^4 with e = |F_ab(q) + F_ba(q + F_ab(q))|; none in the place of
+   what is taken from one photo. */
 __kernel void consistency_trust(__global const float2 *flow, /* (grid.y, grid.x) F_ab, px */
                                 __global const float2 *back, /* (grid.y, grid.x) F_ba, px */
                                 int4 grid,                   /* width, height, wraps, 0; run size */
                                 float tolerance,             /* px that leave a sixteenth of the trust */
-                                __global const uchar *moved, /* (cells.y, cells.x): what moved by itself */
+                                __global const uchar *once,  /* (cells.y, cells.x): what is taken from one photo */
                                 int4 cells,                  /* width, height, px of the chart per cell, 0 */
                                 __global const float *image, /* (grid.y, grid.x) a: log brightness, 0 outside */
                                 __global float4 *trusted)    /* (grid.y, grid.x) F_ab, trust, brightness */
@@ -29,8 +30,8 @@ __kernel void consistency_trust(__global const float2 *flow, /* (grid.y, grid.x)
     const float2 e = (f + bilinear_flow(back, q, grid)) / tolerance;
     const float c = 1.0f / (1.0f + square2(e));
     const int column = LEAST(x / cells.z, cells.x - 1), row = LEAST(y / cells.z, cells.y - 1);
-    const bool by_itself = moved[row * cells.x + column];
-    trusted[at] = (float4)(f, by_itself ? 0.0f : c * c * c * c, by_itself ? UNTOLD : image[at]);
+    const bool single = once[row * cells.x + column];
+    trusted[at] = (float4)(f, single ? 0.0f : c * c * c * c, single ? UNTOLD : image[at]);
 }
 
 /* Halve: the mean flow, weighted by trust, the mean trust and the mean brightness; taps as in pyramid_reduce. */
@@ -147,7 +148,7 @@ __kernel void consistency_relax(__global const float4 *trusted, /* (grid.y, grid
 /* The flow where it is trusted, else what was filled in, in place. */
 __kernel void consistency_mix(__global const float4 *trusted, /* (grid.y, grid.x) flow, trust, brightness */
                               int4 grid,                      /* run size */
-                              __global const float2 *wide,    /* (grid.y, grid.x) for what moved by itself */
+                              __global const float2 *wide,    /* (grid.y, grid.x) for what is taken from one photo */
                               __global float2 *filled)        /* (grid.y, grid.x) for all else */
 {
     const int x = get_global_id(0), y = get_global_id(1);

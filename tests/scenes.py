@@ -9,9 +9,9 @@ from grids import sphere
 from rooms import ROOM, Thing, hit, pattern, unit
 
 from hugin_abflow import movers
+from hugin_abflow.cells import View, Whole
 from hugin_abflow.chart import Chart, pair_chart
 from hugin_abflow.flow import Refused
-from hugin_abflow.movers import Movers, View
 
 Array = np.ndarray
 
@@ -51,7 +51,7 @@ class Scene:
 
     def found(
         self, vouched: tuple[Array, Array] = NOBODY, refused: tuple[Array, Array] | None = None
-    ) -> Movers | None:
+    ) -> Whole | None:
         return movers.find(
             self.chart, self.flows, self.views, vouched, [Refused(0, np.stack(refused))] if refused else ()
         )

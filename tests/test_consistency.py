@@ -13,9 +13,9 @@ from scipy import ndimage
 from tolerances import POSITION, SUM, assert_close
 
 from hugin_abflow import consistency
+from hugin_abflow.cells import CELL, Whole
 from hugin_abflow.chart import Chart, pair_chart
 from hugin_abflow.geometry import PairFlow
-from hugin_abflow.movers import CELL, Movers
 from hugin_abflow.opencl import Device
 from hugin_abflow.pyramid import Level
 from hugin_abflow.working import Grid
@@ -262,7 +262,7 @@ def mended(
     grid: Grid,
     forward: np.ndarray,
     backward: np.ndarray,
-    moved: Movers | None = None,
+    moved: Whole | None = None,
     images: tuple[np.ndarray | None, np.ndarray | None] = (None, None),
 ) -> tuple[np.ndarray, np.ndarray]:
     """Both flows mended; images: what the layers show, on the chart; None: nothing."""
@@ -355,7 +355,7 @@ def test_flow_of_what_moved_is_filled_from_around(device: Device, name: str, col
         there[: CELL * cells.shape[0]][np.kron(cells, np.ones((CELL, CELL), bool))] = way, 0
         places.append(cells)
         flows.append(there)
-    filled = mended(device, CANVASES[name], *flows, Movers(*places))
+    filled = mended(device, CANVASES[name], *flows, Whole(*places))
     assert max(np.abs(flow).max() for flow in filled) < LEFT
     for kept, flow in zip(mended(device, CANVASES[name], *flows), flows, strict=True):
         assert np.array_equal(kept[flow[..., 0] != 0], flow[flow[..., 0] != 0])
@@ -408,14 +408,14 @@ def test_a_line_on_which_wrong_flows_lead_back_counts_little(device: Device) -> 
     assert np.abs(result[..., 0] - 4)[patch & (rows != 30)].mean() < 3
 
 
-def moved_place(grid: Grid) -> tuple[Movers, np.ndarray]:
+def moved_place(grid: Grid) -> tuple[Whole, np.ndarray]:
     """Cells that moved, and their pixels."""
     found = chart_of(grid)
     cells = np.zeros((found.height // CELL, found.width // CELL), bool)
     cells[5:11, 2:8] = True
     place = np.zeros((found.height, found.width), bool)
     place[: CELL * cells.shape[0], : CELL * cells.shape[1]] = np.kron(cells, np.ones((CELL, CELL), bool))
-    return Movers(cells, cells), place
+    return Whole(cells, cells), place
 
 
 def test_place_of_what_moved_gets_all_of_the_motion_around(device: Device) -> None:

@@ -22,10 +22,10 @@ from pictures import (
     texture,
 )
 
-from hugin_abflow import chart, consistency, joint, merge, movers
+from hugin_abflow import chart, consistency, joint, merge, single
+from hugin_abflow.cells import Whole
 from hugin_abflow.errors import SettingsError
 from hugin_abflow.layer import Box, Canvas, Layer
-from hugin_abflow.movers import Movers
 from hugin_abflow.opencl import Device
 
 PLANE = Canvas.plane(301, 151)
@@ -328,7 +328,7 @@ def test_neither_threads_nor_memory_change_a_pixel(monkeypatch):
 
 @pytest.mark.parametrize("looked_for", [True, False])
 def test_every_pair_is_mended_with_its_own_images(monkeypatch, looked_for):
-    """In their order, the last one, too, each with what moved in it."""
+    """In their order, the last one, too, each with what is taken whole."""
     sampled, mended, given = [], [], []
     sample, mend, align = chart.sample, consistency.mend, joint._align
 
@@ -336,8 +336,8 @@ def test_every_pair_is_mended_with_its_own_images(monkeypatch, looked_for):
         sampled.append((layer, chart, sample(device, layer, grid, chart)))
         return sampled[-1][2]
 
-    def spy_mend(device, pair, images, moved=None):
-        mended.append((pair, images, moved, mend(device, pair, images, moved)))
+    def spy_mend(device, pair, images, whole=None):
+        mended.append((pair, images, whole, mend(device, pair, images, whole)))
         return mended[-1][3]
 
     def spy_align(device, layers, pairs, flows, *rest):
@@ -345,19 +345,19 @@ def test_every_pair_is_mended_with_its_own_images(monkeypatch, looked_for):
         return align(device, layers, pairs, flows, *rest)
 
     nowhere = np.zeros((1, 1), bool)
-    found = [Movers(nowhere, nowhere) if looked_for else None for _ in range(20)]
+    found = [Whole(nowhere, nowhere) if looked_for else None for _ in range(20)]
     left = iter(found)
-    monkeypatch.setattr(movers, "find", lambda *_: next(left))
-    monkeypatch.setattr(joint, "_moved", lambda *_: None)
+    monkeypatch.setattr(single, "find", lambda *_: next(left))
+    monkeypatch.setattr(single, "on_canvas", lambda *_: None)
     monkeypatch.setattr(chart, "sample", spy_sample)
     monkeypatch.setattr(consistency, "mend", spy_mend)
     monkeypatch.setattr(joint, "_align", spy_align)
-    merged(moving(SPHERE), SPHERE, movers=looked_for)
+    merged(moving(SPHERE), SPHERE, movers=looked_for, foreground=False)
     [(layers, flows)] = given
     assert len(flows) == len(mended) == len(sampled) // 2 > 3
-    for number, (flow, (pair, images, moved, result)) in enumerate(zip(flows, mended, strict=True)):
+    for number, (flow, (pair, images, whole, result)) in enumerate(zip(flows, mended, strict=True)):
         assert flow is result
-        assert moved is found[number]
+        assert whole is found[number]
         shown = [(layer, level) for layer, its_chart, level in sampled if its_chart is pair.chart]
         assert [level for _, level in shown] == list(images)
         assert [layer for layer, _ in shown] == [layers[pair.a], layers[pair.b]]

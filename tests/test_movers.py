@@ -12,8 +12,7 @@ from rooms import Thing
 from scenes import LEFT, UP, Scene, scene
 from scipy import ndimage
 
-from hugin_abflow import movers
-from hugin_abflow.movers import CELL, Movers
+from hugin_abflow.cells import CELL, LEAST, Whole
 
 Array = np.ndarray
 
@@ -34,7 +33,7 @@ def grown(cells: Array, wraps: bool) -> Array:
     return ndimage.binary_dilation(tiled, np.ones((7, 7)))[:, 9:-9]
 
 
-def assert_found(found: Movers | None, of: Scene, *numbers: int) -> None:
+def assert_found(found: Whole | None, of: Scene, *numbers: int) -> None:
     """Just these things are, in each photo where it shows them: in cells whose middle does, perhaps in those
     where one of the other photo leads, and in those around."""
     assert found is not None
@@ -183,7 +182,7 @@ def test_a_few_cells_are_no_thing() -> None:
     for size, expected in ((0.07, False), (0.1, True)):
         one = scene(Thing(AHEAD, UP, size))
         assert (one.found() is not None) == expected
-        assert (one.shown[0][0].sum() / CELL**2 > movers._LEAST) == expected
+        assert (one.shown[0][0].sum() / CELL**2 > LEAST) == expected
 
 
 def test_a_small_step_is_no_step() -> None:
@@ -280,7 +279,7 @@ def test_what_somebody_vouches_for_is_left_alone(wraps: bool) -> None:
         assert_found(one.found((starts, ends)), one, 1 - thing)
         turned = replace(one, flows=one.flows[::-1], views=one.views[::-1]).found((ends, starts))
         assert turned is not None
-        assert_found(Movers(turned.second, turned.first), one, 1 - thing)
+        assert_found(Whole(turned.second, turned.first), one, 1 - thing)
     for off in ((0, 8), (0, -8), (8, 0)):
         assert_found(one.found(one.vouch(0, off)), one, 0, 1)
 

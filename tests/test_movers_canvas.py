@@ -10,10 +10,9 @@ from reference import common
 from scenes import CANVAS, CHARTS
 from scipy import ndimage
 
-from hugin_abflow import movers
+from hugin_abflow.cells import CELL, Whole
 from hugin_abflow.chart import pair_chart
 from hugin_abflow.layer import Box
-from hugin_abflow.movers import CELL, Movers
 from hugin_abflow.working import Grid
 
 
@@ -29,7 +28,7 @@ def check_on_canvas(grid: Grid, at: int) -> None:
     first[rows - 9 : rows - 2, columns - 5 : columns + 6] = True
     second[rows + 1 : rows + 4, columns + 2 : columns + 9] = True
     cells = grid.resized(round(grid.width / 7.9), 23)
-    found = movers.on_canvas(Movers(first, second), chart, cells)
+    found = Whole(first, second).on_canvas(chart, cells)
     assert found.shape == cells.shape
     x, y = (n + 0.5 for n in common.pixels(cells.width, cells.height))
     u, v = common.chart_position(common.canvas_point(x, y, cells.lens), chart.transform)
@@ -41,7 +40,7 @@ def check_on_canvas(grid: Grid, at: int) -> None:
     expected = ndimage.binary_dilation(expected, np.ones((3, 3)))[:, 1:-1]
     assert 20 < expected.sum() < 200
     assert np.array_equal(found, expected)
-    assert not movers.on_canvas(Movers(empty, empty), chart, cells).any()
+    assert not Whole(empty, empty).on_canvas(chart, cells).any()
 
 
 LENS = (-np.pi, CANVAS.lens[1], np.pi / 2 - 90 * CANVAS.lens[3], CANVAS.lens[3])
@@ -63,6 +62,6 @@ def test_cells_are_those_of_a_region_of_the_canvas() -> None:
 def test_around_the_canvas_every_cell_has_one_of_the_chart() -> None:
     chart = CHARTS[True]
     shape = (chart.height + 1) // CELL, (chart.width + 1) // CELL
-    everywhere = Movers(np.ones(shape, bool), np.zeros(shape, bool))
-    found = movers.on_canvas(everywhere, chart, CANVAS.resized(90, 45))
+    everywhere = Whole(np.ones(shape, bool), np.zeros(shape, bool))
+    found = everywhere.on_canvas(chart, CANVAS.resized(90, 45))
     assert found[20:25].all() and not found[:5].any() and not found[-5:].any()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import partial
 from types import SimpleNamespace
 
 import numpy as np
@@ -12,7 +13,7 @@ from reference import common
 from rooms import ROOM, Thing, hit, pattern, unit
 from scipy import ndimage
 
-from hugin_abflow import joint, movers, multiband, seam
+from hugin_abflow import joint, movers, multiband, seam, single
 from hugin_abflow.guides import Guide
 from hugin_abflow.layer import Canvas, Layer
 from hugin_abflow.opencl import Device
@@ -133,7 +134,7 @@ def test_his_place_is_known_wherever_it_matters(device: Device, monkeypatch: pyt
         original = getattr(module, name)
 
         def remember(*given, **named):
-            seen[name] = named.get("moved", given[-1])
+            seen[name] = named.get("once", given[-1])
             return original(*given, **named)
 
         monkeypatch.setattr(module, name, remember)
@@ -164,14 +165,14 @@ def test_each_photo_is_looked_at_in_its_place(device: Device, monkeypatch: pytes
         assert [view.mask[v, u] for view in views] == expected
 
 
-def test_places_of_all_pairs_count(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_places_of_all_pairs_count() -> None:
     """Each on the chart of its own pair; pairs in which nothing moved have none."""
     grid = full_grid(CANVAS, shoot(None).layers)
     cells = np.random.default_rng(1).random((3, *seam.seam_grid(grid).shape)) < 0.1
-    monkeypatch.setattr(movers, "on_canvas", lambda one, chart, _: cells[chart] if one == chart else None)
-    flows = [SimpleNamespace(chart=k) for k in range(3)]
-    assert np.array_equal(joint._moved(flows, [None, 1, 2], grid), cells[1] | cells[2])
-    assert joint._moved(flows, [None] * 3, grid) is None and joint._moved([], [], grid) is None
+    found = [SimpleNamespace(on_canvas=lambda chart, _: cells[chart]) for _ in range(2)]
+    on_canvas = partial(single.on_canvas, cells=seam.seam_grid(grid))
+    assert np.array_equal(on_canvas([None, *found], [0, 1, 2]), cells[1] | cells[2])
+    assert on_canvas([None] * 3, [0, 1, 2]) is None and on_canvas([], []) is None
 
 
 @pytest.mark.usefixtures(one_device.__name__)

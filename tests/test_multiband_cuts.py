@@ -32,10 +32,10 @@ def offsets(
     weights: Sequence[Array],
     places: Sequence[tuple[int, int, int, int]] | None = None,
     dtype: type = np.uint8,
-    moved: Array | None = None,
+    once: Array | None = None,
 ) -> list[Array]:
     """What is added to each layer, (height, width, 3) on its box, as it is read there. pictures: on the whole
-    grid. moved: cells."""
+    grid. once: cells."""
     layers, fields = [], []
     for k, (picture, weight) in enumerate(zip(pictures, weights, strict=True)):
         left, top, width, height = places[k] if places else (0, 0, grid.width, grid.height)
@@ -45,7 +45,7 @@ def offsets(
         field[..., 3] = weight[part]
         fields.append(device.upload(field))
     gains = Correction(grid.resized(7, 5), float(np.dtype(dtype).kind == "u"), (None,) * len(layers))
-    found = multiband.offsets(device, layers, fields, gains, grid, moved)
+    found = multiband.offsets(device, layers, fields, gains, grid, once)
     result = []
     for layer, offset in zip(layers, found.layers, strict=True):
         assert offset is not None
@@ -265,7 +265,7 @@ def test_what_moved_leaves_no_shade_beside_it(device: Device, turned: int) -> No
     clean = blended(pictures, offsets(device, grid, pictures, weights), weights)
     left = []
     for cells in (moved, None):
-        result = blended(shown, offsets(device, grid, shown, weights, moved=cells), weights)
+        result = blended(shown, offsets(device, grid, shown, weights, once=cells), weights)
         left.append(np.abs(result - clean)[~np.kron(moved, np.ones((8, 8), bool))].max())
     assert left[0] < 0.004 < 0.012 < left[1]
 

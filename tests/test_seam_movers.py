@@ -117,6 +117,6 @@ def test_what_moved_makes_a_region_whatever_the_layers_show() -> None:
         assert not seam.regions(alike(residual), grid, aligned).any()
     residual[6:8, 9] = 0.5 * (seam._WEAK + seam._STRONG)
     residual[30, 30] = 2 * seam._STRONG
-    found = seam.regions(alike(residual), grid, moved=moved)
+    found = seam.regions(alike(residual), grid, once=moved)
     assert np.argwhere(found).tolist() == [[y, x] for y in range(5, 9) for x in range(6, 11)]
     assert not seam.regions(alike(residual), grid).any()

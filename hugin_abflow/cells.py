@@ -1,0 +1,166 @@
+"""A pair's flow by cells of its chart, on the host: for what is taken from one photo, whole (single.py)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+import scipy
+
+from hugin_abflow.chart import Chart
+from hugin_abflow.pyramid import Level
+from hugin_abflow.working import Grid
+
+Mask = npt.NDArray[np.bool_]
+Flows = tuple[npt.NDArray[np.float32], npt.NDArray[np.float32]]
+Places = npt.NDArray[np.float64]  # (n, 2): x right, y down, px of the chart; a pixel's centre at .5
+
+# Chart pixels per cell: a cell is told by the flow at its centre.
+CELL = 4
+# Cells by which what is found is to be grown: flow is smooth across outlines.
+GROWN = 3
+# Cells of a thing, at least.
+LEAST = 20
+# Chart pixels between start and return of a flow that is believed.
+CONSISTENT = 1.0
+
+
+@dataclass(frozen=True)
+class View:
+    """What one photo shows on a chart, float32 (height, width): log brightness and its mask."""
+
+    image: npt.NDArray[np.float32]
+    mask: npt.NDArray[np.float32]
+
+    @classmethod
+    def of(cls, level: Level) -> View:
+        """A copy of what is on the device."""
+        return cls(level.image.get(), level.mask.get())
+
+
+@dataclass(frozen=True)
+class Whole:
+    """What is taken from one photo, whole: where the first and the second photo of a pair show it, cells of
+    their chart.
+    """
+
+    first: Mask
+    second: Mask
+
+    @classmethod
+    def of(cls, found: Sequence[Mask], wraps: bool) -> Whole | None:
+        """What was found in each photo, and the cells around; None: nothing."""
+        if not any(one.any() for one in found):
+            return None
+        first, second = (grown(one, GROWN, wraps) for one in found)
+        return cls(first, second)
+
+    def __or__(self, other: Whole) -> Whole:
+        return Whole(self.first | other.first, self.second | other.second)
+
+    def on_canvas(self, chart: Chart, cells: Grid) -> Mask:
+        """Cells of a grid over the canvas, (height, width), that show it, in either photo, or lie beside one
+        that does.
+        """
+        rows, columns = (n.ravel() + 0.5 for n in np.indices(cells.shape))
+        region = cells.region
+        places = np.stack(
+            [
+                region.left + columns * region.width / cells.width,
+                region.top + rows * region.height / cells.height,
+            ],
+            1,
+        )
+        found = np.zeros(cells.shape, bool)
+        inside, (row, column) = _cells(chart.positions(cells.points(places)), self.first.shape, chart)
+        found.ravel()[inside] = (self.first | self.second)[row, column]
+        return grown(found, 1, cells.wraps)
+
+
+@dataclass(frozen=True)
+class Way:
+    """Flow that starts on one photo, by cells.
+
+    starts      (height, width, 2) px: the cells' centres.
+    ends        the same, where the flow leads.
+    shown       whether both photos show where it starts and where it leads.
+    believed    whether the opposite flow leads back, too.
+    around      columns of a chart that wraps, px; else 0.
+    """
+
+    starts: Places
+    ends: Places
+    shown: Mask
+    believed: Mask
+    around: int = 0
+
+    @classmethod
+    def of(
+        cls, chart: Chart, flows: Flows, views: tuple[View, View], index: int, gap: float = CONSISTENT
+    ) -> Way:
+        """From photo `index` of a pair; gap: px between start and return that are believed."""
+        flow = at_centres(flows[index]).astype(np.float64)
+        rows, columns = np.indices(flow.shape[:2])
+        starts = np.stack([columns, rows], -1).astype(np.float64) * CELL + CELL // 2 + 0.5
+        inside, (row, column) = _pixels(starts + flow, chart)
+        there = np.where(inside, row, 0), np.where(inside, column, 0)
+        shown = inside & (at_centres(views[index].mask) > 0) & (views[1 - index].mask[there] > 0)
+        believed = shown & (np.linalg.norm(flow + flows[1 - index][there], axis=-1) < gap)
+        return cls(starts, starts + flow, shown, believed, chart.width * chart.wraps)
+
+    @property
+    def flow(self) -> Places:
+        """(height, width, 2) px, from cells' centres."""
+        return self.ends - self.starts
+
+    def vouched(self, things: npt.NDArray[np.int32], at: tuple[Places, Places]) -> npt.NDArray[np.intp]:
+        """The numbers of the things, (height, width), that somebody says are matched as their flow has it.
+
+        at: places on both photos that show the same, the one first on which the flow starts.
+        """
+        starts, ends = at
+        cell = np.floor(starts / CELL).astype(int)
+        inside = (cell >= 0).all(1) & (cell[:, 0] < things.shape[1]) & (cell[:, 1] < things.shape[0])
+        column, row = cell[inside].T
+        off = self.ends[row, column] - ends[inside]
+        off[:, 0] -= self.around * np.rint(off[:, 0] / (self.around or 1))
+        agree = np.linalg.norm(off, axis=1) < CELL
+        return np.unique(things[row[agree], column[agree]])
+
+
+def at_centres(values: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
+    """What pixels have, (height, width, ...), at cells' centres."""
+    return values[CELL // 2 :: CELL, CELL // 2 :: CELL]
+
+
+def reached(ends: Places, shape: tuple[int, ...], chart: Chart) -> Mask:
+    """The cells that flow leads to."""
+    found = np.zeros(shape, bool)
+    _, (row, column) = _cells(ends, found.shape, chart)
+    found[row, column] = True
+    return found
+
+
+def grown(mask: Mask, by: int, wraps: bool) -> Mask:
+    """With as many cells around."""
+    modes = "constant", "wrap" if wraps else "constant"
+    found: Mask = scipy.ndimage.maximum_filter(mask, 2 * by + 1, mode=modes)
+    return found
+
+
+def _cells(
+    places: Places, shape: tuple[int, ...], chart: Chart
+) -> tuple[Mask, tuple[npt.NDArray[np.intp], npt.NDArray[np.intp]]]:
+    """Which places (n, 2) px lie on the chart, and the rows and columns of the cells of those."""
+    inside, pixels = _pixels(places, chart)
+    at = (np.minimum(n[inside] // CELL, most - 1) for n, most in zip(pixels, shape, strict=True))
+    return inside, (next(at), next(at))
+
+
+def _pixels(places: Places, chart: Chart) -> tuple[Mask, tuple[npt.NDArray[np.intp], npt.NDArray[np.intp]]]:
+    """Which places (..., 2) px lie on the chart, and the rows and columns of all."""
+    column, row = np.moveaxis(np.floor(places).astype(int), -1, 0)
+    column = column % chart.width if chart.wraps else column
+    return (row >= 0) & (row < chart.height) & (column >= 0) & (column < chart.width), (row, column)

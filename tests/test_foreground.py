@@ -1,0 +1,209 @@
+"""Near things that would be bent, on charts whose every flow is known: found where one photo shows all of
+them, and nothing else is."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from pictures import masked, merged, one_device, pixel_places
+from reference import common
+from rooms import ROOM, Thing, hit, pattern, unit
+from scenes import NOBODY
+from scipy import ndimage
+
+from hugin_abflow import foreground, movers
+from hugin_abflow.cells import CELL, View, Whole
+from hugin_abflow.layer import Canvas
+
+Array = np.ndarray
+
+WIDTH, HEIGHT = 323, 141
+# The borders: where the second photo begins, and where the first one ends.
+BORDERS = 100, 220
+# What is behind shifts by so many px, and a thing by as many more.
+BEHIND, OWN = np.array([2.0, 1.0]), np.array([18.0, -3.0])
+few = settings(max_examples=20, deadline=None, derandomize=True)
+
+
+@dataclass(frozen=True)
+class Pair:
+    """What `find` takes, and the pixels of both photos that show the thing."""
+
+    chart: SimpleNamespace
+    flows: tuple[Array, Array]
+    views: tuple[View, View]
+    thing: tuple[Array, Array]
+
+    def found(self, vouched: tuple[Array, Array] = NOBODY) -> Whole | None:
+        return foreground.find(self.chart, self.flows, self.views, vouched)
+
+
+def pair(
+    left: float,
+    right: float,
+    *,
+    height: float = 22,
+    own: Array = OWN,
+    borders: tuple[int, int] = BORDERS,
+    turned: int | None = None,
+    gaps: int = 0,
+) -> Pair:
+    """A board in front of a wall. left, right: its ends in the first photo, px. turned: columns that a chart
+    that wraps, and has 324, is turned by. gaps: px between its rails, which are as wide."""
+    width = WIDTH if turned is None else WIDTH + 1
+    rows, columns = np.mgrid[:HEIGHT, :width] + 0.5
+
+    def board(x: Array, y: Array) -> Array:
+        solid = (x >= left) & (x < right) & (np.abs(y - HEIGHT / 2) < height / 2)
+        return solid & ((x % (2 * gaps) < gaps) if gaps else True)
+
+    shift = BEHIND + own
+    things = board(columns, rows), board(columns - shift[0], rows - shift[1])
+    flows = [
+        np.where(thing[..., None], sign * shift, sign * BEHIND).astype(np.float32)
+        for thing, sign in zip(things, (1, -1), strict=True)
+    ]
+    masks = [columns < borders[1], columns >= borders[0]]
+    turn = 0 if turned is None else turned
+    flows, masks, things = ([np.roll(one, turn, 1) for one in many] for many in (flows, masks, things))
+    views = tuple(View(np.zeros(mask.shape, np.float32), mask.astype(np.float32)) for mask in masks)
+    chart = SimpleNamespace(width=width, height=HEIGHT, wraps=turned is not None, eye=None)
+    return Pair(chart, tuple(flows), views, tuple(things))
+
+
+def assert_found(found: Whole | None, of: Pair) -> None:
+    """The cells in whose middle a photo shows the thing, if the other one does, too, and those around."""
+    assert found is not None
+    modes = "constant", "wrap" if of.chart.wraps else "constant"
+    middle = np.s_[CELL // 2 :: CELL, CELL // 2 :: CELL]
+    rows, columns = np.indices(of.thing[0].shape)
+    for index, cells in enumerate((found.first, found.second)):
+        right, down = np.moveaxis(of.flows[index].astype(int), -1, 0)
+        there = of.views[1 - index].mask[rows + down * of.thing[index], (columns + right) % of.chart.width]
+        place = (of.thing[index] & (of.views[index].mask > 0) & (there > 0))[middle]
+        assert place.sum() > 30
+        inner, outer = (ndimage.maximum_filter(place, 2 * by + 1, mode=modes) for by in (3, 5))
+        assert cells[inner].all()
+        assert not cells[~outer].any()
+
+
+@pytest.mark.parametrize("ends", [(60, 160), (110, 170), (115, 260), (60, 130)])
+def test_board_that_ends_within_the_overlap_is_found(ends: tuple[float, float]) -> None:
+    """Running out of the second photo, of none, and of the first."""
+    one = pair(*ends)
+    assert_found(one.found(), one)
+
+
+@few
+@given(turned=st.integers(0, 80))
+def test_chart_that_wraps_may_be_turned(turned: int) -> None:
+    plain, one = pair(110, 170, turned=0), pair(110, 170, turned=CELL * turned)
+    assert_found(one.found(), one)
+    for a, b in zip(plain.found().__dict__.values(), one.found().__dict__.values(), strict=True):
+        assert np.array_equal(np.roll(a, turned, 1), b)
+
+
+def test_it_is_the_same_whichever_photo_is_the_first() -> None:
+    one = pair(60, 160)
+    swapped = Pair(one.chart, one.flows[::-1], one.views[::-1], one.thing[::-1])
+    found, other = one.found(), swapped.found()
+    assert np.array_equal(found.first, other.second) and np.array_equal(found.second, other.first)
+
+
+def test_rails_are_one_thing() -> None:
+    """With what shows between them."""
+    one = pair(60, 160, gaps=8, height=60)
+    assert_found(one.found(), one)
+    middle = one.found().first[HEIGHT // 2 // CELL]
+    assert middle[108 // CELL : 156 // CELL].all()
+
+
+@pytest.mark.parametrize(
+    "what",
+    [
+        {"left": 60, "right": 260},  # crosses the overlap: would break at a border
+        {"left": 60, "right": 160, "own": OWN / 2.5},  # bends little
+        {"left": 60, "right": 160, "borders": (10, 310)},  # the same, has much room to change over
+        {"left": 140, "right": 160, "height": 12},  # no more than a few cells
+        {"left": 60, "right": 160, "own": -BEHIND * 0.9},  # is farther than what is around
+    ],
+)
+def test_what_is_left_alone(what: dict) -> None:
+    assert pair(**what).found() is None
+
+
+def test_floor_that_comes_nearer_is_no_thing() -> None:
+    """Flow grows as much, but slowly."""
+    one = pair(60, 160)
+    share = np.clip((np.arange(HEIGHT) - 20) / 100, 0, 1)[:, None, None]
+    flows = tuple(
+        (sign * (BEHIND + share * OWN)).astype(np.float32) + 0 * flow
+        for sign, flow in zip((1, -1), one.flows, strict=True)
+    )
+    assert foreground.find(one.chart, flows, one.views, NOBODY) is None
+
+
+def test_flow_that_does_not_lead_back_tells_nothing() -> None:
+    one = pair(60, 160)
+    flows = one.flows[0], np.where(one.thing[1][..., None], one.flows[1] + 3, one.flows[1])
+    assert foreground.find(one.chart, flows, one.views, NOBODY) is None
+
+
+def test_what_somebody_vouches_for_is_left_alone() -> None:
+    """Once in each photo would do, but control points lie in both."""
+    one = pair(60, 160)
+    starts = np.array([[130.0, 70.0]])
+    assert one.found((starts, starts + BEHIND + OWN)) is None
+    assert one.found((starts, starts + BEHIND + OWN + 6)) is not None
+    assert one.found((np.array([[130.0, 30.0]]), np.array([[130.0, 30.0]]) + BEHIND)) is not None
+
+
+def test_nothing_without_an_overlap_or_anything_behind() -> None:
+    assert pair(60, 160, borders=(200, 200)).found() is None
+    one = pair(60, 160)
+    rng = np.random.default_rng(1)
+    noise = tuple(rng.normal(0, 9, flow.shape).astype(np.float32) for flow in one.flows)
+    assert foreground.find(one.chart, noise, one.views, NOBODY) is None
+
+
+# Whole panoramas
+
+CANVAS = Canvas.sphere(960, 480)
+SCALE = 960 / (2 * np.pi)  # px per radian
+MOVE = np.array([-0.12, 0, 0])
+BALL = Thing((0.02, 1, 0.05), 0 * MOVE, 0.16, 0.75)
+
+
+def ball(**options: bool) -> tuple[int, int]:
+    """Width and height of a ball, which both photos show round, in their panorama."""
+    rows, columns = pixel_places(480, 960)
+    rays = common.canvas_point(columns + 0.5, rows + 0.5, (-np.pi, 1 / SCALE, np.pi / 2, 1 / SCALE))
+    layers = []
+    for second, covered in ((False, (180, 535)), (True, (425, 780))):
+        points = hit(ROOM, MOVE * second, rays)
+        colours = np.exp(pattern(unit(points), 1, SCALE))[..., None] * [60.0, 80.0, 90.0]
+        points, place = BALL.seen(MOVE * second, rays, second)
+        own = np.exp(pattern(unit(points), 2, SCALE))[..., None] * [110.0, 50.0, 30.0]
+        photo = np.full((480, 960, 4), 255, np.uint8)
+        photo[..., :3] = np.clip(np.rint(np.where(place[..., None], own, colours)), 0, 255)
+        layers.append(
+            masked(photo, (np.abs(rows - 240) < 120) & (columns >= covered[0]) & (columns < covered[1]))
+        )
+    result = merged(layers, CANVAS, **options)
+    red = ndimage.binary_opening((result[..., 0] > 1.5 * result[..., 2]) & (result[..., 3] > 0))
+    return np.ptp(np.nonzero(red)[1]) + 1, np.ptp(np.nonzero(red)[0]) + 1
+
+
+@pytest.mark.usefixtures(one_device.__name__)
+def test_a_ball_close_by_stays_round(monkeypatch: pytest.MonkeyPatch) -> None:
+    """And is shown once; it is squeezed if near things are not looked for."""
+    monkeypatch.setattr(movers, "find", lambda *_: None)
+    width, height = ball()
+    assert abs(width - height) <= 3
+    width, height = ball(foreground=False)
+    assert abs(width - height) > 5
