@@ -74,7 +74,7 @@ class Whole:
             1,
         )
         found = np.zeros(cells.shape, bool)
-        inside, (row, column) = _cells(chart.positions(cells.points(places)), self.first.shape, chart)
+        inside, (row, column) = cells_at(chart.positions(cells.points(places)), self.first.shape, chart)
         found.ravel()[inside] = (self.first | self.second)[row, column]
         return grown(found, 1, cells.wraps)
 
@@ -138,7 +138,7 @@ def at_centres(values: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
 def reached(ends: Places, shape: tuple[int, ...], chart: Chart) -> Mask:
     """The cells that flow leads to."""
     found = np.zeros(shape, bool)
-    _, (row, column) = _cells(ends, found.shape, chart)
+    _, (row, column) = cells_at(ends, found.shape, chart)
     found[row, column] = True
     return found
 
@@ -150,7 +150,7 @@ def grown(mask: Mask, by: int, wraps: bool) -> Mask:
     return found
 
 
-def _cells(
+def cells_at(
     places: Places, shape: tuple[int, ...], chart: Chart
 ) -> tuple[Mask, tuple[npt.NDArray[np.intp], npt.NDArray[np.intp]]]:
     """Which places (n, 2) px lie on the chart, and the rows and columns of the cells of those."""

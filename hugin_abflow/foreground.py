@@ -10,49 +10,32 @@ to the other's is left alone: taken from either, it would break at a border.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import dataclass
-from functools import reduce
-from itertools import compress
-from operator import or_
+from collections.abc import Sequence
 
 import numpy as np
 import numpy.typing as npt
 import scipy
 
-from hugin_abflow.cells import CELL, LEAST, Flows, Mask, Places, View, Way, Whole, at_centres, grown, reached
+from hugin_abflow.cells import CELL, LEAST, Flows, Mask, Places, View, Way, Whole, at_centres, cells_at, grown
 from hugin_abflow.chart import Chart
 from hugin_abflow.working import connected
+
+# Cells of a chart, (height, width), by the number of the thing that they show; 0: none.
+Things = npt.NDArray[np.int32]
 
 # Chart pixels by which flow may differ from cell to cell within a surface.
 _ALIKE = 0.75
 # Cells of a surface that is behind things, and its share of what both photos show.
 _WIDE, _SHARE = 40, 0.15
-# Chart pixels by which a thing's flow differs from that of what is behind it.
-_APART = 4.0
-# Strain from which on a thing is beyond repair.
-_STRAIN = 0.1
-# Cells beside a thing that may lie beyond a photo's border and its other photo still show all of it, and
-# their share of those beyond the other's.
-_FEW, _FEWER = 2, 0.15
-# Cells that a thing's outline is smoothed by, and beside it, in which a border is looked for.
-_CLOSED, _BESIDE = 2, 2
-
-
-@dataclass(frozen=True)
-class _Thing:
-    """Where each photo of a pair shows it, and its strain."""
-
-    shown: tuple[Mask, Mask]
-    strain: float
-
-    def meets(self, other: _Thing) -> bool:
-        """Whether it is the same, in both photos."""
-        return all((a & b).any() for a, b in zip(self.shown, other.shown, strict=True))
-
-    def __or__(self, other: _Thing) -> _Thing:
-        first, second = (a | b for a, b in zip(self.shown, other.shown, strict=True))
-        return _Thing((first, second), max(self.strain, other.strain))
+# Chart pixels by which a thing's flow differs from that of what is behind it, at least and in its median.
+_APART, _FAR = 4.0, 6.0
+# Strain from which on a thing is taken whole.
+_STRAIN = 0.08
+# Cells of a thing that may lie at a photo's border, beyond which the other photo goes on, for it still to
+# show the whole, and their share of those at the other's border; and how far from a border lies at it.
+_FEW, _FEWER, _AT = 2, 0.15, 2
+# Cells that a thing's outline is smoothed by.
+_CLOSED = 2
 
 
 def find(
@@ -64,43 +47,75 @@ def find(
     vouched     where somebody says that both show the same: what is matched so is left alone.
     """
     masks = at_centres(views[0].mask) > 0, at_centres(views[1].mask) > 0
+    ways = [Way.of(chart, flows, views, index) for index in (0, 1)]
+    if not all(way.believed.any() for way in ways):
+        return None
     width = _width(masks, chart.wraps)
-    things: list[_Thing] = []
-    for index in (0, 1):
-        way = Way.of(chart, flows, views, index)
-        for its, strain in _standing_out(way, width, (vouched[index], vouched[1 - index])):
-            there = reached(way.ends[its], its.shape, chart)
-            ends = (its, there) if index == 0 else (there, its)
-            found = _Thing((_filled(ends[0], chart.wraps), _filled(ends[1], chart.wraps)), strain)
-            same = [one.meets(found) for one in things]
-            found = reduce(or_, compress(things, same), found)
-            things = [one for one, is_same in zip(things, same, strict=True) if not is_same] + [found]
-    places = [np.zeros(width.shape, bool) for _ in masks]
-    for thing in things:
-        if thing.strain >= _STRAIN and _ends_within(thing, masks, chart.wraps):
-            places = [one | its for one, its in zip(places, thing.shown, strict=True)]
-    return Whole.of(places, chart.wraps)
+    found = [_standing_out(way, width, (vouched[k], vouched[1 - k])) for k, way in enumerate(ways)]
+    shown, strain = _joined(chart, ways, found)
+    kept = (strain >= _STRAIN) & _ends_within(shown, len(strain), masks, chart.wraps)
+    return Whole.of([_filled(kept[its], chart.wraps) for its in shown], chart.wraps)
 
 
 def _standing_out(
     way: Way, width: npt.NDArray[np.float64], vouched: tuple[Places, Places]
-) -> Iterator[tuple[Mask, float]]:
-    """The cells of each thing that stands out of what is behind it, and its strain."""
+) -> tuple[Things, npt.NDArray[np.float64]]:
+    """The things that stand out of what is behind them, and the strain of each number, 0 of 0."""
     surfaces = _surfaces(way)
     sizes = np.bincount(surfaces[way.believed], minlength=surfaces.max() + 1)
-    behind = way.believed & (sizes >= max(_WIDE, _SHARE * np.count_nonzero(way.shown)))[surfaces]
+    behind = (sizes >= max(_WIDE, _SHARE * np.count_nonzero(way.shown)))[surfaces]
     if not behind.any():
-        return
+        return np.zeros(behind.shape, np.int32), np.zeros(1)
     around = way.flow[_nearest(behind, way.around > 0)]
     own = np.linalg.norm(way.flow - around, axis=-1)
     longer = np.linalg.norm(way.flow, axis=-1) > np.linalg.norm(around, axis=-1)
-    things = connected((own > _APART) & longer & way.shown, way.around > 0)
-    told = np.bincount(things[way.believed], minlength=things.max() + 1) >= LEAST
+    parts = connected((own > _APART) & longer & way.shown, way.around > 0)
+    told = np.bincount(parts[way.believed], minlength=parts.max() + 1) >= LEAST
     told[0] = False
-    told[way.vouched(things, vouched)] = False
-    for number in np.flatnonzero(told):
-        its = things == number
-        yield its, float(np.median(own[its & way.believed]) / np.median(width[its]))
+    told[way.vouched(parts, vouched)] = False
+    numbers = np.flatnonzero(told)
+    shift = scipy.ndimage.median(own, np.where(way.believed, parts, 0), numbers)
+    strain = np.where(shift >= _FAR, shift / scipy.ndimage.median(width, parts, numbers), 0.0)
+    new = np.zeros(told.size, np.int32)
+    new[numbers] = np.arange(1, numbers.size + 1)
+    return new[parts], np.concatenate([[0.0], strain])
+
+
+def _joined(
+    chart: Chart, ways: Sequence[Way], found: Sequence[tuple[Things, npt.NDArray[np.float64]]]
+) -> tuple[list[Things], npt.NDArray[np.float64]]:
+    """Where each photo shows the things that were found by flow from either, and the strain of each number:
+    two that lead to each other are one.
+    """
+    (first, strain), (second, other_strain) = found
+    second = np.where(second > 0, second + strain.size - 1, 0)
+    count = strain.size + other_strain.size - 1
+    shown, led = [first.copy(), second.copy()], []
+    for its, there, place, way in zip((first, second), (second, first), shown[::-1], ways, strict=True):
+        inside, (row, column) = cells_at(way.ends[its > 0], its.shape, chart)
+        number, met = its[its > 0][inside], there[row, column]
+        led.append(np.unique((np.minimum(number, met) * count + np.maximum(number, met))[met > 0]))
+        place[row, column] = np.where(met > 0, met, number)
+    same = np.divmod(np.intersect1d(led[0], led[1]), count)
+    graph = scipy.sparse.csr_array((np.ones(same[0].size), same), shape=(count, count))
+    total, thing = scipy.sparse.csgraph.connected_components(graph, directed=False)
+    strains = np.zeros(total)
+    np.maximum.at(strains, thing, np.concatenate([strain, other_strain[1:]]))
+    return [thing[its] for its in shown], strains
+
+
+def _ends_within(
+    shown: Sequence[Things], count: int, masks: tuple[Mask, Mask], wraps: bool
+) -> npt.NDArray[np.bool_]:
+    """Which things one photo shows as far as the other one does: they cross the other's border alone."""
+    crossing = np.zeros((2, count))
+    for number, (own, other) in enumerate((masks, masks[::-1])):
+        border = grown(own & ~other, _AT, wraps)
+        for its in shown:
+            crossing[number] += np.bincount(its[border], minlength=count)
+    within: npt.NDArray[np.bool_] = crossing.min(0) <= _FEW + _FEWER * crossing.max(0)
+    within[0] = False
+    return within
 
 
 def _surfaces(way: Way) -> npt.NDArray[np.int32]:
@@ -134,7 +149,7 @@ def _nearest(mask: Mask, wraps: bool) -> tuple[npt.NDArray[np.intp], npt.NDArray
 
 def _width(masks: tuple[Mask, Mask], wraps: bool) -> npt.NDArray[np.float64]:
     """How wide the overlap is at each cell, px: from the border of one photo, where the other one goes on, to
-    that of the other.
+    that of the other. Without end if one has no such border: then one of them shows all.
     """
     total = np.zeros(masks[0].shape)
     for own, other in (masks, masks[::-1]):
@@ -151,14 +166,7 @@ def _filled(mask: Mask, wraps: bool) -> Mask:
     wider = grown(np.pad(mask, ((_CLOSED, _CLOSED), (0, 0))), _CLOSED, wraps)
     modes = "constant", "wrap" if wraps else "constant"
     closed = scipy.ndimage.minimum_filter(wider, 2 * _CLOSED + 1, mode=modes, cval=1)[_CLOSED:-_CLOSED]
-    filled: Mask = scipy.ndimage.binary_fill_holes(closed)
-    return filled
-
-
-def _ends_within(thing: _Thing, masks: tuple[Mask, Mask], wraps: bool) -> bool:
-    """Whether one photo shows all of a thing that the other one does: it crosses the other's border alone."""
-    beside = [grown(shown, _BESIDE, wraps) for shown in thing.shown]
-    beyond = [
-        sum(np.count_nonzero(its & own & ~other) for its in beside) for own, other in (masks, masks[::-1])
-    ]
-    return bool(min(beyond) <= _FEW + _FEWER * max(beyond))
+    if not wraps:
+        return np.asarray(scipy.ndimage.binary_fill_holes(closed))
+    columns = closed.shape[1]
+    return np.asarray(scipy.ndimage.binary_fill_holes(np.tile(closed, 3))[:, columns : 2 * columns])

@@ -428,7 +428,7 @@ def _flows(
             its_flow = PairFlow(pair.a, pair.b, its_chart, *found)
             mend()
             job = None
-            if settings.seam and (settings.movers or settings.foreground):
+            if settings.seam and (settings.foreground or (settings.movers and its_chart.eye)):
                 views = (View.of(images[0]), View.of(images[1]))
                 arrays, vouched = (found[0].get(), found[1].get()), (placed.at_a, placed.at_b)
                 job = looking.submit(single.find, its_chart, arrays, views, vouched, solved.refused, settings)

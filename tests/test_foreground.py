@@ -4,6 +4,7 @@ them, and nothing else is."""
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 from types import SimpleNamespace
 
 import numpy as np
@@ -16,7 +17,7 @@ from rooms import ROOM, Thing, hit, pattern, unit
 from scenes import NOBODY
 from scipy import ndimage
 
-from hugin_abflow import foreground, movers
+from hugin_abflow import foreground, movers, single
 from hugin_abflow.cells import CELL, View, Whole
 from hugin_abflow.layer import Canvas
 
@@ -48,24 +49,31 @@ def pair(
     right: float,
     *,
     height: float = 22,
+    behind: Array = BEHIND,
     own: Array = OWN,
     borders: tuple[int, int] = BORDERS,
     turned: int | None = None,
     gaps: int = 0,
+    hole: int = 0,
 ) -> Pair:
     """A board in front of a wall. left, right: its ends in the first photo, px. turned: columns that a chart
-    that wraps, and has 324, is turned by. gaps: px between its rails, which are as wide."""
+    that wraps, and has 324, is turned by. gaps: px between its rails, which are as wide. hole: px, of a hoop,
+    which is open below."""
     width = WIDTH if turned is None else WIDTH + 1
     rows, columns = np.mgrid[:HEIGHT, :width] + 0.5
 
     def board(x: Array, y: Array) -> Array:
         solid = (x >= left) & (x < right) & (np.abs(y - HEIGHT / 2) < height / 2)
+        if hole:
+            aside = np.abs(x - (left + right) / 2)
+            solid &= ~((aside < hole / 2) & (np.abs(y - HEIGHT / 2) < hole / 2))
+            solid &= ~((aside < 6) & (y > HEIGHT / 2))
         return solid & ((x % (2 * gaps) < gaps) if gaps else True)
 
-    shift = BEHIND + own
+    shift = behind + own
     things = board(columns, rows), board(columns - shift[0], rows - shift[1])
     flows = [
-        np.where(thing[..., None], sign * shift, sign * BEHIND).astype(np.float32)
+        np.where(thing[..., None], sign * shift, sign * behind).astype(np.float32)
         for thing, sign in zip(things, (1, -1), strict=True)
     ]
     masks = [columns < borders[1], columns >= borders[0]]
@@ -131,10 +139,58 @@ def test_rails_are_one_thing() -> None:
         {"left": 60, "right": 160, "borders": (10, 310)},  # the same, has much room to change over
         {"left": 140, "right": 160, "height": 12},  # no more than a few cells
         {"left": 60, "right": 160, "own": -BEHIND * 0.9},  # is farther than what is around
+        {"left": 60, "right": 160, "behind": BEHIND + OWN, "own": -OWN},  # by much
+        {"left": 60, "right": 160, "behind": OWN, "own": 0.5 * OWN},  # shifts by much, but not by much more
+        {"left": 60, "right": 260, "own": np.array([-2.0, 24.0])},  # crosses it, and shifts along the borders
+        {"left": 70, "right": 260},  # hardly ends within
+        {"left": 110, "right": 170, "borders": (0, WIDTH)},  # lies in photos that show the same
     ],
 )
 def test_what_is_left_alone(what: dict) -> None:
     assert pair(**what).found() is None
+
+
+@pytest.mark.parametrize("turned", [0, 34, 42])
+def test_hoop_is_whole(turned: int) -> None:
+    """With what shows in it, wherever a chart that wraps begins."""
+    one = pair(115, 171, height=56, hole=40, turned=CELL * turned)
+    assert one.found().first[HEIGHT // 2 // CELL, (143 // CELL + turned) % 81]
+
+
+def test_board_that_just_reaches_a_border_ends_within() -> None:
+    assert pair(106, 260).found() is not None
+
+
+@pytest.mark.parametrize("turned", [0, 40, 41])
+def test_surface_goes_on_around_a_chart(turned: int) -> None:
+    """A wall of which but a part has flow that is alike, wherever that lies."""
+    one = pair(120, 165, turned=0)
+    noise = np.random.default_rng(1).normal(0, 1.0, one.flows[0].shape)
+    columns = np.arange(WIDTH + 1)
+    noise[:, (columns >= 138) & (columns < 186)] = 0
+    flows = [flow + noise * ~thing[..., None] for flow, thing in zip(one.flows, one.thing, strict=True)]
+    turn = partial(np.roll, shift=CELL * turned, axis=1)
+    views = tuple(View(turn(view.image), turn(view.mask)) for view in one.views)
+    flows = tuple(turn(flow.astype(np.float32)) for flow in flows)
+    assert foreground.find(one.chart, flows, views, NOBODY) is not None
+
+
+def test_soft_outline_is_one() -> None:
+    one = pair(60, 160, height=60)
+    flows = tuple(ndimage.uniform_filter(flow, (40, 40, 0)) for flow in one.flows)
+    assert foreground.find(one.chart, flows, one.views, NOBODY) is not None
+
+
+def test_many_things_are_told_apart() -> None:
+    """Two boards, of which one ends within the overlap, and the other crosses it."""
+    one, other = pair(60, 160), pair(60, 260)
+    down = 40
+    flows = tuple(
+        np.where(np.roll(b, down, 0)[..., None], np.roll(flow, down, 0), a)
+        for a, flow, b in zip(one.flows, other.flows, other.thing, strict=True)
+    )
+    both = Pair(one.chart, flows, one.views, one.thing)
+    assert_found(both.found(), both)
 
 
 def test_floor_that_comes_nearer_is_no_thing() -> None:
@@ -154,6 +210,14 @@ def test_flow_that_does_not_lead_back_tells_nothing() -> None:
     assert foreground.find(one.chart, flows, one.views, NOBODY) is None
 
 
+def test_few_cells_that_lead_back_tell_nothing() -> None:
+    one = pair(60, 160)
+    columns = np.arange(WIDTH)[None]
+    rest = one.thing[1] & ~((columns >= 128) & (columns < 140))
+    flows = one.flows[0], np.where(rest[..., None], one.flows[1] + 3, one.flows[1])
+    assert foreground.find(one.chart, flows, one.views, NOBODY) is None
+
+
 def test_what_somebody_vouches_for_is_left_alone() -> None:
     """Once in each photo would do, but control points lie in both."""
     one = pair(60, 160)
@@ -161,6 +225,61 @@ def test_what_somebody_vouches_for_is_left_alone() -> None:
     assert one.found((starts, starts + BEHIND + OWN)) is None
     assert one.found((starts, starts + BEHIND + OWN + 6)) is not None
     assert one.found((np.array([[130.0, 30.0]]), np.array([[130.0, 30.0]]) + BEHIND)) is not None
+
+
+def test_what_somebody_vouches_for_across_the_border_of_a_chart() -> None:
+    one, starts = pair(110, 170, turned=180), np.array([[310.0, 70.0]])
+    assert one.found() is not None
+    assert one.found((starts, (starts + BEHIND + OWN) % [324, 1000])) is None
+
+
+@pytest.mark.parametrize("wraps", [False, True])
+@pytest.mark.parametrize("size", [(1, 1), (90, 1), (90, 2), (1, 90), (2, 90), (90, 3), (3, 90)])
+def test_charts_without_cells(size: tuple[int, int], wraps: bool) -> None:
+    chart = SimpleNamespace(width=size[0], height=size[1], wraps=wraps, eye=None)
+    flow, shown = np.zeros((*size[::-1], 2), np.float32), np.ones(size[::-1], np.float32)
+    assert foreground.find(chart, (flow, flow), (View(shown, shown),) * 2, NOBODY) is None
+
+
+@few
+@given(seed=st.integers(0, 2**32), wraps=st.booleans())
+def test_any_flow_is_told_alike_from_both_sides(seed: int, wraps: bool) -> None:
+    """Whichever photo is the first, and, on a chart that wraps, wherever that begins."""
+    rng = np.random.default_rng(seed)
+    height, width = rng.integers(3, 200), 4 * rng.integers(1, 60)
+    base = ndimage.gaussian_filter(rng.normal(0, 1, (height // 16 + 1, width // 16 + 1, 2)), (1, 1, 0)) * 60
+    wide = np.kron(base, np.ones((16, 16, 1)))[:height, :width].astype(np.float32)
+    flows = wide, -wide + rng.normal(0, 0.2, wide.shape).astype(np.float32)
+    columns = np.arange(width)[None] + np.zeros((height, 1))
+    left, right = np.sort(rng.integers(0, width, 2))
+    views = tuple(View(wide[..., 0], mask.astype(np.float32)) for mask in (columns < right, columns >= left))
+    chart = SimpleNamespace(width=width, height=height, wraps=wraps, eye=None)
+    found = foreground.find(chart, flows, views, NOBODY)
+    other = foreground.find(chart, flows[::-1], views[::-1], NOBODY)
+    assert (found is None) == (other is None)
+    if found:
+        assert np.array_equal(found.first, other.second) and np.array_equal(found.second, other.first)
+    if wraps and found:
+        turn = partial(np.roll, shift=4 * rng.integers(1, 60), axis=1)
+        turned = tuple(View(turn(view.image), turn(view.mask)) for view in views)
+        again = foreground.find(chart, tuple(map(turn, flows)), turned, NOBODY)
+        assert again is not None and again.first.sum() == found.first.sum()
+
+
+@pytest.mark.parametrize("movers_too", [False, True])
+@pytest.mark.parametrize("foreground_too", [False, True])
+def test_both_kinds_are_taken_whole(
+    monkeypatch: pytest.MonkeyPatch, movers_too: bool, foreground_too: bool
+) -> None:
+    rng = np.random.default_rng(1)
+    one, other = (Whole(rng.random((9, 9)) < 0.3, rng.random((9, 9)) < 0.3) for _ in range(2))
+    monkeypatch.setattr(movers, "find", lambda *given: one if given == (1, 2, 3, 4, 5) else None)
+    monkeypatch.setattr(foreground, "find", lambda *given: other if given == (1, 2, 3, 4) else None)
+    found = single.find(1, 2, 3, 4, 5, SimpleNamespace(movers=movers_too, foreground=foreground_too))
+    wanted = [its for its, on in ((one, movers_too), (other, foreground_too)) if on]
+    assert (found is None) == (not wanted)
+    for name in ("first", "second") if wanted else ():
+        assert np.array_equal(getattr(found, name), np.any([getattr(its, name) for its in wanted], 0))
 
 
 def test_nothing_without_an_overlap_or_anything_behind() -> None:
