@@ -52,13 +52,14 @@ def pair(
     behind: Array = BEHIND,
     own: Array = OWN,
     borders: tuple[int, int] = BORDERS,
+    top: int = 0,
     turned: int | None = None,
     gaps: int = 0,
     hole: int = 0,
 ) -> Pair:
-    """A board in front of a wall. left, right: its ends in the first photo, px. turned: columns that a chart
-    that wraps, and has 324, is turned by. gaps: px between its rails, which are as wide. hole: px, of a hoop,
-    which is open below."""
+    """A board in front of a wall. left, right: its ends in the first photo, px. top: rows that neither photo
+    shows. turned: columns that a chart that wraps, and has 324, is turned by. gaps: px between its rails, as
+    wide as these. hole: px, of a hoop, which is open below."""
     width = WIDTH if turned is None else WIDTH + 1
     rows, columns = np.mgrid[:HEIGHT, :width] + 0.5
 
@@ -76,7 +77,7 @@ def pair(
         np.where(thing[..., None], sign * shift, sign * behind).astype(np.float32)
         for thing, sign in zip(things, (1, -1), strict=True)
     ]
-    masks = [columns < borders[1], columns >= borders[0]]
+    masks = [(columns < borders[1]) & (rows > top), (columns >= borders[0]) & (rows > top)]
     turn = 0 if turned is None else turned
     flows, masks, things = ([np.roll(one, turn, 1) for one in many] for many in (flows, masks, things))
     views = tuple(View(np.zeros(mask.shape, np.float32), mask.astype(np.float32)) for mask in masks)
@@ -148,12 +149,18 @@ def test_rails_are_one_thing() -> None:
     assert middle[108 // CELL : 156 // CELL].all()
 
 
+SHORT = {"left": 60, "right": 120, "height": 14, "borders": (100, 150)}
+
+
 @pytest.mark.parametrize(
     "what",
     [
         {"left": 60, "right": 260},  # crosses the overlap: would break at a border
         {"left": 60, "right": 160, "own": OWN / 2.5},  # bends little
         {"left": 60, "right": 160, "borders": (10, 310)},  # the same, has much room to change over
+        {"left": 60, "right": 160, "borders": (10, 310), "top": 50},  # where photos end is no border of them
+        {**SHORT, "own": np.array([5.0, 0.0])},  # shifts little
+        {"left": 95, "right": 205},  # crosses one border in one photo, and the other's in the other
         {"left": 140, "right": 160, "height": 12},  # no more than a few cells
         {"left": 60, "right": 160, "own": -BEHIND * 0.9},  # is farther than what is around
         {"left": 60, "right": 160, "behind": BEHIND + OWN, "own": -OWN},  # by much
@@ -174,8 +181,15 @@ def test_hoop_is_whole(turned: int) -> None:
     assert one.found().first[HEIGHT // 2 // CELL, (143 // CELL + turned) % 81]
 
 
-def test_board_that_just_reaches_a_border_ends_within() -> None:
-    assert pair(106, 260).found() is not None
+@pytest.mark.parametrize(
+    "what",
+    [
+        {"left": 106, "right": 260},  # just reaches a border
+        {**SHORT, "own": np.array([7.0, 0.0])},  # shifts just enough
+    ],
+)
+def test_what_is_just_enough(what: dict) -> None:
+    assert pair(**what).found() is not None
 
 
 @pytest.mark.parametrize("turned", [0, 40, 41])
