@@ -17,7 +17,7 @@ from rooms import ROOM, Thing, hit, pattern, unit
 from scenes import NOBODY
 from scipy import ndimage
 
-from hugin_abflow import foreground, movers, single
+from hugin_abflow import foreground, movers
 from hugin_abflow.cells import CELL, View, Whole
 from hugin_abflow.layer import Canvas
 
@@ -270,22 +270,6 @@ def test_charts_without_cells(size: tuple[int, int], wraps: bool) -> None:
     chart = SimpleNamespace(width=size[0], height=size[1], wraps=wraps, eye=None)
     flow, shown = np.zeros((*size[::-1], 2), np.float32), np.ones(size[::-1], np.float32)
     assert foreground.find(chart, (flow, flow), (View(shown, shown),) * 2, NOBODY) is None
-
-
-@pytest.mark.parametrize("movers_too", [False, True])
-@pytest.mark.parametrize("foreground_too", [False, True])
-def test_both_kinds_are_taken_whole(
-    monkeypatch: pytest.MonkeyPatch, movers_too: bool, foreground_too: bool
-) -> None:
-    rng = np.random.default_rng(1)
-    one, other = (Whole(rng.random((9, 9)) < 0.3, rng.random((9, 9)) < 0.3) for _ in range(2))
-    monkeypatch.setattr(movers, "find", lambda *given: one if given == (1, 2, 3, 4, 5) else None)
-    monkeypatch.setattr(foreground, "find", lambda *given: other if given == (1, 2, 3, 4) else None)
-    found = single.find(1, 2, 3, 4, 5, SimpleNamespace(movers=movers_too, foreground=foreground_too))
-    wanted = [its for its, on in ((one, movers_too), (other, foreground_too)) if on]
-    assert (found is None) == (not wanted)
-    for name in ("first", "second") if wanted else ():
-        assert np.array_equal(getattr(found, name), np.any([getattr(its, name) for its in wanted], 0))
 
 
 def test_nothing_without_an_overlap_or_anything_behind() -> None:

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import partial
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -13,13 +11,12 @@ from reference import common
 from rooms import ROOM, Thing, hit, pattern, unit
 from scipy import ndimage
 
-from hugin_abflow import joint, movers, multiband, seam, single
+from hugin_abflow import joint, movers, multiband, seam
 from hugin_abflow.guides import Guide
 from hugin_abflow.layer import Canvas, Layer
 from hugin_abflow.opencl import Device
 from hugin_abflow.progress import silent
 from hugin_abflow.settings import Settings
-from hugin_abflow.working import full_grid
 
 WIDTH, HEIGHT = 960, 480
 CANVAS = Canvas.sphere(WIDTH, HEIGHT)
@@ -163,16 +160,6 @@ def test_each_photo_is_looked_at_in_its_place(device: Device, monkeypatch: pytes
         point = common.canvas_point(np.array(x), np.array(240.5), (-np.pi, 1 / SCALE, np.pi / 2, 1 / SCALE))
         u, v = (int(n) for n in common.chart_position(point, chart.transform))
         assert [view.mask[v, u] for view in views] == expected
-
-
-def test_places_of_all_pairs_count() -> None:
-    """Each on the chart of its own pair; pairs in which nothing moved have none."""
-    grid = full_grid(CANVAS, shoot(None).layers)
-    cells = np.random.default_rng(1).random((3, *seam.seam_grid(grid).shape)) < 0.1
-    found = [SimpleNamespace(on_canvas=lambda chart, _: cells[chart]) for _ in range(2)]
-    on_canvas = partial(single.on_canvas, cells=seam.seam_grid(grid))
-    assert np.array_equal(on_canvas([None, *found], [0, 1, 2]), cells[1] | cells[2])
-    assert on_canvas([None] * 3, [0, 1, 2]) is None and on_canvas([], []) is None
 
 
 @pytest.mark.usefixtures(one_device.__name__)

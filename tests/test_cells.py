@@ -1,4 +1,4 @@
-"""What moved, from charts to cells of the canvas."""
+"""What is taken from one photo, from charts to cells of the canvas."""
 
 from __future__ import annotations
 
