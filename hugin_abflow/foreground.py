@@ -10,7 +10,9 @@ to the other's is left alone: taken from either, it would break at a border.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import partial
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -140,11 +142,9 @@ def _alike(
 
 def _nearest(mask: Mask, wraps: bool) -> tuple[npt.NDArray[np.intp], npt.NDArray[np.intp]]:
     """Rows and columns of the cell of a mask that is nearest to each cell."""
-    columns = mask.shape[1]
-    tiled = np.tile(mask, 3) if wraps else mask
-    row, column = scipy.ndimage.distance_transform_edt(~tiled, return_distances=False, return_indices=True)
-    middle = np.s_[:, columns : 2 * columns] if wraps else np.s_[:, :]
-    return row[middle], column[middle] % columns
+    indices = partial(scipy.ndimage.distance_transform_edt, return_distances=False, return_indices=True)
+    row, column = _all_around(indices, ~mask, wraps)
+    return row, column % mask.shape[1]
 
 
 def _width(masks: tuple[Mask, Mask], wraps: bool) -> npt.NDArray[np.float64]:
@@ -153,11 +153,10 @@ def _width(masks: tuple[Mask, Mask], wraps: bool) -> npt.NDArray[np.float64]:
     """
     total = np.zeros(masks[0].shape)
     for own, other in (masks, masks[::-1]):
-        beyond = np.tile(other & ~own, 3 if wraps else 1)
-        if not beyond.any():
+        within = own | ~other
+        if within.all():
             return np.full(total.shape, np.inf)
-        distance = scipy.ndimage.distance_transform_edt(~beyond)
-        total += distance[:, own.shape[1] : 2 * own.shape[1]] if wraps else distance
+        total += _all_around(scipy.ndimage.distance_transform_edt, within, wraps)
     return CELL * total
 
 
@@ -166,7 +165,10 @@ def _filled(mask: Mask, wraps: bool) -> Mask:
     wider = grown(np.pad(mask, ((_CLOSED, _CLOSED), (0, 0))), _CLOSED, wraps)
     modes = "constant", "wrap" if wraps else "constant"
     closed = scipy.ndimage.minimum_filter(wider, 2 * _CLOSED + 1, mode=modes, cval=1)[_CLOSED:-_CLOSED]
-    if not wraps:
-        return np.asarray(scipy.ndimage.binary_fill_holes(closed))
-    columns = closed.shape[1]
-    return np.asarray(scipy.ndimage.binary_fill_holes(np.tile(closed, 3))[:, columns : 2 * columns])
+    return _all_around(scipy.ndimage.binary_fill_holes, closed, wraps)
+
+
+def _all_around(function: Callable[[Mask], Any], mask: Mask, wraps: bool) -> npt.NDArray[Any]:
+    """What a function of SciPy that knows no columns which wrap makes of a mask, (..., height, width)."""
+    columns = mask.shape[1]
+    return np.asarray(function(np.tile(mask, 3))[..., columns : 2 * columns] if wraps else function(mask))

@@ -75,12 +75,13 @@ def find(
     scale = chart.eye.down
     limit = max(_APART, _SPREADS * scale * float(np.percentile(epipolar.across(u, v, direction), 75)))
     found = [np.zeros(way.shown.shape, bool) for way in ways]
-    every = [(index, False, way) for index, way in enumerate(ways)]
+    every = [(index, False, way, its) for index, (way, its) in enumerate(zip(ways, seen, strict=True))]
     for one in refused:
         wide, gap = one.finest(chart.width, chart.height), CONSISTENT * max(1.0, 2.0 ** (one.level - 1))
-        every += [(index, True, Way.of(chart, wide, views, index, gap)) for index in (0, 1)]
-    for index, searched, way in every:
-        u, v = _seen(chart.eye, way, index)
+        for index in (0, 1):
+            way = Way.of(chart, wide, views, index, gap)
+            every.append((index, True, way, _seen(chart.eye, way, index)))
+    for index, searched, way, (u, v) in every:
         across = epipolar.across(u, v, direction)
         apart = scale * across / limit
         its_way = across < _ELSEWHERE * np.linalg.norm(v - u, axis=1)

@@ -88,7 +88,7 @@ def test_twin_of_trust_is_the_formula(wraps: bool) -> None:
 
 @pytest.mark.parametrize("size", SIZES)
 def test_twin_of_trust_has_none_in_what_moved(size: tuple[int, int]) -> None:
-    """Pixel by pixel, on cells of the size that movers.py makes, as many as have a pixel in their middle."""
+    """Pixel by pixel, on cells of the size that cells.py makes, as many as have a pixel in their middle."""
     moved, still = moved_cells(4, *size), np.zeros((size[1], size[0], 2))
     rows, columns = moved.shape
     grid, cells = (*size, 0, 0), (columns, rows, CELL, 0)
