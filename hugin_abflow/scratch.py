@@ -87,12 +87,13 @@ def work_folder() -> Iterator[Path]:
             folder = parent / f"hugin-abflow-{_HOST}-{secrets.token_hex(6)}"
             _ours.add(folder)
             folder.mkdir(0o700)
-            descriptor = os.open(folder / _LOCK, os.O_CREAT | os.O_WRONLY, 0o600)
-            _lock(descriptor)
-            if (folder / _LOCK).exists():
-                break
-            os.close(descriptor)  # swept before it was locked
-            descriptor = None
+            with suppress(FileNotFoundError):  # swept before it had a lock
+                descriptor = os.open(folder / _LOCK, os.O_CREAT | os.O_WRONLY, 0o600)
+                _lock(descriptor)
+                if (folder / _LOCK).exists():
+                    break
+                os.close(descriptor)  # swept before it was locked
+                descriptor = None
         yield folder
     finally:
         if descriptor is not None:
@@ -114,25 +115,25 @@ def sweep(folder: Path) -> None:
         for entry in entries:
             if (found := _PART.fullmatch(entry.name)) and entry.is_file(follow_symlinks=False):
                 part = Path(entry.path)
-                _remove_abandoned(part, found[1], partial(part.unlink, missing_ok=True))
+                _remove_abandoned(entry, part, found[1], partial(part.unlink, missing_ok=True))
             elif (found := _FOLDER.fullmatch(entry.name)) and entry.is_dir(follow_symlinks=False):
-                # without its lock a folder was made just now, or is being removed
                 remove = partial(shutil.rmtree, entry.path, ignore_errors=True)
-                _remove_abandoned(Path(entry.path) / _LOCK, found[1], remove)
+                _remove_abandoned(entry, Path(entry.path) / _LOCK, found[1], remove)
 
 
-def _remove_abandoned(lock: Path, host: str, remove: Callable[[], None]) -> None:
-    """Call `remove` if nobody holds a lock. It is held meanwhile: who has made the file just now, and waits
-    for its lock, finds that it is gone.
+def _remove_abandoned(entry: os.DirEntry[str], lock: Path, host: str, remove: Callable[[], None]) -> None:
+    """Call `remove` if nobody holds the lock of a file, which it is itself, or of a folder. It is held meanwhile:
+    who has made one just now, and waits for its lock, finds that it is gone.
     """
     with suppress(OSError):
-        if host != _HOST and time.time() - lock.stat().st_mtime < _WEEK:
+        if host != _HOST and time.time() - entry.stat(follow_symlinks=False).st_mtime < _WEEK:
             return
         if sys.platform == "win32":
-            lock.unlink()  # refused while it is open
+            lock.unlink(missing_ok=True)  # refused while it is open
             remove()
             return
-        descriptor = os.open(lock, os.O_RDWR)
+        # a folder whose process was killed before it had a lock, or while it was removed, has none
+        descriptor = os.open(lock, os.O_RDWR | (os.O_CREAT if entry.is_dir() else 0), 0o600)
         try:
             if _lock(descriptor, wait=False):
                 remove()

@@ -94,16 +94,60 @@ def test_leftovers_of_other_computers_go_after_a_week(root: Path) -> None:
 
 
 def test_what_is_not_ours_stays(root: Path) -> None:
-    """Names alike, a link, a folder that is only just being made."""
+    """Names alike, a link, a folder that another computer is only just making."""
     (root / "target").touch()
     link = f".abflow-{scratch._HOST}-0123456789ab.tif"
     (root / link).symlink_to(root / "target")
     (root / ".abflow").mkdir()
     (root / ".abflow-notes.txt").touch()
-    (root / f"hugin-abflow-{scratch._HOST}-abcdefgh").mkdir()
+    (root / "hugin-abflow-0123abcd-abcdefgh").mkdir()
     before = names_in(root)
     sweep(root)
     assert names_in(root) == before
+
+
+def test_a_folder_without_its_lock_goes(root: Path) -> None:
+    """Its process was killed while it was made, or removed."""
+    left = root / f"hugin-abflow-{scratch._HOST}-0123456789ab"
+    left.mkdir()
+    (left / "layer.tif").touch()
+    foreign = root / "hugin-abflow-0123abcd-0123456789ab"
+    foreign.mkdir()
+    age(foreign, 8 * 24 * 3600)
+    sweep(root)
+    assert names_in(root) == []
+
+
+@pytest.mark.parametrize("step", ["made", "opened", "locked"])
+def test_a_folder_that_is_swept_while_it_is_made_is_made_anew(
+    root: Path, monkeypatch: pytest.MonkeyPatch, step: str
+) -> None:
+    steps: list[str] = []
+    mkdir, lock = Path.mkdir, scratch._lock
+
+    def swept(name: str) -> None:
+        steps.append(name)
+        if name == step and steps.count(name) == 1:
+            with monkeypatch.context() as patch:
+                patch.setattr(scratch, "_lock", lock)
+                sweep(root)
+
+    def make(path: Path, mode: int) -> None:
+        mkdir(path, mode)
+        swept("made")
+
+    def locked(descriptor: int, wait: bool = True) -> bool:
+        swept("opened")
+        result = lock(descriptor, wait)
+        swept("locked")
+        return result
+
+    monkeypatch.setattr(Path, "mkdir", make)
+    monkeypatch.setattr(scratch, "_lock", locked)
+    with work_folder() as folder:
+        assert names_in(root) == [folder.name] and names_in(folder) == ["in use"]
+        assert steps.count("made") == (1 if step == "locked" else 2)
+    assert names_in(root) == []
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="another mechanism there")
