@@ -39,6 +39,7 @@ _QUARTER_LEVEL = {np.dtype(np.uint8): 0.25 / 255}
 _QUARTER_FINE_LEVEL = 0.25 / 65535
 
 Span = tuple[int, int]
+_Coarse = tuple[tuple[int, int, int, int], Buffer]  # place on a coarse grid; float32 (height, width, 4)
 
 
 @dataclass(frozen=True)
@@ -58,7 +59,7 @@ class BlendLayer:
     field: Buffer
     reach: Sequence[float]
     gain: Buffer | None
-    offset: tuple[tuple[int, int, int, int], Buffer] | None = None
+    offset: _Coarse | None = None
 
 
 @dataclass(frozen=True)
@@ -112,7 +113,7 @@ def _band_height(
     used = memory.resident() + device.own_memory + _SLACK
     while True:
         plan = _plan(layers, full, grid, crop, height)
-        needed = used + _pass_memory(layers, plan)
+        needed = used + _pass_memory(layers, plan, full.height / grid.height)
         if needed <= limit or height <= _LEAST_ROWS:
             break
         height = max(_LEAST_ROWS, height // 2)
@@ -126,8 +127,11 @@ def _band_height(
     return height
 
 
-def _pass_memory(layers: Sequence[BlendLayer], plan: Sequence[_Band]) -> int:
-    """Bytes that the bands take on host and device beside what is there before."""
+def _pass_memory(layers: Sequence[BlendLayer], plan: Sequence[_Band], scale: float) -> int:
+    """Bytes that the bands take on host and device beside what is there before.
+
+    scale: rows of the panorama per row of the working grid.
+    """
     first, part = layers[0].layer, plan[0].part
     pixel = (first.channels + 1) * device_dtype(first).itemsize
     shelves = _shelves([one.layer for one in layers], [band.rows for band in plan])
@@ -141,8 +145,9 @@ def _pass_memory(layers: Sequence[BlendLayer], plan: Sequence[_Band]) -> int:
         )
         for band in plan
     )
-    lines = sum(16 * (one.box[2] + (one.offset[0][2] if one.offset else 0)) * part.height for one in layers)
-    return shelves.total * pixel + fresh * pixel + 4 * out + 2 * lines
+    coarse = math.ceil(part.height / scale) + 4
+    slices = sum(16 * (one.box[2] + (one.offset[0][2] if one.offset else 0)) * coarse for one in layers)
+    return shelves.total * pixel + fresh * pixel + 4 * out + slices
 
 
 def _bands(
@@ -165,13 +170,13 @@ def _bands(
     share = _QUARTER_LEVEL.get(first.dtype, _QUARTER_FINE_LEVEL)
     whole = (0, 0, gain_grid.width, gain_grid.height)
     fields = [(layer.box, layer.field) for layer in layers]
-    gains = [(whole, layer.gain) for layer in layers if layer.gain is not None]
-    offsets = [layer.offset for layer in layers if layer.offset is not None]
+    gains = [None if layer.gain is None else (whole, layer.gain) for layer in layers]
+    offsets = [layer.offset for layer in layers]
     longitudes = _turn(device, full.lens[0], full.lens[1], crop.left - region.left, crop.width)
     plan = _plan(layers, full, grid, crop, height)
-    lines = plan[0].part.height
     ways, gained, added = (
-        device.empty((lines * sum(box[2] for box, _ in arrays), 4)) for arrays in (fields, gains, offsets)
+        _Slices(device, arrays, full, coarse, plan)
+        for arrays, coarse in ((fields, grid), (gains, gain_grid), (offsets, offset_grid))
     )
     with _Store(
         device, [layer.layer for layer in layers], [band.rows for band in plan], settings.cores
@@ -181,25 +186,23 @@ def _bands(
             size = part.width, part.height
             groups = -(-part.width // together), part.height
             store.next()
-            way_starts = _lines(device, fields, part, full, grid, share, ways)
-            gain_starts = _lines(device, gains, part, full, gain_grid, 0.0, gained)
-            offset_starts = _lines(device, offsets, part, full, offset_grid, 0.0, added)
-            table = np.zeros((len(layers), 16), np.int32)
+            places = [slices.take(part) for slices in (ways, gained, added)]
+            _hide(device, ways.values, places[0], part, full, grid, share)
+            table = np.zeros((len(layers), 24), np.int32)
             for k, (layer, (start, end)) in enumerate(zip(layers, band.rows, strict=True)):
                 box, ring = layer.layer.box, store.shelves.rings[k]
                 table[k, :4] = box.left - region.left, box.top - region.top + start, box.width, end - start
-                table[k, 4:8] = layer.box[0], layer.box[2], ring.start, way_starts[k]
-                table[k, 8] = -1 if layer.gain is None else gain_starts.pop(0)
-                table[k, 9:12] = ring.rows, start % ring.rows, -1
-                if layer.offset is not None:
-                    table[k, 11:14] = offset_starts.pop(0), layer.offset[0][0], layer.offset[0][2]
+                table[k, 19:22] = ring.start, ring.rows, start % ring.rows
+            for number, its_places in enumerate(places):
+                table[:, 4 + 4 * number : 8 + 4 * number] = its_places[:, :4]
+                table[:, 16 + number] = its_places[:, 4]
             used = [k for k, (start, end) in enumerate(band.rows) if start < end]
             latitudes = _turn(device, full.lens[2], -full.lens[3], part.top, part.height)
             out = device.empty((part.height, part.width, first.channels + 1), device_dtype(first))
             device.run(
-                "blend", "blend_band", groups, store.rows, device.upload(table[used]), len(used), ways,
-                gained, added, longitudes, latitudes, full.border, full.lens, grid.border, gain_grid.border,
-                offset_grid.border,
+                "blend", "blend_band", groups, store.rows, device.upload(table[used]), len(used), ways.values,
+                gained.values, added.values, longitudes, latitudes, full.border, full.lens, grid.border,
+                gain_grid.border, offset_grid.border,
                 (part.left, part.top, *size), (region.left, region.top),
                 shoulder, int(settings.interpolation == "nearest"), share, out, options=options,
             )  # fmt: skip
@@ -212,33 +215,62 @@ def _turn(device: Device, angle: float, step: float, first: int, count: int) -> 
     return device.upload(np.stack([np.sin(angles), np.cos(angles)], -1).astype(np.float32))
 
 
-def _lines(
+class _Slices:
+    """Of arrays on boxes of a coarse grid the rows that a band reads. values: float32 (n, 4), one array after
+    the other.
+    """
+
+    def __init__(
+        self,
+        device: Device,
+        arrays: Sequence[_Coarse | None],
+        full: Grid,
+        grid: Grid,
+        plan: Sequence[_Band],
+    ) -> None:
+        self._arrays = arrays
+        self._scale = full.height / grid.height
+        most = max(int(places[:, 2] @ places[:, 3]) for places in (self._places(band.part) for band in plan))
+        self.values = device.empty((most, 4))
+
+    def take(self, part: Box) -> npt.NDArray[np.int32]:
+        """Have `values` hold the rows of a band. Per array their box on the grid, where they begin, -1 where
+        there is none, and three zeros: (arrays, 8).
+        """
+        places = self._places(part)
+        for (_, first, width, height, start, *_), array in zip(places.tolist(), self._arrays, strict=True):
+            if array is not None:
+                self.values.copy(start, array[1], (first - array[0][1]) * width, height * width)
+        return places
+
+    def _places(self, part: Box) -> npt.NDArray[np.int32]:
+        places, values = np.zeros((len(self._arrays), 8), np.int32), 0
+        places[:, 4] = -1
+        for place, array in zip(places, self._arrays, strict=True):
+            if array is not None:
+                left, _, width, _ = array[0]
+                first, last = _coarse_rows(array[0], part, self._scale)
+                place[:5] = left, first, width, last - first, values
+                values += width * (last - first)
+        return places
+
+
+def _hide(
     device: Device,
-    arrays: Sequence[tuple[tuple[int, int, int, int], Buffer]],
+    ways: Buffer,
+    places: npt.NDArray[np.int32],
     part: Box,
     full: Grid,
     grid: Grid,
     share: float,
-    result: Buffer,
-) -> list[int]:
-    """Arrays on boxes of a coarse grid at the rows of a band, into float32 (n, 4); where each begins."""
-    scale = full.height / grid.height
-    table, values, lines = np.zeros((len(arrays), 8), np.int32), 0, 0
-    for entry, (box, _) in zip(table, arrays, strict=True):
-        first, last = _coarse_rows(box, part, scale)
-        entry[:6] = box[0], first, box[2], last - first, values, lines
-        values += box[2] * (last - first)
-        lines += box[2] * part.height
-    packed = device.empty((values, 4))
-    for (_, first, width, height, start, _, _, _), (box, array) in zip(table.tolist(), arrays, strict=True):
-        packed.copy(start, array, (first - box[1]) * width, height * width)
+) -> None:
+    """Make weights of `ways` negative that are less than a share of what all layers have in their place."""
+    first, last = _coarse_rows((0, 0, grid.width, grid.height), part, full.height / grid.height)
+    run = 0, first, grid.width, last - first
     device.run(
-        "blend", "blend_rows", (grid.width, part.height), packed, device.upload(table), len(table),
-        (grid.width, part.height), part.top, scale, share, result,
+        "blend", "blend_hide", run[2:], ways, device.upload(places), len(places), run, share,
         options="-DPIXEL=float -DSAMPLES=4 -DWHITE=1.0f -DINTEGER=0 -DPIXELS=2",
     )  # fmt: skip
-    starts: list[int] = table[:, 5].tolist()
-    return starts
 
 
 def _coarse_rows(box: tuple[int, int, int, int], part: Box, scale: float) -> Span:

@@ -122,8 +122,8 @@ def sweep(folder: Path) -> None:
 
 
 def _remove_abandoned(entry: os.DirEntry[str], lock: Path, host: str, remove: Callable[[], None]) -> None:
-    """Call `remove` if nobody holds the lock of a file, which it is itself, or of a folder. It is held meanwhile:
-    who has made one just now, and waits for its lock, finds that it is gone.
+    """Call `remove` if nobody holds the lock of a file, which it is itself, or of a folder. It is held
+    meanwhile: who has made one just now, and waits for its lock, finds that it is gone.
     """
     with suppress(OSError):
         if host != _HOST and time.time() - entry.stat(follow_symlinks=False).st_mtime < _WEEK:

@@ -9,14 +9,12 @@
    all fractions, this next to nothing; a ramp stays one to 0.03 px. */
 #define BLEND_SLOPE (-2.0f / 3.0f)
 
-/* One layer as a band needs it: 64 bytes, made by hugin_abflow/blend.py. */
+/* One layer as a band needs it: 96 bytes, made by hugin_abflow/blend.py. */
 typedef struct {
-    int4 place;     /* of its stored rows: left, top, width, height */
-    int2 way;       /* left, width of its field on the working grid */
-    int rows, ways, gains; /* where it begins in `stored`, `ways` and `gains`; gains -1: no correction */
-    int ring, turn; /* rows lie in a ring of so many, the first one there */
-    int offsets;    /* where they begin in `offsets`; -1: none */
-    int2 span;      /* left, width of its offsets on their grid */
+    int4 place;               /* of its stored rows: left, top, width, height */
+    int4 way, gain, offset;   /* of the rows at hand of its field, gains and offsets, each on its grid */
+    int ways, gains, offsets; /* where these begin; gains, offsets -1: none */
+    int rows, ring, turn;     /* where its stored rows begin, a ring of so many, the first one there */
     int unused[2];
 } blend_layer;
 
@@ -153,46 +151,30 @@ static inline float4 blend_sample(__global const pixel_stored *stored, __global 
     return blend_rim(stored, layer, corner, t, border);
 }
 
-/* Values of coarse arrays at the heights of a band's rows, linear between their rows; beyond an array, its rim.
-   Weights (w) that are less than a share of their sum, which nobody sees, become negative. */
-__kernel void blend_rows(__global const float4 *values, /* arrays one after the other: (box.w, box.z) each */
-                         __global const int8 *arrays,   /* (count) box on the coarse grid; begin in values, rows */
+/* Weights of fields that are less than a share of their sum, which nobody sees, become negative. */
+__kernel void blend_hide(__global float4 *ways,      /* fields, one after the other: (box.w, box.z) each */
+                         __global const int8 *boxes, /* (count) box on the working grid; begin in ways */
                          int count,
-                         int2 size,                  /* columns of the coarse grid, rows of the band: run size */
-                         int top, float scale,       /* the band's first row; its rows per row of the grid */
-                         float share,                /* below which weights are hidden; 0: none */
-                         __global float4 *rows)      /* per array, (size.y, box.z) */
+                         int4 part,   /* of the working grid: run size */
+                         float share) /* below which they are hidden */
 {
-    const int x = get_global_id(0), y = get_global_id(1);
-    if (x >= size.x || y >= size.y)
+    const int2 p = (int2)(get_global_id(0), get_global_id(1)) + part.xy;
+    if (p.x >= part.x + part.z || p.y >= part.y + part.w)
         return;
-    const float q = (top + y + 0.5f) / scale - 0.5f;
-    int upper = (int)q;
-    upper -= q < upper;
-    const float t = q - upper;
-    float total = 0.0f;
+    float least = 0.0f;
     for (int k = 0; k < count; ++k) {
-        const int4 box = arrays[k].lo;
-        const int column = x - box.x;
-        if (column < 0 || column >= box.z)
-            continue;
-        __global const float4 *from = values + arrays[k].s4 + column;
-        const float4 a = from[LIMITED(upper - box.y, 0, box.w - 1) * box.z];
-        const float4 v = a + t * (from[LIMITED(upper + 1 - box.y, 0, box.w - 1) * box.z] - a);
-        rows[arrays[k].s5 + y * box.z + column] = v;
-        total += v.w > 0.0f ? v.w : 0.0f;
+        const int at = box_index(p, boxes[k].lo);
+        least += at < 0 ? 0.0f : share * ways[boxes[k].s4 + at].w;
     }
-    const float least = share * total;
-    for (int k = 0; k < count && least > 0.0f; ++k) {
-        const int column = x - arrays[k].s0;
-        if (column < 0 || column >= arrays[k].s2)
-            continue;
-        __global float *w = (__global float *)(rows + arrays[k].s5 + y * arrays[k].s2 + column) + 3;
-        *w -= *w > least ? least * least / *w : least; /* hardly less where much is left */
+    for (int k = 0; k < count; ++k) {
+        const int at = box_index(p, boxes[k].lo);
+        __global float4 *way = ways + boxes[k].s4 + at;
+        if (at >= 0)
+            way->w -= way->w > least ? least * least / way->w : least; /* hardly less where much is left */
     }
 }
 
-/* Which columns of a coarse line PIXELS positions lie between, and how far. */
+/* Which columns of a coarse grid PIXELS positions lie between, and how far. */
 typedef struct {
     blend_int left, right;
     blend_real t;
@@ -203,11 +185,10 @@ static inline blend_between blend_columns(blend_real q) {
     const blend_real p = q - 0.5f;
     blend_int left = BLEND_INTS(p);
     left += p < BLEND_REALS(left); /* true is -1 */
-    const blend_between at = {left, left + 1, p - BLEND_REALS(left)};
-    return at;
+    return (blend_between){left, left + 1, p - BLEND_REALS(left)};
 }
 
-/* The same in a line of the columns from span.x on, span.y of them. */
+/* The same in an array of the columns from span.x on, span.y of them; beyond it, its rim. */
 static inline blend_between blend_within(blend_between at, int2 span, int4 border) {
     at.left -= span.x;
     at.right -= span.x;
@@ -220,12 +201,30 @@ static inline blend_between blend_within(blend_between at, int2 span, int4 borde
     return at;
 }
 
-/* Linear reading of a line of values. */
-static inline blend_samples blend_read(__global const float4 *line, blend_between at) {
-#define BLEND_LEFT(n, i) line[at.left.i]
-#define BLEND_RIGHT(n, i) line[at.right.i]
-    const blend_samples a = (blend_samples)(BLEND_LIST(BLEND_LEFT)), b = (blend_samples)(BLEND_LIST(BLEND_RIGHT));
-    return a + BLEND_EACH(at.t) * (b - a);
+/* Which rows of a coarse array a line of pixels lies between, and how far. */
+typedef struct {
+    __global const float4 *upper, *lower;
+    float t;
+} blend_lines;
+
+/* Those beside height q of the grid. place: of the array, whose values begin at `values`; beyond it, its rim. */
+static inline blend_lines blend_beside(__global const float4 *values, int4 place, float q) {
+    const int row = floor_int(q - 0.5f), first = row - place.y, last = place.w - 1;
+    return (blend_lines){values + LIMITED(first, 0, last) * place.z, values + LIMITED(first + 1, 0, last) * place.z,
+                         q - 0.5f - row};
+}
+
+/* Bilinear reading. */
+static inline blend_samples blend_read(blend_lines lines, blend_between at) {
+#define BLEND_UPPER_LEFT(n, i) lines.upper[at.left.i]
+#define BLEND_UPPER_RIGHT(n, i) lines.upper[at.right.i]
+#define BLEND_LOWER_LEFT(n, i) lines.lower[at.left.i]
+#define BLEND_LOWER_RIGHT(n, i) lines.lower[at.right.i]
+    blend_samples left = (blend_samples)(BLEND_LIST(BLEND_UPPER_LEFT));
+    blend_samples right = (blend_samples)(BLEND_LIST(BLEND_UPPER_RIGHT));
+    left += lines.t * ((blend_samples)(BLEND_LIST(BLEND_LOWER_LEFT)) - left);
+    right += lines.t * ((blend_samples)(BLEND_LIST(BLEND_LOWER_RIGHT)) - right);
+    return left + BLEND_EACH(at.t) * (right - left);
 }
 
 /* How pixels are corrected: what odds are multiplied by, less 1, then what is added, for floats to the
@@ -235,24 +234,26 @@ typedef struct {
     blend_int some;
 } blend_correction;
 
-/* Where their corrections are read: arrays, columns, the row of gains and that of the band. */
+/* Where their corrections are read: arrays; columns and heights of the grids. */
 typedef struct {
     __global const float4 *gains, *offsets;
-    blend_between cell, column;
-    int gain_row, row;
+    blend_between gain_column, offset_column;
+    float gain_height, offset_height;
     int4 offset_border;
 } blend_corrections;
 
 static inline blend_correction blend_corrected(const blend_corrections *from, __global const blend_layer *layer) {
     blend_correction result = {(blend_samples)(0.0f), (blend_samples)(0.0f), (blend_int)(0)};
     if (layer->gains >= 0) {
-        const blend_samples gain = blend_read(from->gains + layer->gains + from->gain_row, from->cell);
+        const blend_lines lines = blend_beside(from->gains + layer->gains, layer->gain, from->gain_height);
+        const blend_samples gain = blend_read(lines, from->gain_column);
         result.rise = BLEND_EXPONENTIAL(gain) - 1.0f;
         result.some = blend_any(gain);
     }
     if (layer->offsets >= 0) {
-        const blend_between column = blend_within(from->column, layer->span, from->offset_border);
-        const blend_samples offset = blend_read(from->offsets + layer->offsets + from->row * layer->span.y, column);
+        const blend_between column = blend_within(from->offset_column, layer->offset.xz, from->offset_border);
+        const blend_lines lines = blend_beside(from->offsets + layer->offsets, layer->offset, from->offset_height);
+        const blend_samples offset = blend_read(lines, column);
         result.offset = INTEGER ? WHITE * offset : BLEND_EXPONENTIAL(offset) - 1.0f;
         result.some |= blend_any(offset);
     }
@@ -272,9 +273,7 @@ static inline blend_real blend_angles(blend_real y, blend_real x) {
     const blend_real t = y / x, t2 = t * t;
     const blend_int small = x > 0.0f && t2 < 0.01f;
     const blend_real angle = t * (1.0f - t2 * (1.0f / 3.0f - t2 * (0.2f - t2 * (1.0f / 7.0f))));
-    if (!BLEND_SOME(!small))
-        return angle;
-    return small ? angle : atan2(y, x);
+    return BLEND_SOME(!small) ? (small ? angle : atan2(y, x)) : angle;
 }
 
 /* Where a layer is sampled for pixels at (px, py): the field's displacements d carried to full resolution.
@@ -328,9 +327,9 @@ static inline blend_samples blend_round(blend_samples v, blend_samples threshold
 __kernel void blend_band(
     __global const pixel_stored *stored, /* a ring of rows for each layer: (ring, width) */
     __global const blend_layer *layers, int count, /* those that the band may touch */
-    __global const float4 *ways,         /* per layer, (band.w, way.y): displacement, weight, from blend_rows */
-    __global const float4 *gains,        /* per corrected layer, (band.w, gain_border.x) */
-    __global const float4 *offsets,      /* per layer with offsets, (band.w, span.y) */
+    __global const float4 *ways,         /* per layer, (way.w, way.z): displacement, weight, from blend_hide */
+    __global const float4 *gains,        /* per corrected layer, (gain.w, gain.z), whole rows of their grid */
+    __global const float4 *offsets,      /* per layer with offsets, (offset.w, offset.z) */
     __global const float2 *columns,      /* (band.z) sine and cosine of longitude; plane: not used */
     __global const float2 *lines,        /* (band.w) sine and cosine of latitude; plane: not used */
     int4 border, float4 lens,            /* full-resolution grid of the region */
@@ -350,10 +349,11 @@ __kernel void blend_band(
     const blend_real px = BLEND_REALS(place.x + (blend_int)(BLEND_LIST(BLEND_NUMBER))) + 0.5f;
     const float py = place.y + 0.5f;
     const float2 scale = (float2)((float)border.x / field_border.x, (float)border.y / field_border.y);
+    const float2 gain_scale = (float2)((float)gain_border.x / border.x, (float)gain_border.y / border.y);
+    const float2 offset_scale = (float2)((float)offset_border.x / border.x, (float)offset_border.y / border.y);
     const blend_corrections corrections = {
-        gains, offsets,
-        blend_within(blend_columns(px * ((float)gain_border.x / border.x)), (int2)(0, gain_border.x), gain_border),
-        blend_columns(px * ((float)offset_border.x / border.x)), y * gain_border.x, y, offset_border};
+        gains, offsets, blend_within(blend_columns(px * gain_scale.x), (int2)(0, gain_border.x), gain_border),
+        blend_columns(px * offset_scale.x), py * gain_scale.y, py * offset_scale.y, offset_border};
 
     int first = count;
     blend_correction correction, first_correction;
@@ -400,8 +400,9 @@ __kernel void blend_band(
                 blend_int seen = open & (c.FOURTHS != 0.0f);
                 if (!BLEND_SOME(seen))
                     continue;
-                __global const float4 *line = ways + layers[k].ways + y * layers[k].way.y;
-                const blend_samples way = blend_read(line, blend_within(column, layers[k].way, field_border));
+                const int4 span = layers[k].way;
+                const blend_lines beside = blend_beside(ways + layers[k].ways, span, py / scale.y);
+                const blend_samples way = blend_read(beside, blend_within(column, span.xz, field_border));
                 blend_real w = way.FOURTHS + hidden;
                 seen &= w > 0.0f;
                 if (!BLEND_SOME(seen))

@@ -90,42 +90,27 @@ def correct(colour: Array, gain: Array, offset: Array, white: float, shoulder: f
     return np.where(offset == 0, c, np.where(c >= 0, np.maximum(raised, 0), raised))
 
 
-def blend_rows(
-    arrays: Sequence[Array],
-    boxes: Sequence[Sequence[int]],
-    size: Sequence[int],
-    top: int,
-    scale: float,
-    share: float,
-) -> list[Array]:
-    """Arrays on parts of a grid at the heights of a band's rows; weights below a share turn negative."""
-    lines, total = [], np.zeros((size[1], size[0]))
-    y = (top + np.arange(size[1])[:, None] + 0.5) / scale
-    for values, box in zip(arrays, boxes, strict=True):
-        columns = np.s_[:, box[0] : box[0] + box[2]]
-        x = box[0] + np.arange(box[2])[None] + 0.5
-        lines.append(read_field(values, box, *np.broadcast_arrays(x, y), (size[0], 0, 0, 0)))
-        total[columns] += np.maximum(lines[-1][..., 3], 0)
-    for line, box in zip(lines, boxes, strict=True):
-        least, w = share * total[:, box[0] : box[0] + box[2]], line[..., 3].copy()
-        line[..., 3] -= np.where(w > least, least**2 / np.where(w > least, w, 1), least)
-    return lines
-
-
-def read_line(lines: Array, left: int, x: Array, border: Sequence[int]) -> Array:
-    """Lines (rows, width, 4) that begin at column `left` of a coarse grid, at x (rows, n), linear."""
-    rows, width = lines.shape[:2]
-    y = np.broadcast_to(np.arange(rows)[:, None] + 0.5, x.shape)
-    return read_field(lines, (left, 0, width, rows), x, y, (border[0], rows, border[2], 0))
+def blend_hide(fields: Sequence[Array], boxes: Sequence[Sequence[int]], share: float) -> list[Array]:
+    """Fields on parts of a grid; weights below a share of their sum turn negative."""
+    width, height = (max(box[i] + box[i + 2] for box in boxes) for i in (0, 1))
+    places = [np.s_[top : top + rows, left : left + columns] for left, top, columns, rows in boxes]
+    total = np.zeros((height, width))
+    for field, place in zip(fields, places, strict=True):
+        total[place] += field[..., 3]
+    hidden = [field.copy() for field in fields]
+    for field, place in zip(hidden, places, strict=True):
+        least, w = share * total[place], field[..., 3]
+        field[..., 3] -= np.where(w > least, least**2 / np.where(w > least, w, 1), least)
+    return hidden
 
 
 def blend_band(
     stored: Sequence[Array],
     places: Sequence[Sequence[int]],
     ways: Sequence[Array],
-    lefts: Sequence[int],
+    boxes: Sequence[Sequence[int]],
     gains: Sequence[Array | None],
-    offsets: Sequence[tuple[int, Array] | None],
+    offsets: Sequence[tuple[Sequence[int], Array] | None],
     border: Sequence[int],
     lens: Numbers,
     field_border: Sequence[int],
@@ -141,23 +126,27 @@ def blend_band(
     """Samples of the band, float64 but rounded and within 0..white for integer layers.
 
     stored, places      rows of each layer and their box.
-    ways, lefts         of `blend_rows`, first column.
-    offsets             first column, of `blend_rows`.
+    ways, boxes         of `blend_hide`, and their boxes on the working grid.
+    gains               on the whole colour grid.
+    offsets             and their boxes on their grid.
     """
     columns, rows = pixels(band[2], band[3], band[0], band[1])
     x, y = columns + 0.5, rows + 0.5
     scale = border[0] / field_border[0], border[1] / field_border[1]
     seen = []
-    every = zip(stored, places, ways, lefts, gains, offsets, strict=True)
-    for pixels_, place, way, left, gain, offset in every:
+    every = zip(stored, places, ways, boxes, gains, offsets, strict=True)
+
+    def read(field: Array, box: Sequence[int], grid: Sequence[int]) -> Array:
+        return read_field(field, box, x * grid[0] / border[0], y * grid[1] / border[1], grid)
+
+    for pixels_, place, way, box, gain, offset in every:
         opaque_ = opaque(pixels_, white)
-        f = read_line(way, left, x / scale[0], field_border)
+        f = read(way, box, field_border)
         exposure, raised = np.zeros((2, *x.shape, 3))
         if gain is not None:
-            exposure = read_line(gain, 0, x * gain_border[0] / border[0], gain_border)[..., :3]
+            exposure = read(gain, (0, 0, *gain_border[:2]), gain_border)[..., :3]
         if offset is not None:
-            start, lines = offset
-            raised = read_line(lines, start, x * offset_border[0] / border[0], offset_border)[..., :3]
+            raised = read(offset[1], offset[0], offset_border)[..., :3]
         own = take(opaque_, place, columns, rows)
         colour = sample(opaque_, place, *position(x, y, f[..., :3], scale, lens), border, nearest)
         colour = np.where(f[..., :3].any(-1, keepdims=True), colour, own)
