@@ -46,6 +46,9 @@ _SPREAD = 0.3
 _ROUNDS = ((0.1, 4.0), (1.0, 3.0), (100.0, 2.5))
 # The same, slower and stricter: what lies far from it is no exposure but something that only one layer shows.
 _STRICT = ((0.01, 4.0), (0.03, 2.5), (0.3, 1.6), (3.0, 1.2), (100.0, 1.0))
+# Where differences weigh no more than smoothness, gains are smooth, and blocks of so many cells across share
+# one: a round takes as long as unknowns take to be eliminated.
+_ROUGH, _BLOCK = 1.0, 2
 # Weight of a clipped cell against smoothness: what it tells is a bound, of a brightness that nobody knows.
 _BOUND = 0.1
 # Weight of what is seen of one layer alone: where layers are not mixed they are best left as they are.
@@ -257,22 +260,35 @@ def solve(measured: Measured, rounds: Sequence[tuple[float, float]] = _ROUNDS) -
     difference = np.concatenate([d.values[e > 0, :3] for d, e in zip(differences, evidence, strict=True)])
     bounds = _Bounds(measured, number, area, count)
     smooth = step.T @ scipy.sparse.diags_array(stiffness) @ step
+    # a step between blocks is a slope of as many cells
+    blocks = _blocks(inside)
+    smooth_blocks = blocks.T @ smooth @ blocks / _BLOCK
     round_ = cells.circumference / (cells.lens[1] or 1.0)  # cells
-    solution, solver = np.zeros((count, 3)), _Solver()
+    solution, solver, rough_solver = np.zeros((count, 3)), _Solver(), _Solver()
     for data, limit in rounds:
         fade = _TREND_FADE if rounds is _STRICT and data < rounds[-1][0] else _FADE
         hold = (inside * area)[inside] / max(1.0, fade * round_) ** 2
         off = link @ solution + difference if solution.any() else np.zeros_like(difference)
         trusted = data * weight * _biweight(off, limit)
         held, pull = bounds.active(solution, limit)
-        matrix = (
-            scipy.sparse.diags_array(hold + held) + smooth + link.T @ scipy.sparse.diags_array(trusted) @ link
-        )
+        told = scipy.sparse.diags_array(hold + held) + link.T @ scipy.sparse.diags_array(trusted) @ link
         wanted = pull - link.T @ (trusted[:, None] * difference)
-        solution = solver.solve(matrix, wanted)
+        if data <= _ROUGH:
+            matrix = blocks.T @ told @ blocks + smooth_blocks
+            solution = blocks @ rough_solver.solve(matrix, blocks.T @ wanted)
+        else:
+            solution = solver.solve(told + smooth, wanted)
     result = np.zeros((*inside.shape, 3))
     result[inside] = solution
     return result
+
+
+def _blocks(inside: npt.NDArray[np.bool_]) -> scipy.sparse.csr_array:
+    """A matrix (cells, blocks) that gives each of the layers' cells the value of its block."""
+    layer, row, column = np.nonzero(inside)
+    names = np.stack([layer, row // _BLOCK, column // _BLOCK])
+    block = np.unique(np.ravel_multi_index(tuple(names), inside.shape), return_inverse=True)[1]
+    return scipy.sparse.csr_array((np.ones(block.size), (np.arange(block.size), block)))
 
 
 class _Solver:

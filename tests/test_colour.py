@@ -182,15 +182,18 @@ def test_twins_of_the_exposure_scale(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def dense_gains(measured: colour.Measured, rounds: tuple) -> np.ndarray:
-    """The minimum of the sum in colour.py, by least squares over all cells of all layers."""
+    """The minimum of the sum in colour.py by least squares, of blocks where differences weigh little."""
     cells, inside = measured.grid, measured.inside
-    _, height, width = inside.shape
-    index = np.arange(inside.size).reshape(inside.shape)
+    (_, height, width), index = inside.shape, np.arange(inside.size).reshape(inside.shape)
     latitude = cells.lens[2] - (np.arange(height) + 0.5) * cells.lens[3]
     area = np.maximum(np.cos(latitude), 0.02) if cells.lens[1] else np.ones(height)
     circle = 2 * math.pi / cells.lens[1] if cells.lens[1] else width
     solution = np.zeros((*inside.shape, 3))
+    blocks = np.zeros((inside.size, inside.size))
+    for k, y, x in np.argwhere(inside):
+        blocks[index[k, y, x], index[k, y // 2, x // 2]] = 1
     for data, limit in rounds:
+        slack, onto = (0.5, blocks) if data <= 1 else (1.0, np.eye(inside.size))
         last = rounds is colour._ROUNDS or (data, limit) == rounds[-1]
         fade = max(1.0, (colour._FADE if last else colour._TREND_FADE) * circle)
         rows, targets = [], []
@@ -207,9 +210,10 @@ def dense_gains(measured: colour.Measured, rounds: tuple) -> np.ndarray:
             term(area[y] / fade**2, {index[k, y, x]: 1}, nothing)
             right = (x + 1) % width
             if (right > x or cells.wraps) and inside[k, y, right]:
-                term(1 / area[y], {index[k, y, x]: 1, index[k, y, right]: -1}, nothing)
+                term(slack / area[y], {index[k, y, x]: 1, index[k, y, right]: -1}, nothing)
             if y + 1 < height and inside[k, y + 1, x]:
-                term(math.sqrt(area[y] * area[y + 1]), {index[k, y, x]: 1, index[k, y + 1, x]: -1}, nothing)
+                between = slack * math.sqrt(area[y] * area[y + 1])
+                term(between, {index[k, y, x]: 1, index[k, y + 1, x]: -1}, nothing)
         for one in measured.differences:
             a, b, d = one.a, one.b, one.values
             for y, x in np.argwhere(d[..., 3] > 0):
@@ -227,7 +231,8 @@ def dense_gains(measured: colour.Measured, rounds: tuple) -> np.ndarray:
                     trust = (1 - (np.linalg.norm(short) / limit) ** 2) ** 2
                     weight = colour._BOUND * area[y] * abs(one.beyond[y, x, 3]) * trust
                     term(weight, {index[raised]: 1}, least)
-        solution = np.linalg.lstsq(np.array(rows), np.array(targets), rcond=None)[0].reshape(*inside.shape, 3)
+        solution = onto @ np.linalg.lstsq(np.array(rows) @ onto, np.array(targets), rcond=None)[0]
+        solution = solution.reshape(*inside.shape, 3)
     return solution
 
 
@@ -275,9 +280,10 @@ def test_cells_grow_where_many_layers_lie_on_each_other() -> None:
         assert colour.colour_grid(plane(160, 160), np.ones((layers, 53, 77), bool)).shape == (cells, cells)
 
 
-@pytest.mark.parametrize("shift", [1, 4])
-def test_turning_a_panorama_turns_its_gains(shift: int) -> None:
-    measured = overlapping(2, CELLS["sphere"])
+@pytest.mark.parametrize(("shift", "off"), [(2, 1e-6), (4, 1e-6), (1, 5e-3)])
+def test_turning_a_panorama_turns_its_gains(shift: int, off: float) -> None:
+    """Where blocks of cells turn as well; else first rounds differ a little."""
+    measured = overlapping(2, sphere(110, 55).resized(10, 5))
     gains = colour.solve(measured)
     turned = [
         replace(d, values=np.roll(d.values, shift, 1), beyond=np.roll(d.beyond, shift, 1))
@@ -285,7 +291,7 @@ def test_turning_a_panorama_turns_its_gains(shift: int) -> None:
     ]
     inside = np.roll(measured.inside, shift, 2)
     again = colour.solve(replace(measured, inside=inside, differences=tuple(turned)))
-    assert np.allclose(np.roll(gains, shift, 2), again, atol=1e-6)
+    assert np.allclose(np.roll(gains, shift, 2), again, atol=off)
 
 
 def test_no_difference_is_exactly_no_gain() -> None:
