@@ -22,8 +22,9 @@ narrow transitions; multiband.py blends low frequencies across them.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from itertools import chain, pairwise
 from typing import Any
 
 import cv2
@@ -95,9 +96,8 @@ def residuals(
     """What flow and exposure do not explain."""
     cells = seam_grid(grid)
     mean, square = np.zeros(cells.shape), np.zeros(cells.shape)
-    for pair in pairs:
-        clipped = clipping(layers[pair.a].layer)
-        found = _differences(device, layers, fields, pair, correction, grid, cells, clipped)
+    clipped = clipping(layers[0].layer)
+    for found in _differences(device, layers, fields, pairs, correction, grid, cells, clipped):
         share = found[..., 4:]
         smooth = _smooth(np.concatenate([found[..., :4] * share, share], -1), cells.wraps)
         smooth = (share > 0) * smooth[..., :4] / np.where(share > 0, smooth[..., 4:], 1)
@@ -146,8 +146,7 @@ def divide(
     """Give each cell of every overlap of layers that are not aligned to one layer, as `cut` does."""
     cells = grid.coarser(_FINE_CELL)
     square = np.zeros(cells.shape)
-    for pair in pairs:
-        found = _differences(device, layers, fields, pair, correction, grid, cells, math.inf)
+    for found in _differences(device, layers, fields, pairs, correction, grid, cells, math.inf):
         square = np.maximum(square, np.where(found[..., 4] > 0, _SHORTER + found[..., 3], 0))
     whole = square > 0
     owner = _owners(layers, fields, Residuals(square, square), whole, masks, grid, cells, _FINE_CUT)
@@ -203,27 +202,35 @@ def _differences(
     device: Device,
     layers: Sequence[WorkingLayer],
     fields: Sequence[Buffer],
-    pair: Pair,
+    pairs: Sequence[Pair],
     correction: Correction,
     grid: Grid,
     cells: Grid,
     clipped: float,
-) -> npt.NDArray[np.float64]:
-    """Of two corrected layers, (height, width, 5): per cell the mean of their difference in r, g, b and the
-    largest mean square of these, where neither is brighter than `clipped`, and the share of the pixels that
-    tell.
+) -> Iterator[npt.NDArray[np.float64]]:
+    """Of each two corrected layers, (height, width, 5): per cell the mean of their difference in r, g, b and
+    the largest mean square of these, where neither is brighter than `clipped`, and the share of the pixels
+    that tell.
     """
     none = device.zeros((*correction.grid.shape, 4))
-    difference, square = device.empty((*cells.shape, 4)), device.empty(cells.shape)
-    sides: list[Any] = []
-    for k in (pair.a, pair.b):
-        sides += [layers[k].pixels, fields[k], layers[k].box, correction.gains[k] or none]
-    device.run(
-        "seam", "seam_difference", cells.border[:2], *sides, grid.border, grid.lens,
-        correction.grid.border, cells.border, correction.shoulder, clipped, difference, square,
-    )  # fmt: skip
-    mean = difference.get()
-    return np.dstack([mean[..., :3], square.get(), mean[..., 3]]).astype(np.float64)
+
+    def started() -> Iterator[tuple[Buffer, Buffer]]:
+        for pair in pairs:
+            difference, square = device.empty((*cells.shape, 4)), device.empty(cells.shape)
+            sides: list[Any] = []
+            for k in (pair.a, pair.b):
+                sides += [layers[k].pixels, fields[k], layers[k].box, correction.gains[k] or none]
+            device.run(
+                "seam", "seam_difference", cells.border[:2], *sides, grid.border, grid.lens,
+                correction.grid.border, cells.border, correction.shoulder, clipped, difference, square,
+            )  # fmt: skip
+            yield difference, square
+
+    # the next pair is compared while the caller looks at this one
+    for buffers, _ in pairwise(chain(started(), (None,))):
+        if buffers:
+            mean, square = (buffer.get() for buffer in buffers)
+            yield np.dstack([mean[..., :3], square, mean[..., 3]]).astype(np.float64)
 
 
 def _smooth(values: npt.NDArray[np.float64], wraps: bool) -> npt.NDArray[np.float64]:

@@ -205,7 +205,7 @@ def test_a_cell_of_which_little_is_seen_tells_as_much_less(monkeypatch: pytest.M
     found[..., 4] = 1
     found[4, 6] = 0.5, -0.6, 0.1, 0.4, 0.1
     found[4, 7] = 0
-    monkeypatch.setattr(seam, "_differences", lambda *_: found)
+    monkeypatch.setattr(seam, "_differences", lambda *_: [found])
     layers = [SimpleNamespace(layer=SimpleNamespace(dtype=np.dtype(np.uint8)))] * 2
     residual = seam.residuals(None, layers, [], [seam.Pair(0, 1)], None, plane(96, 72))
     y, x = np.mgrid[0:9, 0:12]
