@@ -74,10 +74,12 @@ class Residuals:
 
     mean    r: of their low frequencies.
     rms     t: of all. In `divide` both are the mean square, on finer cells.
+    told    where any pair tells: not where a layer is sampled beyond its border. None: everywhere.
     """
 
     mean: npt.NDArray[np.float64]
     rms: npt.NDArray[np.float64]
+    told: Cells | None = None
 
 
 def seam_grid(grid: Grid) -> Grid:
@@ -95,7 +97,7 @@ def residuals(
 ) -> Residuals:
     """What flow and exposure do not explain."""
     cells = seam_grid(grid)
-    mean, square = np.zeros(cells.shape), np.zeros(cells.shape)
+    mean, square, told = np.zeros(cells.shape), np.zeros(cells.shape), np.zeros(cells.shape, bool)
     clipped = clipping(layers[0].layer)
     for found in _differences(device, layers, fields, pairs, correction, grid, cells, clipped):
         share = found[..., 4:]
@@ -103,7 +105,8 @@ def residuals(
         smooth = (share > 0) * smooth[..., :4] / np.where(share > 0, smooth[..., 4:], 1)
         mean = np.maximum(mean, np.abs(smooth[..., :3]).max(-1))
         square = np.maximum(square, smooth[..., 3])
-    return Residuals(mean, np.sqrt(square))
+        told |= share[..., 0] > 0
+    return Residuals(mean, np.sqrt(square), told)
 
 
 def regions(residual: Residuals, grid: Grid, aligned: bool = True, once: Cells | None = None) -> Cells:
@@ -169,6 +172,7 @@ def _owners(
     one that the softmax favours, -1 where none is.
     """
     cover = on_cells(masks.host, cells, np.logical_and)
+    residual = _completed(residual, cover.sum(0) > 1, cells.wraps)
     shares = np.stack(
         [_at_centres(f.get()[..., 3], k.box, grid, cells) for f, k in zip(fields, layers, strict=True)]
     )
@@ -179,6 +183,23 @@ def _owners(
         one = once is not None and bool(once[region].any())
         owner[rows, columns] = label(rows, columns, residual, shares, cover, cells.wraps, cut_price, one)
     return owner
+
+
+def _completed(residual: Residuals, overlaps: Cells, wraps: bool) -> Residuals:
+    """With what the nearest cell tells where layers overlap and none does. That is beside a layer's border,
+    from which things are moved away: a cut there would cost nothing, and leave half of somebody.
+    """
+    if residual.told is None or not residual.told.any():
+        return residual
+    missing = overlaps & ~residual.told
+    by = residual.told.shape[1] // 2 if wraps else 0
+    told = np.pad(residual.told, ((0, 0), (by, by)), mode="wrap")
+    row, column = scipy.ndimage.distance_transform_edt(~told, return_distances=False, return_indices=True)
+    nearest = (
+        row[:, by : by + missing.shape[1]],
+        (column[:, by : by + missing.shape[1]] - by) % missing.shape[1],
+    )
+    return Residuals(*(np.where(missing, one[nearest], one) for one in (residual.mean, residual.rms)))
 
 
 def _yield(
