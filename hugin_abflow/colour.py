@@ -7,7 +7,8 @@ through each layer, smoothly, and fades out. It is the minimum of
     sum_pairs c (g_a - g_b + d_ab)^2  +  sum_k |grad g_k|^2  +  g_k^2 / fade^2
 
 with d_ab the measured difference of the aligned layers, and c how far it can be trusted and both are seen: a
-sparse linear system, solved directly. Where there is no difference it is exactly zero.
+sparse linear system, solved directly; in the first rounds, which only tell what to trust, for blocks of
+cells. Where there is no difference it is exactly zero.
 
 Cameras' curves level off towards white, by which log odds move colours as exposure does; others run straight
 into it. The scale's shoulder, between both, is the one that leaves the least of the differences: else a
@@ -47,7 +48,7 @@ _ROUNDS = ((0.1, 4.0), (1.0, 3.0), (100.0, 2.5))
 # The same, slower and stricter: what lies far from it is no exposure but something that only one layer shows.
 _STRICT = ((0.01, 4.0), (0.03, 2.5), (0.3, 1.6), (3.0, 1.2), (100.0, 1.0))
 # Where differences weigh no more than smoothness, gains are smooth, and blocks of so many cells across share
-# one: a round takes as long as unknowns take to be eliminated.
+# one: nearly all of a round's time goes into eliminating unknowns.
 _ROUGH, _BLOCK = 1.0, 2
 # Weight of a clipped cell against smoothness: what it tells is a bound, of a brightness that nobody knows.
 _BOUND = 0.1
@@ -260,7 +261,7 @@ def solve(measured: Measured, rounds: Sequence[tuple[float, float]] = _ROUNDS) -
     difference = np.concatenate([d.values[e > 0, :3] for d, e in zip(differences, evidence, strict=True)])
     bounds = _Bounds(measured, number, area, count)
     smooth = step.T @ scipy.sparse.diags_array(stiffness) @ step
-    # a step between blocks is a slope of as many cells
+    # a step between blocks stands for _BLOCK steps, each of that part of it: their squares are less by that
     blocks = _blocks(inside)
     smooth_blocks = blocks.T @ smooth @ blocks / _BLOCK
     round_ = cells.circumference / (cells.lens[1] or 1.0)  # cells
@@ -271,13 +272,13 @@ def solve(measured: Measured, rounds: Sequence[tuple[float, float]] = _ROUNDS) -
         off = link @ solution + difference if solution.any() else np.zeros_like(difference)
         trusted = data * weight * _biweight(off, limit)
         held, pull = bounds.active(solution, limit)
-        told = scipy.sparse.diags_array(hold + held) + link.T @ scipy.sparse.diags_array(trusted) @ link
+        data_term = scipy.sparse.diags_array(hold + held) + link.T @ scipy.sparse.diags_array(trusted) @ link
         wanted = pull - link.T @ (trusted[:, None] * difference)
         if data <= _ROUGH:
-            matrix = blocks.T @ told @ blocks + smooth_blocks
+            matrix = blocks.T @ data_term @ blocks + smooth_blocks
             solution = blocks @ rough_solver.solve(matrix, blocks.T @ wanted)
         else:
-            solution = solver.solve(told + smooth, wanted)
+            solution = solver.solve(data_term + smooth, wanted)
     result = np.zeros((*inside.shape, 3))
     result[inside] = solution
     return result
@@ -287,8 +288,8 @@ def _blocks(inside: npt.NDArray[np.bool_]) -> scipy.sparse.csr_array:
     """A matrix (cells, blocks) that gives each of the layers' cells the value of its block."""
     layer, row, column = np.nonzero(inside)
     names = np.stack([layer, row // _BLOCK, column // _BLOCK])
-    block = np.unique(np.ravel_multi_index(tuple(names), inside.shape), return_inverse=True)[1]
-    return scipy.sparse.csr_array((np.ones(block.size), (np.arange(block.size), block)))
+    blocks, its = np.unique(np.ravel_multi_index(tuple(names), inside.shape), return_inverse=True)
+    return scipy.sparse.csr_array((np.ones(its.size), (np.arange(its.size), its)), (its.size, blocks.size))
 
 
 class _Solver:

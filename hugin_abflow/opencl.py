@@ -421,6 +421,11 @@ class Device:
             self.queue.finish()
         self.tell_times()
 
+    def flush(self) -> None:
+        """Have all that was started begun, while the host does something else."""
+        with _device_errors("starting"):
+            self.queue.flush()
+
     def timed(self, name: str, kind: str, event: cl.Event) -> None:
         """Have the trace, where there is one, told later when this was done."""
         if self._times:

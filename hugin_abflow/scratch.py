@@ -90,7 +90,7 @@ def work_folder() -> Iterator[Path]:
             with suppress(FileNotFoundError):  # swept before it had a lock
                 descriptor = os.open(folder / _LOCK, os.O_CREAT | os.O_WRONLY, 0o600)
                 _lock(descriptor)
-                if (folder / _LOCK).exists():
+                if os.fstat(descriptor).st_nlink:
                     break
                 os.close(descriptor)  # swept before it was locked
                 descriptor = None
@@ -122,8 +122,8 @@ def sweep(folder: Path) -> None:
 
 
 def _remove_abandoned(entry: os.DirEntry[str], lock: Path, host: str, remove: Callable[[], None]) -> None:
-    """Call `remove` if nobody holds the lock of a file, which it is itself, or of a folder. It is held
-    meanwhile: who has made one just now, and waits for its lock, finds that it is gone.
+    """Call `remove` if nobody holds `lock`: that of a folder, or the file itself. It is held meanwhile, and
+    goes first: who waits for it, having made it just now or to remove it, too, has a file that is gone.
     """
     with suppress(OSError):
         if host != _HOST and time.time() - entry.stat(follow_symlinks=False).st_mtime < _WEEK:
@@ -133,9 +133,10 @@ def _remove_abandoned(entry: os.DirEntry[str], lock: Path, host: str, remove: Ca
             remove()
             return
         # a folder whose process was killed before it had a lock, or while it was removed, has none
-        descriptor = os.open(lock, os.O_RDWR | (os.O_CREAT if entry.is_dir() else 0), 0o600)
+        make = os.O_CREAT if entry.is_dir() else 0
+        descriptor = os.open(lock, os.O_RDWR | os.O_NOFOLLOW | make, 0o600)
         try:
-            if _lock(descriptor, wait=False):
+            if _lock(descriptor, wait=False) and os.fstat(descriptor).st_nlink:
                 remove()
         finally:
             os.close(descriptor)

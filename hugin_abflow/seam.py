@@ -24,7 +24,6 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from itertools import chain, pairwise
 from typing import Any
 
 import cv2
@@ -74,7 +73,8 @@ class Residuals:
 
     mean    r: of their low frequencies.
     rms     t: of all. In `divide` both are the mean square, on finer cells.
-    told    where any pair tells: not where a layer is sampled beyond its border. None: everywhere.
+    told    where any pair has pixels to compare: none are where layers are clipped, or sampled beyond their
+            borders. None: everywhere.
     """
 
     mean: npt.NDArray[np.float64]
@@ -113,8 +113,8 @@ def regions(residual: Residuals, grid: Grid, aligned: bool = True, once: Cells |
     """Where layers differ too much to be blended, of the same shape; unless they are aligned, texture differs
     everywhere and tells nothing. once: cells that belong to a region whatever the layers show there.
     """
-    told = residual if aligned else Residuals(residual.mean, residual.mean)
-    found = _regions(told, seam_grid(grid), np.zeros(residual.mean.shape, bool) if once is None else once)
+    residual = residual if aligned else Residuals(residual.mean, residual.mean)
+    found = _regions(residual, seam_grid(grid), np.zeros(residual.mean.shape, bool) if once is None else once)
     return np.logical_or.reduce(found) if found else np.zeros(residual.mean.shape, bool)
 
 
@@ -172,7 +172,7 @@ def _owners(
     one that the softmax favours, -1 where none is.
     """
     cover = on_cells(masks.host, cells, np.logical_and)
-    residual = _completed(residual, cover.sum(0) > 1, cells.wraps)
+    residual = _completed(residual, cover, cells.wraps)
     shares = np.stack(
         [_at_centres(f.get()[..., 3], k.box, grid, cells) for f, k in zip(fields, layers, strict=True)]
     )
@@ -185,21 +185,29 @@ def _owners(
     return owner
 
 
-def _completed(residual: Residuals, overlaps: Cells, wraps: bool) -> Residuals:
-    """With what the nearest cell tells where layers overlap and none does. That is beside a layer's border,
-    from which things are moved away: a cut there would cost nothing, and leave half of somebody.
+def _completed(residual: Residuals, cover: npt.NDArray[np.bool_], wraps: bool) -> Residuals:
+    """With the nearest cell's residual in cells that nothing tells of, from a layer's border on: things are
+    moved away from there, and a cut would cost nothing, and leave half of somebody.
+
+    cover       (layers, height, width): the cells that each of them covers.
     """
     if residual.told is None or not residual.told.any():
         return residual
-    missing = overlaps & ~residual.told
     by = residual.told.shape[1] // 2 if wraps else 0
-    told = np.pad(residual.told, ((0, 0), (by, by)), mode="wrap")
-    row, column = scipy.ndimage.distance_transform_edt(~told, return_distances=False, return_indices=True)
-    nearest = (
-        row[:, by : by + missing.shape[1]],
-        (column[:, by : by + missing.shape[1]] - by) % missing.shape[1],
-    )
-    return Residuals(*(np.where(missing, one[nearest], one) for one in (residual.mean, residual.rms)))
+    around = [(0, 0), (by, by)]
+    cover = np.pad(cover, [(0, 0), *around], mode="wrap")
+    told = np.pad(residual.told, around, mode="wrap")
+    borders = [one & scipy.ndimage.binary_dilation(~one, np.ones((3, 3))) for one in cover]
+    missing = (cover.sum(0) > 1) & ~told
+    missing = scipy.ndimage.binary_propagation(np.any(borders, 0) & missing, np.ones((3, 3)), missing)
+    nearest = scipy.ndimage.distance_transform_edt(~told, return_distances=False, return_indices=True)
+
+    def completed(values: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+        values = np.pad(values, around, mode="wrap")
+        whole = np.where(missing, values[tuple(nearest)], values)
+        return whole[:, by : whole.shape[1] - by]
+
+    return Residuals(completed(residual.mean), completed(residual.rms))
 
 
 def _yield(
@@ -235,23 +243,30 @@ def _differences(
     """
     none = device.zeros((*correction.grid.shape, 4))
 
-    def started() -> Iterator[tuple[Buffer, Buffer]]:
-        for pair in pairs:
-            difference, square = device.empty((*cells.shape, 4)), device.empty(cells.shape)
-            sides: list[Any] = []
-            for k in (pair.a, pair.b):
-                sides += [layers[k].pixels, fields[k], layers[k].box, correction.gains[k] or none]
-            device.run(
-                "seam", "seam_difference", cells.border[:2], *sides, grid.border, grid.lens,
-                correction.grid.border, cells.border, correction.shoulder, clipped, difference, square,
-            )  # fmt: skip
-            yield difference, square
+    def start(pair: Pair) -> tuple[Buffer, Buffer]:
+        difference, square = device.empty((*cells.shape, 4)), device.empty(cells.shape)
+        sides: list[Any] = []
+        for k in (pair.a, pair.b):
+            sides += [layers[k].pixels, fields[k], layers[k].box, correction.gains[k] or none]
+        device.run(
+            "seam", "seam_difference", cells.border[:2], *sides, grid.border, grid.lens,
+            correction.grid.border, cells.border, correction.shoulder, clipped, difference, square,
+        )  # fmt: skip
+        return difference, square
 
-    # the next pair is compared while the caller looks at this one
-    for buffers, _ in pairwise(chain(started(), (None,))):
-        if buffers:
-            mean, square = (buffer.get() for buffer in buffers)
-            yield np.dstack([mean[..., :3], square, mean[..., 3]]).astype(np.float64)
+    def fetch(difference: Buffer, square: Buffer) -> npt.NDArray[np.float64]:
+        mean = difference.get()
+        return np.dstack([mean[..., :3], square.get(), mean[..., 3]]).astype(np.float64)
+
+    if not pairs:
+        return
+    started = start(pairs[0])
+    for pair in pairs[1:]:
+        found = fetch(*started)
+        started = start(pair)  # the device goes on while the caller looks at what is found
+        device.flush()
+        yield found
+    yield fetch(*started)
 
 
 def _smooth(values: npt.NDArray[np.float64], wraps: bool) -> npt.NDArray[np.float64]:

@@ -153,7 +153,7 @@ static inline float4 blend_sample(__global const pixel_stored *stored, __global 
 
 /* Weights of fields that are less than a share of their sum, which nobody sees, become negative. */
 __kernel void blend_hide(__global float4 *ways,      /* fields, one after the other: (box.w, box.z) each */
-                         __global const int8 *boxes, /* (count) box on the working grid; begin in ways */
+                         __global const int8 *boxes, /* (count) box on the working grid; s4: begin in ways */
                          int count,
                          int4 part,   /* of the working grid: run size */
                          float share) /* below which they are hidden */

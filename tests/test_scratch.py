@@ -151,6 +151,49 @@ def test_a_folder_that_is_swept_while_it_is_made_is_made_anew(
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="another mechanism there")
+@pytest.mark.parametrize("late", ["maker", "sweeper"])
+def test_a_lock_that_is_gone_is_nobodys(root: Path, monkeypatch: pytest.MonkeyPatch, late: str) -> None:
+    """While one waits for the lock of a folder it goes, and another one, of the same name, is held."""
+    lock, held = scratch._lock, list[int]()
+
+    def waited(descriptor: int, wait: bool = True) -> bool:
+        if wait == (late == "maker") and not held:
+            (name,) = names_in(root)
+            (root / name / "in use").unlink()
+            held.append(os.open(root / name / "in use", os.O_CREAT | os.O_RDWR, 0o600))
+            assert lock(held[0], False)
+        return lock(descriptor, wait)
+
+    monkeypatch.setattr(scratch, "_lock", waited)
+    if late == "maker":
+        with work_folder() as folder:
+            assert len(names_in(root)) == 2 and (folder / "in use").exists()
+        assert len(names_in(root)) == 1
+    else:
+        (root / f"hugin-abflow-{scratch._HOST}-0123456789ab").mkdir()
+        sweep(root)
+        assert len(names_in(root)) == 1
+    os.close(held[0])
+    sweep(root)
+    assert names_in(root) == []
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="another mechanism there")
+def test_what_vanishes_is_not_made_anew_and_links_are_not_followed(root: Path, tmp_path: Path) -> None:
+    part = root / f".abflow-{scratch._HOST}-0123456789ab.tif"
+    part.touch()
+    (entry,) = os.scandir(root)
+    part.unlink()
+    scratch._remove_abandoned(entry, part, scratch._HOST, part.unlink)
+    assert names_in(root) == []
+    folder = root / f"hugin-abflow-{scratch._HOST}-0123456789ab"
+    folder.mkdir()
+    (folder / "in use").symlink_to(root / "elsewhere")
+    sweep(root)
+    assert not (root / "elsewhere").exists()
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="another mechanism there")
 def test_what_is_swept_is_locked_until_it_is_gone(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Else it could go when somebody who has made it just now holds its lock."""
     left = root / f".abflow-{scratch._HOST}-0123456789ab.tif"

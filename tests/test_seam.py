@@ -213,6 +213,18 @@ def test_a_cell_of_which_little_is_seen_tells_as_much_less(monkeypatch: pytest.M
     assert np.isclose(residual.mean[4, 6], 0.6 * 0.1 / weight.sum(), rtol=0.01)
     assert np.isclose(residual.rms[4, 6], np.sqrt(0.4 * 0.1 / weight.sum()), rtol=0.01)
     assert residual.mean[4, 7] == residual.rms[4, 7] == 0
+    assert residual.told is not None and residual.told.sum() == 107 and not residual.told[4, 7]
+
+
+def test_a_cell_is_told_of_by_any_pair(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What is as bright as clipped pixels are is not compared, but without flow."""
+    found = np.zeros((2, 9, 12, 5))
+    found[0, :, :5, 4], found[1, 3, 3:, 4] = 0.2, 1
+    asked = []
+    monkeypatch.setattr(seam, "_differences", lambda *given: asked.append(given[-1]) or iter(found))
+    layers = [SimpleNamespace(layer=SimpleNamespace(dtype=np.dtype(np.uint8)))] * 2
+    residual = seam.residuals(None, layers, [], [seam.Pair(0, 1)] * 2, None, plane(96, 72))
+    assert np.array_equal(residual.told, (found[..., 4] > 0).any(0)) and asked == [0.98]
 
 
 # Regions

@@ -125,52 +125,69 @@ def test_what_moved_makes_a_region_whatever_the_layers_show() -> None:
     assert not seam.regions(alike(residual), grid).any()
 
 
-def owners(told: np.ndarray, residual: np.ndarray) -> np.ndarray:
+def owners(told: np.ndarray, residual: np.ndarray, turn: int = 0) -> np.ndarray:
     """Whose each cell is: the first layer ends at column 26, the second begins at 14; somebody is on 8 to 17
-    in one, on 16 to 23 in the other.
+    in one, on 16 to 23 in the other. All is turned by some columns.
     """
-    grid = plane(240, 96)
+    grid = plane(240, 96, wraps=turn > 0)
     x, region = np.arange(30), np.zeros((12, 30), bool)
     region[2:10, 8:26] = True
     covers = np.stack([np.tile(one, (12, 1)) for one in (x < 26, x >= 14)])
     share = np.clip((x - 13) / 13, 0, 1) * np.ones((12, 1))
+    told, residual, region, covers, share = (
+        np.roll(v, turn, -1) for v in (told, residual, region, covers, share)
+    )
     fields = [np.stack([0 * s] * 3 + [s], -1).repeat(8, 0).repeat(8, 1) for s in (1 - share, share)]
-    return seam._owners(
+    found = seam._owners(
         [SimpleNamespace(box=(0, 0, 240, 96))] * 2,
         [SimpleNamespace(get=lambda field=field: field) for field in fields],
         seam.Residuals(residual, residual, told), region, SimpleNamespace(host=covers), grid,
         seam.seam_grid(grid), seam._CUT, region,
     )  # fmt: skip
+    return np.roll(found, -turn, 1)
 
 
-def test_nobody_is_cut_by_a_border_where_nothing_tells_what_is_there() -> None:
+@pytest.mark.parametrize("turn", [0, 15])
+def test_nobody_is_cut_by_a_border_where_nothing_tells_what_is_there(turn: int) -> None:
     """Beside the second layer's border what it shows was moved away: a cut there seems to cost nothing."""
     residual = np.zeros((12, 30))
     residual[:, 14:26] = 0.02
     residual[2:10, [15, *range(18, 24)]] = 0.3
     residual[:, 14] = 0
-    assert (owners(np.ones((12, 30), bool), residual)[2:10, 14:24] == 1).all()
+    assert (owners(np.ones((12, 30), bool), residual, turn)[2:10, 14:24] == 1).all()
     told = residual > 0
-    assert (owners(told, residual)[2:10, 8:26] == 0).all()
+    assert (owners(told, residual, turn)[2:10, 8:26] == 0).all()
 
 
 @pytest.mark.parametrize("wraps", WRAPS)
-def test_cells_where_layers_overlap_and_nothing_tells_are_as_the_nearest(wraps: bool) -> None:
-    random = np.random.default_rng(3)
-    mean, rms = random.random((2, 9, 20))
-    told = np.zeros((9, 20), bool)
-    told[2:6, 4:7] = told[4, 18] = True
-    overlaps = random.random((9, 20)) < 0.7
-    found = seam._completed(seam.Residuals(mean, rms, told), overlaps, wraps)
-    y, x = np.nonzero(told)
-    for row, column in np.ndindex(9, 20):
-        if told[row, column] or not overlaps[row, column]:
-            assert found.mean[row, column] == mean[row, column]
+def test_cells_beside_a_border_of_which_nothing_tells_are_as_the_nearest(wraps: bool) -> None:
+    """One layer lies on all cells, another one on columns 3 to 19 of 24; what is clipped tells nothing."""
+    mean, rms = np.random.default_rng(3).random((2, 9, 24))
+    cover = np.ones((2, 9, 24), bool)
+    cover[1, :, :3] = cover[1, :, 20:] = False
+    told = cover[1].copy()
+    told[2:7, 3:6] = told[0:4, 18:20] = False
+    clipped = np.s_[3:6, 10:13]
+    told[clipped] = False
+    told[7:, 3:] = told[7:, :4] = False
+    told[8, 12] = True
+    for turn in (0, 11):
+        turned = [np.roll(v, turn, -1) for v in (mean, rms, told, cover)]
+        if turn and not wraps:
             continue
-        aside = np.abs(x - column)
-        apart = (y - row) ** 2 + (np.minimum(aside, 20 - aside) if wraps else aside) ** 2
-        nearest = apart == apart.min()
-        assert found.mean[row, column] in mean[y, x][nearest]
-        assert found.rms[row, column] in rms[y, x][nearest]
+        found = seam._completed(seam.Residuals(*turned[:3]), turned[3], wraps)
+        its_mean, its_rms = (np.roll(v, -turn, 1) for v in (found.mean, found.rms))
+        missing = cover[1] & ~told
+        missing[clipped] = False
+        assert missing.sum() > 40
+        assert np.array_equal(its_mean[~missing], mean[~missing])
+        assert np.array_equal(its_rms[~missing], rms[~missing])
+        y, x = np.nonzero(told)
+        for row, column in np.argwhere(missing):
+            aside = np.abs(x - column)
+            apart = (y - row) ** 2 + (np.minimum(aside, 24 - aside) if wraps else aside) ** 2
+            nearest = apart == apart.min()
+            assert its_mean[row, column] in mean[y, x][nearest]
+            assert its_rms[row, column] in rms[y, x][nearest]
     nothing = seam.Residuals(mean, rms, 0 * told)
-    assert seam._completed(nothing, overlaps, wraps) is nothing
+    assert seam._completed(nothing, cover, wraps) is nothing
