@@ -22,7 +22,7 @@ import numpy as np
 import numpy.typing as npt
 import pyopencl as cl
 
-from hugin_abflow import launch, memory, trace
+from hugin_abflow import launch, memory, pocl, trace
 from hugin_abflow.errors import DeviceError
 from hugin_abflow.spare import Spare
 
@@ -278,7 +278,9 @@ class Device:
     """
 
     def __init__(self, wanted: str | None = None, threads: int = 0) -> None:
-        self.device = _part(_choose(wanted), threads)
+        chosen = _choose(wanted)
+        pocl.name_processor(chosen.version, chosen.int_ptr)
+        self.device = _part(chosen, threads)
         self.context = cl.Context([self.device])
         timing = cl.command_queue_properties.PROFILING_ENABLE if trace.is_recording() else 0
         self.queue = cl.CommandQueue(self.context, properties=timing)

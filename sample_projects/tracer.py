@@ -19,6 +19,8 @@ import numpy as np
 import numpy.typing as npt
 import pyopencl as cl
 
+from hugin_abflow.pocl import name_processor
+
 Floats = npt.NDArray[np.float32]
 Vector = Sequence[float] | npt.NDArray[np.float64]
 
@@ -375,7 +377,9 @@ def _device() -> cl.Device:
     if not devices:
         raise RuntimeError("no OpenCL device; install one, such as PoCL (pip install 'pyopencl[pocl]')")
     cpus = [device for device in devices if device.type & cl.device_type.CPU]
-    return (cpus or devices)[0]
+    device = (cpus or devices)[0]
+    name_processor(device.version, device.int_ptr)
+    return device
 
 
 def _smooth_faces(light: Floats, texels: npt.NDArray[np.int32]) -> Floats:

@@ -1,0 +1,97 @@
+"""PoCL on a processor that is newer than its compiler.
+
+PoCL asks its LLVM for the processor's name. Where LLVM is older than the processor it may say "generic",
+which its own compiler then refuses: no program builds at all (PoCL's issue 1049). So does PoCL 3.0 of PyPI,
+with LLVM 14, on AMD's Zen 5. Such a device is given the name of an older processor here.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import logging
+import os
+import platform
+import struct
+import sys
+from collections.abc import Set
+from itertools import takewhile
+from pathlib import Path
+
+_log = logging.getLogger(__name__)
+
+_UNKNOWN = b"generic\0"
+
+# Processors, each of which can do what the one before can and more: by what, in the words of /proc/cpuinfo,
+# one tells. PoCL's libraries of functions, which it chooses by the same, are compiled for these.
+_PROCESSORS: tuple[tuple[str, Set[str]], ...] = (
+    ("x86-64", {"sse2"}),
+    ("haswell", {"sse4_2", "popcnt", "avx2", "fma", "f16c", "bmi1", "bmi2", "abm", "movbe"}),
+    ("skylake-avx512", {"avx512f", "avx512bw", "avx512cd", "avx512dq", "avx512vl", "adx", "clflushopt"}),
+)
+
+# The first bytes of a device's record (`struct _cl_device_id`); in PoCL 3.0 the name's address is at 640.
+_RECORD = 1536
+
+
+def name_processor(version: str, record: int) -> None:
+    """Have PoCL compile for a processor that its compiler knows, where it does not know this one.
+
+    version     what the device says of itself (CL_DEVICE_VERSION); PoCL's ends with the processor's name.
+    record      the address of its `cl_device_id`; parts of it (sub-devices) have to be made afterwards.
+
+    Nothing happens on other systems than Linux on x86-64, whose compilers know "generic", or if the record
+    is not as expected: programs that do not build are an error of their own.
+    """
+    if not ("pocl" in version.lower() and version.endswith("-generic")):
+        return
+    if sys.platform != "linux" or platform.machine() != "x86_64":
+        return
+    try:
+        name = _like(_features())
+        if _rename(record, name):
+            _log.debug("PoCL does not know this processor; it compiles for %s", name)
+    except OSError as error:
+        _log.debug("PoCL does not know this processor, and cannot be told: %s", error)
+
+
+def _features() -> Set[str]:
+    """What this processor can do, in the words of /proc/cpuinfo."""
+    lines = Path("/proc/cpuinfo").read_text("utf-8").splitlines()
+    return next((set(line.partition(":")[2].split()) for line in lines if line.startswith("flags")), set())
+
+
+def _like(features: Set[str]) -> str:
+    """The last of the processors that can do no more than one with these features."""
+    able = takewhile(lambda processor: processor[1] <= features, _PROCESSORS)
+    return [_PROCESSORS[0], *able][-1][0]
+
+
+def _rename(record: int, name: str) -> bool:
+    """Have the device's record hold this name in place of none; returns whether it held none."""
+    # this file fails where an address leads nowhere, and a pointer would end the process
+    memory = os.open("/proc/self/mem", os.O_RDWR)
+    try:
+        words = os.pread(memory, _RECORD, record)
+        for place in range(0, len(words) - 7, 8):
+            (address,) = struct.unpack_from("@Q", words, place)
+            if _read(memory, address) == _UNKNOWN:
+                os.pwrite(memory, struct.pack("@Q", _copied(name)), record + place)
+                return True
+        return False
+    finally:
+        os.close(memory)
+
+
+def _read(memory: int, address: int) -> bytes:
+    """As many bytes as the unknown name has; none where there is no memory."""
+    try:
+        return os.pread(memory, len(_UNKNOWN), address)
+    except (OSError, OverflowError):
+        return b""
+
+
+def _copied(name: str) -> int:
+    """The address of a copy that PoCL may free as its own."""
+    duplicate = ctypes.CDLL(None).strdup
+    duplicate.restype = ctypes.c_size_t
+    return int(duplicate(name.encode()))

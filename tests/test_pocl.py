@@ -1,0 +1,129 @@
+"""PoCL compiles on processors that its compiler does not know."""
+
+from __future__ import annotations
+
+import ctypes
+import os
+import platform
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from hugin_abflow import pocl
+from hugin_abflow.opencl import Device
+
+NAMELESS = "OpenCL 3.0 PoCL HSTR: pthread-x86_64-unknown-linux-gnu-generic"
+HERE = sys.platform == "linux" and platform.machine() == "x86_64"
+only_here = pytest.mark.skipif(not HERE, reason="other compilers know a processor without a name")
+
+
+class Record(ctypes.Structure):
+    """Some of what drivers keep of a device: numbers, and addresses good and bad."""
+
+    _fields_ = (
+        ("table", ctypes.c_void_p),
+        ("kind", ctypes.c_uint64),
+        ("nowhere", ctypes.c_void_p),
+        ("long_name", ctypes.c_char_p),
+        ("triplet", ctypes.c_char_p),
+        ("processor", ctypes.c_char_p),
+        ("rest", ctypes.c_char * pocl._RECORD),
+    )
+
+
+def record_of(processor: bytes) -> Record:
+    return Record(
+        0, (1 << 64) - 1, 8, b"a processor", b"x86_64-unknown-linux-gnu", processor, b"\xff" * pocl._RECORD
+    )
+
+
+@only_here
+def test_the_name_alone_is_changed() -> None:
+    record = record_of(b"generic")
+    before = bytes(record)
+    pocl.name_processor(NAMELESS, ctypes.addressof(record))
+    assert record.processor in {name.encode() for name, _ in pocl._PROCESSORS}
+    field = Record.processor
+    after = bytearray(bytes(record))
+    after[field.offset : field.offset + field.size] = before[field.offset : field.offset + field.size]
+    assert bytes(after) == before
+
+
+@only_here
+def test_a_name_stays() -> None:
+    for processor in (b"znver3", b"generic-rv64"):
+        record = record_of(processor)
+        pocl.name_processor(NAMELESS, ctypes.addressof(record))
+        assert record.processor == processor
+
+
+@only_here
+@pytest.mark.parametrize(
+    "version",
+    [
+        "OpenCL 3.0 PoCL HSTR: pthread-x86_64-unknown-linux-gnu-haswell",
+        "OpenCL 3.0 CUDA 12.4.0",
+        "OpenCL 3.0 of another kind-generic",
+    ],
+)
+def test_other_devices_are_left_alone(version: str) -> None:
+    record = record_of(b"generic")
+    pocl.name_processor(version, ctypes.addressof(record))
+    assert record.processor == b"generic"
+
+
+@only_here
+def test_what_cannot_be_read_is_no_error() -> None:
+    pocl.name_processor(NAMELESS, 8)
+
+
+FEATURES = sorted(set[str]().union(*(needed for _, needed in pocl._PROCESSORS)))
+
+
+@given(st.sets(st.sampled_from(FEATURES)))
+def test_no_processor_is_taken_for_one_that_can_do_more(features: set[str]) -> None:
+    taken = pocl._like(features)
+    weaker = [name for name, _ in pocl._PROCESSORS].index(taken)
+    for name, needed in pocl._PROCESSORS[1 : weaker + 1]:  # all of x86-64 can do what the first can
+        assert needed <= features, name
+
+
+def test_all_that_a_processor_can_do_is_used() -> None:
+    features = set[str]()
+    for name, needed in pocl._PROCESSORS:
+        features |= needed
+        assert pocl._like(features) == name
+
+
+_NAMELESS_RUN = """
+import sys
+from hugin_abflow import pocl
+from hugin_abflow.opencl import Device, _choose
+
+chosen = _choose(None)
+pocl._UNKNOWN = sys.argv[1].encode() + b"\\0"
+assert pocl._rename(chosen.int_ptr, "generic") or sys.argv[1] == "generic"
+pocl._UNKNOWN = b"generic\\0"
+pocl.name_processor(sys.argv[2], chosen.int_ptr)
+print(sorted(Device(threads=1).build("pyramid")))
+"""
+
+
+@only_here
+def test_a_nameless_processor_builds(device: Device, tmp_path: Path) -> None:
+    """The name of this machine's is taken away first, if it has one."""
+    version = device.device.version
+    if "PoCL" not in version or "-gnu-" not in version:
+        pytest.skip("the device is none of PoCL's")
+    done = subprocess.run(
+        [sys.executable, "-c", _NAMELESS_RUN, version.partition("-gnu-")[2], NAMELESS],
+        env=os.environ | {"POCL_CACHE_DIR": str(tmp_path), "PYOPENCL_NO_CACHE": "1"},
+        capture_output=True,
+        text=True,
+    )
+    assert done.returncode == 0, done.stderr
+    assert "pyramid_" in done.stdout
