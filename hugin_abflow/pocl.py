@@ -14,19 +14,18 @@ import platform
 import struct
 import sys
 from collections.abc import Set
-from itertools import takewhile
 from pathlib import Path
 
 _log = logging.getLogger(__name__)
 
 _UNKNOWN = b"generic\0"
 
-# Processors, each of which can do what the one before can and more: by what, in the words of /proc/cpuinfo,
-# one tells. PoCL's libraries of functions, which it chooses by the same, are compiled for these.
-_PROCESSORS: tuple[tuple[str, Set[str]], ...] = (
-    ("x86-64", {"sse2"}),
-    ("haswell", {"sse4_2", "popcnt", "avx2", "fma", "f16c", "bmi1", "bmi2", "abm", "movbe"}),
-    ("skylake-avx512", {"avx512f", "avx512bw", "avx512cd", "avx512dq", "avx512vl", "adx", "clflushopt"}),
+# PoCL's libraries of functions, and the processors for which they are compiled: which one is loaded depends
+# on the first feature alone, in the words of /proc/cpuinfo; programs may expect the others as well. If they
+# were compiled for less than the library, they would pass long vectors in another way.
+_PROCESSORS: tuple[tuple[str, str, Set[str]], ...] = (
+    ("avx512f", "skylake-avx512", {"avx512bw", "avx512cd", "avx512dq", "avx512vl", "adx", "clflushopt"}),
+    ("avx2", "haswell", {"sse4_2", "popcnt", "fma", "f16c", "bmi1", "bmi2", "abm", "movbe"}),
 )
 
 # The first bytes of a device's record (`struct _cl_device_id`); in PoCL 3.0 the name's address is at 640.
@@ -39,8 +38,8 @@ def name_processor(version: str, record: int) -> None:
     version     what the device says of itself (CL_DEVICE_VERSION); PoCL's ends with the processor's name.
     record      the address of its `cl_device_id`; parts of it (sub-devices) have to be made afterwards.
 
-    Nothing happens on other systems than Linux on x86-64, whose compilers know "generic", or if the record
-    is not as expected: programs that do not build are an error of their own.
+    Nothing happens on other systems than Linux on x86-64, whose compilers know "generic", on processors that
+    can do less than AVX2, or if the record is not as expected: that programs do not build is told there.
     """
     if not ("pocl" in version.lower() and version.endswith("-generic")):
         return
@@ -48,7 +47,7 @@ def name_processor(version: str, record: int) -> None:
         return
     try:
         name = _like(_features())
-        if _rename(record, name):
+        if name and _rename(record, name):
             _log.debug("PoCL does not know this processor; it compiles for %s", name)
     except OSError as error:
         _log.debug("PoCL does not know this processor, and cannot be told: %s", error)
@@ -60,10 +59,12 @@ def _features() -> Set[str]:
     return next((set(line.partition(":")[2].split()) for line in lines if line.startswith("flags")), set())
 
 
-def _like(features: Set[str]) -> str:
-    """The last of the processors that can do no more than one with these features."""
-    able = takewhile(lambda processor: processor[1] <= features, _PROCESSORS)
-    return [_PROCESSORS[0], *able][-1][0]
+def _like(features: Set[str]) -> str | None:
+    """A processor that can do no more than one with these features, and for which PoCL has its functions."""
+    for decisive, name, others in _PROCESSORS:
+        if decisive in features:
+            return name if others <= features else None
+    return None
 
 
 def _rename(record: int, name: str) -> bool:
