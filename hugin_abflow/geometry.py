@@ -51,14 +51,20 @@ def fields(
     device: Device,
     layers: Sequence[WorkingLayer],
     coefficients: Sequence[Coefficients],
-    flows: Sequence[PairFlow],
+    flows: list[PairFlow],
     grid: Grid,
     settings: Settings,
 ) -> list[Buffer]:
     """Per layer, on its box: float32 (height, width, 4), the displacement of x_k as a difference of points
     (sphere: of unit vectors; plane: working px) and the colour weight s_k, not yet normalised.
+
+    `flows` is emptied: all of them and all fields together would be most of what working resolution takes.
     """
-    result = displacements(device, layers, coefficients, flows, grid, settings)
+    result = list[Buffer]()
+    for index in range(len(layers)):
+        result.append(_displacement(device, index, layers, coefficients, flows, grid, settings))
+        flows[:] = [flow for flow in flows if max(flow.a, flow.b) > index]
+        device.give_back()
     highest = device.zeros(grid.shape)
     furthest = _PLAUSIBLE * grid.circumference
     for layer, field, coefficient in zip(layers, result, coefficients, strict=True):
@@ -89,16 +95,30 @@ def displacements(
 
     every   columns and rows of a layer's box from one to the next: (height / every, width / every, 4).
     """
-    result = []
-    for index in range(len(layers)):
-        field = _displacement(device, index, layers, coefficients, flows, grid, every, None)
-        for _ in range(settings.fixed_point_steps):
-            field = _displacement(device, index, layers, coefficients, flows, grid, every, field)
-        result.append(field)
-    return result
+    return [
+        _displacement(device, index, layers, coefficients, flows, grid, settings, every)
+        for index in range(len(layers))
+    ]
 
 
 def _displacement(
+    device: Device,
+    index: int,
+    layers: Sequence[WorkingLayer],
+    coefficients: Sequence[Coefficients],
+    flows: Sequence[PairFlow],
+    grid: Grid,
+    settings: Settings,
+    every: int = 1,
+) -> Buffer:
+    """One layer's of `displacements`."""
+    field = _sum_of_flows(device, index, layers, coefficients, flows, grid, every, None)
+    for _ in range(settings.fixed_point_steps):
+        field = _sum_of_flows(device, index, layers, coefficients, flows, grid, every, field)
+    return field
+
+
+def _sum_of_flows(
     device: Device,
     index: int,
     layers: Sequence[WorkingLayer],

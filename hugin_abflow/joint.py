@@ -225,7 +225,6 @@ def _align(
     clipped = highlights.excess(device, layers, masks, grid, settings)
     transition.narrow(device, layers, coefficients, flows, grid, settings, clipped.max(0))
     fields = geometry.fields(device, layers, coefficients, flows, grid, settings)
-    flows.clear()  # these are as large as the layers, and not needed again
     del coefficients
     device.give_back()
     highlights.give_way(device, layers, fields, clipped, grid)
@@ -307,8 +306,7 @@ def _read(
             reduced = [job.result() for job in jobs]
         finally:
             decoders.shutdown(cancel_futures=True)
-        device.finish()  # else the last rows' time would be told as that of what follows
-    device.give_back()
+        device.give_back()
     return sorted(reduced, key=_place)
 
 
@@ -437,6 +435,5 @@ def _flows(
                 shifts.append(figures.parallax(device, its_flow, images, grid))
             advance(1)
         mend()
-        device.finish()  # kernels are only queued: the last pair's time would be told as that of what follows
-    device.give_back()
+        device.give_back()
     return result, shifts, singles

@@ -80,10 +80,10 @@ def offsets(
             "multiband", "multiband_weights", layer.box[2:],
             layer.pixels, field, layer.box, grid.border, total,
         )  # fmt: skip
-    finest = [
-        _finest(device, layer, field, total, correction, k, grid, grids[1], widths[1])
-        for k, (layer, field) in enumerate(zip(layers, fields, strict=True))
-    ]
+    finest = []
+    for k, (layer, field) in enumerate(zip(layers, fields, strict=True)):
+        finest.append(_finest(device, layer, field, total, correction, k, grid, grids[1], widths[1]))
+        device.give_back()  # layers are of different sizes
     del total
     _differ(device, finest, widths[1], np.zeros((1, 1)) if once is None else once)
     blend = _blend(device, finest, grids[1:], widths[1:])
@@ -146,7 +146,8 @@ def _differ(device: Device, finest: list[_Level], widths: Widths, once: npt.NDAr
             alone, cells,
         )  # fmt: skip
         finest[k] = _spread(device, level, widths)
-        device.give_back()  # layers are of different sizes
+        del level
+        device.give_back()
 
 
 def _blend(

@@ -414,6 +414,7 @@ class Device:
 
     def give_back(self) -> None:
         """Return freed memory to the system, on the device and the host, at the end of a step."""
+        self.finish()  # what still waits for its kernels would stay
         self.spare.release()
         memory.give_back()
 
