@@ -38,8 +38,8 @@ _INSTALL = {
     "darwin": "use a macOS with Apple's OpenCL, or install pocl from conda-forge",
 }
 
-# Where the ICD loader looks for drivers, and which devices PoCL offers: a wrong one hides them all.
-_HIDING = ("OCL_ICD_VENDORS", "POCL_DEVICES")
+# Where drivers are looked for, which devices PoCL offers, where it keeps kernels: a wrong one hides them all.
+_HIDING = ("OCL_ICD_VENDORS", "POCL_DEVICES", "POCL_CACHE_DIR")
 
 
 @dataclass(frozen=True)
@@ -75,6 +75,7 @@ def _kind(device: cl.Device) -> str:
 
 def _devices() -> list[cl.Device]:
     """All devices of all platforms; `DeviceError` where there is none."""
+    pocl.find_cache()
     try:
         platforms = cl.get_platforms()
     except cl.Error:

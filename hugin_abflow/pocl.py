@@ -1,8 +1,11 @@
-"""PoCL on a processor that is newer than its compiler.
+"""Where PoCL, OpenCL on the processor, would not work: it is helped.
 
-PoCL asks its LLVM for the processor's name. Where LLVM is older than the processor it may say "generic",
-which its own compiler then refuses: no program builds at all (PoCL's issue 1049). So does PoCL 3.0 of PyPI,
-with LLVM 14, on AMD's Zen 5. Such a device is given the name of an older processor here.
+**A processor that is newer than its compiler.** PoCL asks its LLVM for the processor's name. Where LLVM is
+older it may say "generic", which its own compiler then refuses: no program builds at all (PoCL's issue 1049).
+So does PoCL 3.0 of PyPI, with LLVM 14, on AMD's Zen 5. The device is given the name of an older processor.
+
+**A home that cannot be written**, as in containers and of services. PoCL keeps what it compiled there, and
+offers no device if it cannot; pyopencl fails as well. They are given a folder among temporary files.
 """
 
 from __future__ import annotations
@@ -11,9 +14,12 @@ import ctypes
 import logging
 import os
 import platform
+import stat
 import struct
 import sys
+import tempfile
 from collections.abc import Set
+from contextlib import suppress
 from pathlib import Path
 
 _log = logging.getLogger(__name__)
@@ -30,6 +36,43 @@ _PROCESSORS: tuple[tuple[str, str, Set[str]], ...] = (
 
 # The first bytes of a device's record (`struct _cl_device_id`); in PoCL 3.0 the name's address is at 640.
 _RECORD = 1536
+
+
+def find_cache() -> None:
+    """Have compiled kernels kept among temporary files where there is no home that can be written.
+
+    To be called before OpenCL's drivers are loaded. Sets XDG_CACHE_HOME, which PoCL and pyopencl ask.
+    """
+    if sys.platform != "linux":
+        return
+    own = _own_cache()
+    if own is None:
+        with suppress(OSError):  # that there is no device is told where one is asked for
+            os.environ["XDG_CACHE_HOME"] = str(_private_folder())
+    elif "HOME" not in os.environ:  # PoCL would take a folder that all users share, or cannot
+        os.environ["XDG_CACHE_HOME"] = str(own)
+
+
+def _own_cache() -> Path | None:
+    """The user's folder for caches, which may have to be made; None: it cannot be written."""
+    try:
+        folder = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+        there = folder.absolute()
+        while not there.exists():
+            there = there.parent
+    except (OSError, RuntimeError):  # it must not be looked at, or the system does not know the user
+        return None
+    return folder if there.is_dir() and os.access(there, os.W_OK | os.X_OK) else None
+
+
+def _private_folder() -> Path:
+    """One among temporary files, the same each time. Raises OSError."""
+    folder = Path(tempfile.gettempdir(), f"hugin-abflow-cache-{os.getuid()}")
+    folder.mkdir(mode=0o700, exist_ok=True)
+    found = folder.lstat()
+    if not stat.S_ISDIR(found.st_mode) or found.st_uid != os.getuid() or found.st_mode & 0o022:
+        raise PermissionError(f"others may write {folder}")  # programs of others are not to be run
+    return folder
 
 
 def name_processor(version: str, record: int) -> None:

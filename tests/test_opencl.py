@@ -132,13 +132,15 @@ def shelf(monkeypatch: pytest.MonkeyPatch) -> list[SimpleNamespace]:
     return devices
 
 
-@pytest.mark.parametrize("names", [[], ["POCL_DEVICES"], ["OCL_ICD_VENDORS", "POCL_DEVICES"]])
+@pytest.mark.parametrize(
+    "names", [[], ["POCL_DEVICES"], ["OCL_ICD_VENDORS", "POCL_DEVICES", "POCL_CACHE_DIR"]]
+)
 def test_environment_that_may_hide_devices_is_named(
     monkeypatch: pytest.MonkeyPatch, names: list[str]
 ) -> None:
     """Those variables that are set, with their values, beside what to install."""
     monkeypatch.setattr(cl, "get_platforms", lambda: [])
-    for name in ("OCL_ICD_VENDORS", "POCL_DEVICES"):
+    for name in ("OCL_ICD_VENDORS", "POCL_DEVICES", "POCL_CACHE_DIR"):
         monkeypatch.delenv(name, raising=False)
     for name in names:
         monkeypatch.setenv(name, f"/wrong/{name.lower()}")
@@ -150,16 +152,16 @@ def test_environment_that_may_hide_devices_is_named(
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="other systems have other loaders")
-@pytest.mark.parametrize("name", ["OCL_ICD_VENDORS", "POCL_DEVICES"])
+@pytest.mark.parametrize("name", ["OCL_ICD_VENDORS", "POCL_DEVICES", "POCL_CACHE_DIR"])
 def test_environment_that_hides_devices_is_named_by_the_program(name: str) -> None:
     """These variables really do what the message says; they are read when OpenCL is loaded."""
     if "Portable" not in Device().device.platform.name:
         pytest.skip("another driver may take no notice")  # POCL_DEVICES is PoCL's own
     command = [sys.executable, "-m", "hugin_abflow", "--list-devices"]
-    environment = os.environ | {name: "/nowhere"}
+    environment = os.environ | {name: "/dev/null/none"}
     done = subprocess.run(command, capture_output=True, text=True, env=environment, check=False)
     assert done.returncode == ExitCode.DEVICE
-    assert f"{name} is '/nowhere'" in done.stderr and done.stdout == ""
+    assert f"{name} is '/dev/null/none'" in done.stderr and done.stdout == ""
 
 
 def test_default_is_the_fastest_gpu(shelf: list[SimpleNamespace]) -> None:

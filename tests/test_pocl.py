@@ -1,4 +1,4 @@
-"""PoCL compiles on processors that its compiler does not know."""
+"""PoCL compiles on processors that its compiler does not know, and where no home can be written."""
 
 from __future__ import annotations
 
@@ -16,6 +16,7 @@ from hugin_abflow.opencl import Device
 
 NAMELESS = "OpenCL 3.0 PoCL HSTR: pthread-x86_64-unknown-linux-gnu-generic"
 HERE = sys.platform == "linux" and platform.machine() == "x86_64"
+only_linux = pytest.mark.skipif(sys.platform != "linux", reason="caches are elsewhere on other systems")
 only_here = pytest.mark.skipif(not HERE, reason="other compilers know a processor without a name")
 
 AVX2 = {"sse2", "sse4_2", "popcnt", "avx", "avx2", "fma", "f16c", "bmi1", "bmi2", "abm", "movbe"}
@@ -126,3 +127,86 @@ def test_a_nameless_processor_builds(device: Device, tmp_path: Path) -> None:
     )
     assert done.returncode == 0, done.stderr
     assert "pyramid_" in done.stdout
+
+
+@pytest.fixture
+def nobody(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
+    """A user whose home is no folder; returns where temporary files are."""
+    (tmp_path / "home").touch()
+    (tmp_path / "temporary").mkdir()
+    monkeypatch.setenv("HOME", str(tmp_path / "home"))
+    monkeypatch.setenv("XDG_CACHE_HOME", "")  # and so put back what it was
+    monkeypatch.delenv("XDG_CACHE_HOME")
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path / "temporary"))
+    return tmp_path / "temporary"
+
+
+@only_linux
+@pytest.mark.parametrize("name", ["HOME", "XDG_CACHE_HOME"])
+def test_a_cache_that_can_be_written_stays(
+    monkeypatch: pytest.MonkeyPatch, nobody: Path, name: str, tmp_path: Path
+) -> None:
+    monkeypatch.setenv(name, str(tmp_path / "to be made"))
+    before = dict(os.environ)
+    pocl.find_cache()
+    assert dict(os.environ) == before
+    assert not list(nobody.iterdir())
+
+
+@only_linux
+def test_without_a_home_the_cache_is_ones_own(nobody: Path) -> None:
+    for _ in range(2):  # the second run finds the first one's
+        os.environ.pop("XDG_CACHE_HOME", None)
+        pocl.find_cache()
+        (cache,) = nobody.iterdir()
+        assert os.environ["XDG_CACHE_HOME"] == str(cache)
+        assert cache.stat().st_mode & 0o777 == 0o700
+
+
+@only_linux
+def test_a_home_that_is_not_named_is_looked_up(monkeypatch: pytest.MonkeyPatch, nobody: Path) -> None:
+    """PoCL alone would take a folder that belongs to whoever came first."""
+    monkeypatch.delenv("HOME")
+    monkeypatch.setattr(Path, "home", lambda: nobody)
+    pocl.find_cache()
+    assert os.environ["XDG_CACHE_HOME"] == f"{nobody}/.cache"
+    monkeypatch.delenv("XDG_CACHE_HOME")
+
+    def unknown() -> Path:
+        raise RuntimeError("Could not determine home directory.")
+
+    monkeypatch.setattr(Path, "home", unknown)
+    pocl.find_cache()
+    assert Path(os.environ["XDG_CACHE_HOME"]).parent == nobody
+
+
+@only_linux
+def test_programs_of_others_are_not_run(nobody: Path) -> None:
+    pocl.find_cache()
+    (cache,) = nobody.iterdir()
+    for spoil in (lambda: cache.chmod(0o777), lambda: (cache.rmdir(), cache.symlink_to(nobody))):
+        os.environ.pop("XDG_CACHE_HOME", None)
+        spoil()
+        pocl.find_cache()
+        assert "XDG_CACHE_HOME" not in os.environ
+
+
+_HOMELESS_RUN = """
+from hugin_abflow.opencl import Device
+
+device = Device()
+print(sorted(device.build("pyramid")), device.zeros((2, 3)).get().sum())
+"""
+
+
+@only_linux
+def test_kernels_are_built_without_a_home(nobody: Path) -> None:
+    done = subprocess.run(
+        [sys.executable, "-c", _HOMELESS_RUN],
+        env={**os.environ, "TMPDIR": str(nobody)},
+        capture_output=True,
+        text=True,
+    )
+    assert done.returncode == 0, done.stderr
+    assert "pyramid_" in done.stdout
+    assert not done.stderr
