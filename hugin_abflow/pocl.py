@@ -5,7 +5,8 @@ older it may say "generic", which its own compiler then refuses: no program buil
 So does PoCL 3.0 of PyPI, with LLVM 14, on AMD's Zen 5. The device is given the name of an older processor.
 
 **A home that cannot be written**, as in containers and of services. PoCL keeps what it compiled there, and
-offers no device if it cannot; pyopencl fails as well. They are given a folder among temporary files.
+offers no device if it cannot; pyopencl fails as well. On a full disk, or one that no program may be run from,
+it ends the process. They are given a folder among temporary files.
 """
 
 from __future__ import annotations
@@ -17,7 +18,6 @@ import platform
 import stat
 import struct
 import sys
-import tempfile
 from collections.abc import Set
 from contextlib import suppress
 from pathlib import Path
@@ -34,45 +34,58 @@ _PROCESSORS: tuple[tuple[str, str, Set[str]], ...] = (
     ("avx2", "haswell", {"sse4_2", "popcnt", "fma", "f16c", "bmi1", "bmi2", "abm", "movbe"}),
 )
 
+# Where temporary files may be, beside where TMPDIR says.
+_PLACES = ("/tmp", "/var/tmp")
+
+# Compiled kernels take several MiB for each depth and number of channels.
+_LEAST_ROOM = 32 << 20
+
 # The first bytes of a device's record (`struct _cl_device_id`); in PoCL 3.0 the name's address is at 640.
 _RECORD = 1536
 
 
 def find_cache() -> None:
-    """Have compiled kernels kept among temporary files where there is no home that can be written.
+    """Have compiled kernels kept among temporary files where there is no home that can hold them.
 
     To be called before OpenCL's drivers are loaded. Sets XDG_CACHE_HOME, which PoCL and pyopencl ask.
     """
     if sys.platform != "linux":
         return
-    own = _own_cache()
-    if own is None:
-        with suppress(OSError):  # that there is no device is told where one is asked for
-            os.environ["XDG_CACHE_HOME"] = str(_private_folder())
-    elif "HOME" not in os.environ:  # PoCL would take a folder that all users share, or cannot
-        os.environ["XDG_CACHE_HOME"] = str(own)
-
-
-def _own_cache() -> Path | None:
-    """The user's folder for caches, which may have to be made; None: it cannot be written."""
     try:
-        folder = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+        own = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+    except RuntimeError:  # the system does not know the user
+        own = None
+    if own and _holds_programs(own):
+        if "HOME" not in os.environ:  # PoCL would take a folder that all users share, or cannot
+            os.environ["XDG_CACHE_HOME"] = str(own)
+        return
+    for place in (os.environ.get("TMPDIR") or _PLACES[0], *_PLACES):
+        folder = Path(place, f"hugin-abflow-cache-{os.getuid()}")
+        if _holds_programs(folder) and _make_private(folder):
+            os.environ["XDG_CACHE_HOME"] = str(folder)
+            return
+
+
+def _holds_programs(folder: Path) -> bool:
+    """Whether programs can be written to a folder, which may have to be made itself, and run from there."""
+    try:
         there = folder.absolute()
         while not there.exists():
             there = there.parent
-    except (OSError, RuntimeError):  # it must not be looked at, or the system does not know the user
-        return None
-    return folder if there.is_dir() and os.access(there, os.W_OK | os.X_OK) else None
+        system = os.statvfs(there)
+    except OSError:  # it must not even be looked at
+        return False
+    room = system.f_bavail * system.f_frsize >= _LEAST_ROOM and not system.f_flag & os.ST_NOEXEC
+    return room and there.is_dir() and os.access(there, os.W_OK | os.X_OK)
 
 
-def _private_folder() -> Path:
-    """One among temporary files, the same each time. Raises OSError."""
-    folder = Path(tempfile.gettempdir(), f"hugin-abflow-cache-{os.getuid()}")
-    folder.mkdir(mode=0o700, exist_ok=True)
-    found = folder.lstat()
-    if not stat.S_ISDIR(found.st_mode) or found.st_uid != os.getuid() or found.st_mode & 0o022:
-        raise PermissionError(f"others may write {folder}")  # programs of others are not to be run
-    return folder
+def _make_private(folder: Path) -> bool:
+    """Make a folder in which nobody else may write, if it is not there; returns whether it is such now."""
+    with suppress(OSError):
+        folder.mkdir(mode=0o700, exist_ok=True)
+        found = folder.lstat()
+        return stat.S_ISDIR(found.st_mode) and found.st_uid == os.getuid() and not found.st_mode & 0o022
+    return False
 
 
 def name_processor(version: str, record: int) -> None:

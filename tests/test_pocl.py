@@ -8,6 +8,7 @@ import platform
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
@@ -137,7 +138,7 @@ def nobody(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
     monkeypatch.setenv("HOME", str(tmp_path / "home"))
     monkeypatch.setenv("XDG_CACHE_HOME", "")  # and so put back what it was
     monkeypatch.delenv("XDG_CACHE_HOME")
-    monkeypatch.setattr("tempfile.tempdir", str(tmp_path / "temporary"))
+    monkeypatch.setenv("TMPDIR", str(tmp_path / "temporary"))
     return tmp_path / "temporary"
 
 
@@ -181,7 +182,8 @@ def test_a_home_that_is_not_named_is_looked_up(monkeypatch: pytest.MonkeyPatch, 
 
 
 @only_linux
-def test_programs_of_others_are_not_run(nobody: Path) -> None:
+def test_programs_of_others_are_not_run(monkeypatch: pytest.MonkeyPatch, nobody: Path) -> None:
+    monkeypatch.setattr(pocl, "_PLACES", (str(nobody),))
     pocl.find_cache()
     (cache,) = nobody.iterdir()
     for spoil in (lambda: cache.chmod(0o777), lambda: (cache.rmdir(), cache.symlink_to(nobody))):
@@ -189,6 +191,23 @@ def test_programs_of_others_are_not_run(nobody: Path) -> None:
         spoil()
         pocl.find_cache()
         assert "XDG_CACHE_HOME" not in os.environ
+
+
+@only_linux
+@pytest.mark.parametrize("fault", [{"f_bavail": 1}, {"f_flag": getattr(os, "ST_NOEXEC", 0)}])
+def test_disks_that_hold_no_programs_are_passed_over(
+    monkeypatch: pytest.MonkeyPatch, nobody: Path, fault: dict[str, int]
+) -> None:
+    """Full ones, and those from which none may be run."""
+    home, good = nobody / "home", {"f_bavail": 1 << 20, "f_frsize": 4096, "f_flag": 0}
+    home.mkdir()
+    monkeypatch.setenv("HOME", str(home))
+    monkeypatch.setattr(
+        os, "statvfs", lambda path: SimpleNamespace(**good | (fault if home in (path, *path.parents) else {}))
+    )
+    pocl.find_cache()
+    assert Path(os.environ["XDG_CACHE_HOME"]).parent == nobody
+    assert not list(home.iterdir())
 
 
 _HOMELESS_RUN = """
@@ -203,7 +222,6 @@ print(sorted(device.build("pyramid")), device.zeros((2, 3)).get().sum())
 def test_kernels_are_built_without_a_home(nobody: Path) -> None:
     done = subprocess.run(
         [sys.executable, "-c", _HOMELESS_RUN],
-        env={**os.environ, "TMPDIR": str(nobody)},
         capture_output=True,
         text=True,
     )
