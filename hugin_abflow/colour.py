@@ -28,7 +28,6 @@ import scipy
 
 from hugin_abflow.coefficient import on_cells
 from hugin_abflow.geometry import Pair
-from hugin_abflow.layer import Layer
 from hugin_abflow.opencl import Buffer, Device
 from hugin_abflow.settings import Settings
 from hugin_abflow.working import Grid, WorkingLayer
@@ -116,9 +115,10 @@ def colour_grid(grid: Grid, covered: npt.NDArray[np.bool_]) -> Grid:
     return grid.coarser(max(_CELL, round(_CELL * depth / _DEEP)))
 
 
-def clipping(layer: Layer) -> float:
-    """The share of full scale above which a layer's samples may be clipped; floats never are."""
-    return _CLIPPED if layer.dtype.kind == "u" else math.inf
+def clipping(layer: WorkingLayer) -> tuple[float, ...]:
+    """The r, g, b above which a layer's samples may be clipped, and an unused 1; floats never are."""
+    share = _CLIPPED if layer.layer.dtype.kind == "u" else math.inf
+    return (*(share * white for white in layer.white), 1.0)
 
 
 def measure(
@@ -195,8 +195,8 @@ class _Overlap:
     cells: Grid
 
     @property
-    def _clipping(self) -> float:
-        return clipping(self.layers[self.pair.a].layer)
+    def _clipping(self) -> list[tuple[float, ...]]:
+        return [clipping(self.layers[k]) for k in (self.pair.a, self.pair.b)]
 
     @property
     def _sides(self) -> list[Any]:
@@ -211,7 +211,7 @@ class _Overlap:
         mixing = self.device.empty(self.cells.shape)
         self.device.run(
             "colour", "colour_difference", self.cells.border[:2],
-            *self._sides, shoulder, self._clipping, _SPREAD, values, beyond, mixing,
+            *self._sides, shoulder, *self._clipping, _SPREAD, values, beyond, mixing,
         )  # fmt: skip
         host = (v.get().astype(np.float64) for v in (values, beyond, mixing))
         return Difference(self.pair.a, self.pair.b, *host)
@@ -221,7 +221,7 @@ class _Overlap:
         misfit = self.device.empty((*self.cells.shape, 4))
         self.device.run(
             "colour", "colour_misfit", self.cells.border[:2],
-            *self._sides, _SHOULDERS, self._clipping, misfit,
+            *self._sides, _SHOULDERS, *self._clipping, misfit,
         )  # fmt: skip
         return misfit.get().astype(np.float64).reshape(-1, len(_SHOULDERS))
 

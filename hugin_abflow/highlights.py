@@ -45,7 +45,7 @@ def excess(
         found = device.empty(cells.shape)
         device.run(
             "highlights", "highlights_share", cells.border[:2], layer.pixels, layer.box, grid.border,
-            cells.border, _NEARLY, _SURELY, found,
+            cells.border, (*layer.white, 1.0), _NEARLY, _SURELY, found,
         )  # fmt: skip
         share[:] = found.get()
     inside = on_cells(masks.host, cells, np.logical_or)

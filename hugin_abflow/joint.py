@@ -31,6 +31,7 @@ from hugin_abflow import (
     memory,
     multiband,
     quality,
+    saturation,
     seam,
     single,
     transition,
@@ -147,6 +148,7 @@ def prepare(
     order = {id(layer): index for index, layer in enumerate(layers)}
     numbers = [order[id(one.layer)] for one in reduced]
     overlaps = _overlaps(device, reduced, masks)
+    reduced = saturation.found(device, reduced, [pair for pair, _ in overlaps])
     _check_memory(device, reduced, overlaps, masks, grid, settings)
     its_guides = by_pair(guides if settings.guides else ())
     flows, shifts, singles = (
@@ -183,7 +185,7 @@ def _making_ready(device: Device, first: Layer, settings: Settings) -> Iterator[
     where kernels are compiled for the first time; no process that is to end waits for all of it.
     """
     of_flow = ("chart", "pyramid", "flow", "search", "consistency", "transition") if settings.flow else ()
-    kernels = ("coefficient", *of_flow, "highlights", "geometry", "colour", "seam", "multiband")
+    kernels = ("coefficient", "saturation", *of_flow, "highlights", "geometry", "colour", "seam", "multiband")
     libraries = ("scipy.ndimage", "scipy.sparse.csgraph", "scipy.sparse.linalg")
     steps: list[Callable[[], object]] = [partial(device.build, name) for name in kernels]
     steps += [partial(importlib.import_module, name) for name in libraries]

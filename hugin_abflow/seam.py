@@ -98,7 +98,7 @@ def residuals(
     """What flow and exposure do not explain."""
     cells = seam_grid(grid)
     mean, square, told = np.zeros(cells.shape), np.zeros(cells.shape), np.zeros(cells.shape, bool)
-    clipped = clipping(layers[0].layer)
+    clipped = [clipping(layer) for layer in layers]
     for found in _differences(device, layers, fields, pairs, correction, grid, cells, clipped):
         share = found[..., 4:]
         smooth = _smooth(np.concatenate([found[..., :4] * share, share], -1), cells.wraps)
@@ -149,7 +149,8 @@ def divide(
     """Give each cell of every overlap of layers that are not aligned to one layer, as `cut` does."""
     cells = grid.coarser(_FINE_CELL)
     square = np.zeros(cells.shape)
-    for found in _differences(device, layers, fields, pairs, correction, grid, cells, math.inf):
+    all_tells = [(math.inf,) * 4] * len(layers)
+    for found in _differences(device, layers, fields, pairs, correction, grid, cells, all_tells):
         square = np.maximum(square, np.where(found[..., 4] > 0, _SHORTER + found[..., 3], 0))
     whole = square > 0
     owner = _owners(layers, fields, Residuals(square, square), whole, masks, grid, cells, _FINE_CUT)
@@ -235,7 +236,7 @@ def _differences(
     correction: Correction,
     grid: Grid,
     cells: Grid,
-    clipped: float,
+    clipped: Sequence[tuple[float, ...]],
 ) -> Iterator[npt.NDArray[np.float64]]:
     """Of each two corrected layers, (height, width, 5): per cell the mean of their difference in r, g, b and
     the largest mean square of these, where neither is brighter than `clipped`, and the share of the pixels
@@ -250,7 +251,8 @@ def _differences(
             sides += [layers[k].pixels, fields[k], layers[k].box, correction.gains[k] or none]
         device.run(
             "seam", "seam_difference", cells.border[:2], *sides, grid.border, grid.lens,
-            correction.grid.border, cells.border, correction.shoulder, clipped, difference, square,
+            correction.grid.border, cells.border, correction.shoulder, clipped[pair.a], clipped[pair.b],
+            difference, square,
         )  # fmt: skip
         return difference, square
 

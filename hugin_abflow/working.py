@@ -126,12 +126,14 @@ class WorkingLayer:
 
     box         (left, top, width, height) on the grid.
     checksum    of the stored pixels: tells layers of one size and place apart.
+    white       r, g, b of what is clipped, of full scale.
     """
 
     layer: Layer
     box: tuple[int, int, int, int]
     pixels: Buffer
     checksum: int
+    white: tuple[float, float, float] = (1.0, 1.0, 1.0)
 
 
 def full_grid(canvas: Canvas, layers: Sequence[Layer]) -> Grid:

@@ -1,7 +1,7 @@
 /* How two aligned layers differ in exposure and colour, per cell of a coarse colour grid. */
 
-static inline bool colour_clips(float4 c, float clipped) {
-    return c.x > clipped || c.y > clipped || c.z > clipped;
+static inline bool colour_clips(float4 c, float4 clipped) {
+    return c.x > clipped.x || c.y > clipped.y || c.z > clipped.z;
 }
 
 /* Mean difference a - b on the exposure scale over the pixels of a cell (every second one in x and y) that both
@@ -13,7 +13,7 @@ __kernel void colour_difference(__global const float4 *layer_a, __global const f
                                 int4 border, float4 lens,   /* working grid */
                                 int4 cells,                 /* colour grid, run size */
                                 float shoulder,             /* of the exposure scale */
-                                float clipped,              /* brighter samples may have been any brighter */
+                                float4 clipped_a, float4 clipped_b, /* brighter samples may have been any brighter */
                                 float spread,               /* disagreement that halves the trust */
                                 __global float4 *difference, /* (cells.y, cells.x): r, g, b, weight 0..1 */
                                 __global float4 *beyond,     /* the same; weight > 0: a is clipped, < 0: b */
@@ -36,7 +36,7 @@ __kernel void colour_difference(__global const float4 *layer_a, __global const f
             const float t = field_b[box_index((int2)(x, y), box_b)].w;
             mixed += 4.0f * s * t / GREATEST((s + t) * (s + t), 1e-20f);
             const float3 d = exposure_scale(a.xyz, shoulder) - exposure_scale(b.xyz, shoulder);
-            const bool clips_a = colour_clips(a, clipped), clips_b = colour_clips(b, clipped);
+            const bool clips_a = colour_clips(a, clipped_a), clips_b = colour_clips(b, clipped_b);
             if (clips_a && !clips_b) {
                 more += d;
                 above += 1.0f;
@@ -72,7 +72,7 @@ __kernel void colour_misfit(__global const float4 *layer_a, __global const float
                             int4 border, float4 lens,  /* working grid */
                             int4 cells,                /* colour grid, run size */
                             float4 shoulders,
-                            float clipped,             /* brighter samples are not used */
+                            float4 clipped_a, float4 clipped_b, /* brighter samples are not used */
                             __global float4 *misfit)   /* (cells.y, cells.x), for each shoulder */
 {
     const int cx = get_global_id(0), cy = get_global_id(1);
@@ -89,7 +89,7 @@ __kernel void colour_misfit(__global const float4 *layer_a, __global const float
             tried += 1.0f;
             float4 a, b;
             if (!layer_pair(layer_a, field_a, box_a, layer_b, field_b, box_b, (int2)(x, y), border, lens, &a, &b) ||
-                colour_clips(a, clipped) || colour_clips(b, clipped))
+                colour_clips(a, clipped_a) || colour_clips(b, clipped_b))
                 continue;
             const float p[3] = {a.x, a.y, a.z}, q[3] = {b.x, b.y, b.z};
             for (int k = 0; k < 3; ++k) {

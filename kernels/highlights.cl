@@ -5,7 +5,8 @@
 __kernel void highlights_share(__global const float4 *layer, /* (box.w, box.z) r, g, b, valid */
                                int4 box,                     /* place on the working grid */
                                int4 border, int4 cells,      /* working grid; transition grid, run size */
-                               float nearly, float surely,   /* of the brightest channel */
+                               float4 white,                 /* what the layer shows white, r, g, b */
+                               float nearly, float surely,   /* of that, in the brightest channel */
                                __global float *share)        /* (cells.y, cells.x) */
 {
     const int cx = get_global_id(0), cy = get_global_id(1);
@@ -18,7 +19,7 @@ __kernel void highlights_share(__global const float4 *layer, /* (box.w, box.z) r
     float sum = 0.0f, n = 0.0f;
     for (int y = top; y < bottom; ++y)
         for (int x = left; x < right; ++x) {
-            const float4 c = layer[y * box.z + x];
+            const float4 c = layer[y * box.z + x] / white;
             const float brightest = GREATEST(c.x, GREATEST(c.y, c.z));
             const float valid = c.w > 0.0f ? 1.0f : 0.0f;
             sum += valid * LIMITED((brightest - nearly) / (surely - nearly), 0.0f, 1.0f);

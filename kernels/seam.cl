@@ -16,7 +16,7 @@ __kernel void seam_difference(__global const float4 *layer_a, __global const flo
                               int4 border, float4 lens,    /* working grid */
                               int4 colours, int4 cells,    /* grid of the gains; seam grid, run size */
                               float shoulder,              /* of the exposure scale */
-                              float clipped,               /* brighter samples are not used */
+                              float4 clipped_a, float4 clipped_b, /* brighter samples are not used */
                               __global float4 *difference, /* (cells.y, cells.x): r, g, b, share */
                               __global float *square)      /* (cells.y, cells.x) */
 {
@@ -34,7 +34,7 @@ __kernel void seam_difference(__global const float4 *layer_a, __global const flo
             tried += 1.0f;
             float4 a, b;
             if (!layer_pair(layer_a, field_a, box_a, layer_b, field_b, box_b, (int2)(x, y), border, lens, &a, &b) ||
-                any(a.xyz > clipped) || any(b.xyz > clipped))
+                any(a.xyz > clipped_a.xyz) || any(b.xyz > clipped_b.xyz))
                 continue;
             const float3 d = seam_look(a.xyz, gain_a[g].xyz, shoulder) - seam_look(b.xyz, gain_b[g].xyz, shoulder);
             sum += d;

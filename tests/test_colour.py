@@ -21,7 +21,7 @@ from hugin_abflow.opencl import Device
 from hugin_abflow.settings import Settings
 from hugin_abflow.working import Grid, WorkingLayer
 
-CLIPPED, SPREAD = 0.9, 0.15
+CLIPPED, NEVER, SPREAD = ((0.93, 0.9, 0.95, 1.0), (0.9, 0.95, 0.92, 1.0)), ((1e30,) * 4,) * 2, 0.15
 
 
 def smooth_layer(seed: int, width: int, height: int, share: float = 0.85) -> np.ndarray:
@@ -66,13 +66,13 @@ def test_difference_equals_its_twin(device: Device, name: str, shoulder: float, 
     grid = GRIDS[name]
     cells = grid.resized(7, 3)
     sides = two_sides(name, lamps)
-    clipped = CLIPPED if shoulder else 1e30
+    clipped = CLIPPED if shoulder else NEVER
     results = [device.empty((3, 7, 4)), device.empty((3, 7, 4)), device.empty((3, 7))]
     device.run(
         "colour", "colour_difference", (7, 3), *uploaded(device, sides),
-        grid.border, grid.lens, cells.border, shoulder, clipped, SPREAD, *results,
+        grid.border, grid.lens, cells.border, shoulder, *clipped, SPREAD, *results,
     )  # fmt: skip
-    expected = colour_difference(*sides, grid.border, grid.lens, cells.border, shoulder, clipped, SPREAD)
+    expected = colour_difference(*sides, grid.border, grid.lens, cells.border, shoulder, *clipped, SPREAD)
     if lamps:
         assert set(np.sign(expected[1][..., 3]).ravel()) >= {-1, 1}
     else:
@@ -92,9 +92,9 @@ def test_misfit_equals_its_twin(device: Device, name: str) -> None:
     result = device.empty((3, 7, 4))
     device.run(
         "colour", "colour_misfit", (7, 3), *uploaded(device, sides),
-        grid.border, grid.lens, cells.border, shoulders, CLIPPED, result,
+        grid.border, grid.lens, cells.border, shoulders, *CLIPPED, result,
     )  # fmt: skip
-    expected = colour_misfit(*sides, grid.border, grid.lens, cells.border, shoulders, CLIPPED)
+    expected = colour_misfit(*sides, grid.border, grid.lens, cells.border, shoulders, *CLIPPED)
     assert (expected > 1e-3).mean() > 0.4
     assert_close(result.get(), expected, 10 * POSITION, decisions=0.1)
 
@@ -109,7 +109,7 @@ def test_twin_of_misfit_knows_the_scale(shoulder: float) -> None:
     b[..., :3] = common.exposure_shift(a[..., :3], np.array([0.4, 0.2, 0.3]), shoulder)
     still, box, shoulders = np.zeros_like(a), (0, 0, 77, 53), (1.0, 0.75, 0.5, 0.25)
     sides = [a, still, box, b, still, box]
-    misfit = colour_misfit(*sides, grid.border, grid.lens, (7, 3, 0, 0), shoulders, 9).sum((0, 1))
+    misfit = colour_misfit(*sides, grid.border, grid.lens, (7, 3, 0, 0), shoulders, *NEVER).sum((0, 1))
     right = shoulders.index(shoulder)
     assert misfit[right] < 1e-9
     assert (np.delete(misfit, right) > 1e-4).all()
@@ -138,7 +138,7 @@ def test_twin_of_difference_measures_a_gain(shoulder: float) -> None:
     still = np.zeros_like(a)
     box = (0, 0, 77, 53)
     result, *_ = colour_difference(
-        a, still, box, b, still, box, grid.border, grid.lens, (7, 3, 0, 0), shoulder, 9, SPREAD
+        a, still, box, b, still, box, grid.border, grid.lens, (7, 3, 0, 0), shoulder, *NEVER, SPREAD
     )
     known = result[..., 3] > 0
     assert known.mean() > 0.8

@@ -21,6 +21,8 @@ __all__ = ["one_device"]
 
 # The kernels
 
+WHITE = (1.0, 0.95, 1.2, 1.0)
+
 
 @pytest.mark.parametrize("name", list(GRIDS))
 def test_share_equals_its_twin(device: Device, name: str) -> None:
@@ -32,10 +34,10 @@ def test_share_equals_its_twin(device: Device, name: str) -> None:
     layer[..., :3] *= patches(2, box[2], box[3], 0.4, 9)[..., None]
     share = device.empty((7, 10))
     device.run(
-        "highlights", "highlights_share", (10, 7), device.upload(layer), box, grid.border, cells, 0.6, 0.9,
-        share,
+        "highlights", "highlights_share", (10, 7), device.upload(layer), box, grid.border, cells, WHITE,
+        0.6, 0.9, share,
     )  # fmt: skip
-    expected = highlights_share(layer, box, grid.border, cells, 0.6, 0.9)
+    expected = highlights_share(layer, box, grid.border, cells, WHITE, 0.6, 0.9)
     assert (expected > 0).mean() > 0.3
     assert (expected < 1).all()
     assert_close(share.get(), expected, 10 * SUM)

@@ -46,8 +46,8 @@ def test_twin_of_yield_reads_scipys_zoom() -> None:
 
 @pytest.mark.parametrize("name", list(GRIDS))
 @pytest.mark.parametrize("shoulder", [0.0, 0.5, 1.0])
-@pytest.mark.parametrize("clipped", [0.8, math.inf])
-def test_difference_equals_its_twin(device: Device, name: str, shoulder: float, clipped: float) -> None:
+@pytest.mark.parametrize("clipped", [((0.8, 0.85, 0.9, 1.0), (0.85, 0.8, 0.75, 1.0)), ((math.inf,) * 4,) * 2])
+def test_difference_equals_its_twin(device: Device, name: str, shoulder: float, clipped: tuple) -> None:
     grid = GRIDS[name]
     cells, colours = grid.resized(10, 7).border, grid.resized(5, 3).border
     sides: list = []
@@ -63,9 +63,9 @@ def test_difference_equals_its_twin(device: Device, name: str, shoulder: float, 
     uploaded = [device.upload(one) if isinstance(one, np.ndarray) else one for one in sides]
     device.run(
         "seam", "seam_difference", (10, 7), *uploaded, grid.border, grid.lens, colours, cells, shoulder,
-        clipped, out, square,
+        *clipped, out, square,
     )  # fmt: skip
-    expected, squares = seam_difference(*sides, grid.border, grid.lens, colours, cells, shoulder, clipped)
+    expected, squares = seam_difference(*sides, grid.border, grid.lens, colours, cells, shoulder, *clipped)
     assert (expected[..., 3] > 0).mean() > 0.4
     assert (squares > 1.5 * np.square(expected[..., :3]).max(-1)).any()
     # a pixel more or less at a mask's rim is one of some ten of a cell
@@ -206,7 +206,7 @@ def test_a_cell_of_which_little_is_seen_tells_as_much_less(monkeypatch: pytest.M
     found[4, 6] = 0.5, -0.6, 0.1, 0.4, 0.1
     found[4, 7] = 0
     monkeypatch.setattr(seam, "_differences", lambda *_: [found])
-    layers = [SimpleNamespace(layer=SimpleNamespace(dtype=np.dtype(np.uint8)))] * 2
+    layers = [SimpleNamespace(layer=SimpleNamespace(dtype=np.dtype(np.uint8)), white=(1.0, 1.0, 1.0))] * 2
     residual = seam.residuals(None, layers, [], [seam.Pair(0, 1)], None, plane(96, 72))
     y, x = np.mgrid[0:9, 0:12]
     weight = np.exp(-0.5 * ((y - 4) ** 2 + (x - 6) ** 2)) * found[..., 4]
@@ -222,9 +222,11 @@ def test_a_cell_is_told_of_by_any_pair(monkeypatch: pytest.MonkeyPatch) -> None:
     found[0, :, :5, 4], found[1, 3, 3:, 4] = 0.2, 1
     asked = []
     monkeypatch.setattr(seam, "_differences", lambda *given: asked.append(given[-1]) or iter(found))
-    layers = [SimpleNamespace(layer=SimpleNamespace(dtype=np.dtype(np.uint8)))] * 2
+    layers = [SimpleNamespace(layer=SimpleNamespace(dtype=np.dtype(np.uint8)), white=(1.0, 1.0, 1.0))] * 2
     residual = seam.residuals(None, layers, [], [seam.Pair(0, 1)] * 2, None, plane(96, 72))
-    assert np.array_equal(residual.told, (found[..., 4] > 0).any(0)) and asked == [0.98]
+    assert np.array_equal(residual.told, (found[..., 4] > 0).any(0)) and asked == [
+        [(0.98, 0.98, 0.98, 1.0)] * 2
+    ]
 
 
 # Regions

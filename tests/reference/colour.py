@@ -24,18 +24,17 @@ def colour_difference(
     lens: Numbers,
     cells: Sequence[int],
     shoulder: float,
-    clipped: float,
+    clipped_a: Numbers,
+    clipped_b: Numbers,
     spread: float,
 ) -> tuple[Array, Array, Array]:
     """Mean difference a - b of every cell's pixels, every other one in x and y, and its weight; the same of
     those that one layer shows clipped, where these are most; and how far both layers are seen.
     """
-    a, b, clips_a, clips_b, known = _seen(
-        (layer_a, field_a, box_a), (layer_b, field_b, box_b), border, lens, clipped
-    )
+    sides = ((layer_a, field_a, box_a), (layer_b, field_b, box_b))
+    a, b, clips_a, clips_b, known = _seen(*sides, border, lens, clipped_a, clipped_b)
     columns, rows = pixels(border[0], border[1])
-    sides = ((field_a, box_a), (field_b, box_b))
-    s, t = (take(field, box, columns, rows)[..., 3].astype(np.float64) for field, box in sides)
+    s, t = (take(field, box, columns, rows)[..., 3].astype(np.float64) for _, field, box in sides)
     mixed = np.where(known, 4 * s * t / np.maximum((s + t) ** 2, 1e-20), 0)
     mixing = np.zeros((cells[1], cells[0]))
     difference = exposure_scale(a, shoulder) - exposure_scale(b, shoulder)
@@ -64,12 +63,12 @@ def colour_misfit(
     lens: Numbers,
     cells: Sequence[int],
     shoulders: Numbers,
-    clipped: float,
+    clipped_a: Numbers,
+    clipped_b: Numbers,
 ) -> Array:
     """What the best gain of a cell leaves of the difference, by weighted least squares on each scale."""
-    a, b, clips_a, clips_b, known = _seen(
-        (layer_a, field_a, box_a), (layer_b, field_b, box_b), border, lens, clipped
-    )
+    sides = ((layer_a, field_a, box_a), (layer_b, field_b, box_b))
+    a, b, clips_a, clips_b, known = _seen(*sides, border, lens, clipped_a, clipped_b)
     a, b = np.maximum(a, EXPOSURE_FLOOR), np.maximum(b, EXPOSURE_FLOOR)
     result = np.zeros((cells[1], cells[0], len(shoulders)))
     for place, part in _parts(border, cells, 4):
@@ -87,12 +86,19 @@ def colour_misfit(
 
 
 def _seen(
-    side_a: Side, side_b: Side, border: Sequence[int], lens: Numbers, clipped: float
+    side_a: Side,
+    side_b: Side,
+    border: Sequence[int],
+    lens: Numbers,
+    clipped_a: Numbers,
+    clipped_b: Numbers,
 ) -> tuple[Array, Array, Array, Array, Array]:
     """Colours of both aligned layers, where each is clipped, and where both are."""
     columns, rows = pixels(border[0], border[1])
     a, b = (layer_seen(*side, columns, rows, border, lens) for side in (side_a, side_b))
-    clips = (one[..., :3].max(-1) > clipped for one in (a, b))
+    clips = (
+        (one[..., :3] > np.float32(limit)[:3]).any(-1) for one, limit in ((a, clipped_a), (b, clipped_b))
+    )
     return a[..., :3], b[..., :3], *clips, (a[..., 3] > 0) & (b[..., 3] > 0)
 
 

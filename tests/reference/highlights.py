@@ -14,13 +14,14 @@ def highlights_share(
     box: Sequence[int],
     border: Sequence[int],
     cells: Sequence[int],
+    white: Sequence[float],
     nearly: float,
     surely: float,
 ) -> Array:
     """Mean over each cell's valid pixels of how surely they are clipped; 0 where none is valid."""
     whole = np.zeros((border[1], border[0], 4))
     whole[box[1] : box[1] + box[3], box[0] : box[0] + box[2]] = layer
-    sure = np.clip((whole[..., :3].max(-1) - nearly) / (surely - nearly), 0, 1)
+    sure = np.clip(((whole / white)[..., :3].max(-1) - nearly) / (surely - nearly), 0, 1)
     result = np.zeros((cells[1], cells[0]))
     for y in range(cells[1]):
         for x in range(cells[0]):

@@ -23,10 +23,11 @@ def seam_difference(
     colours: Sequence[int],
     cells: Sequence[int],
     shoulder: float,
-    clipped: float,
+    clipped_a: Numbers,
+    clipped_b: Numbers,
 ) -> tuple[Array, Array]:
     """Mean corrected difference a - b of every cell's pixels, every other one in x and y, with their share,
-    and the largest channel's mean square; samples brighter than `clipped` are left out."""
+    and the largest channel's mean square; samples brighter than `clipped` of their layer are left out."""
     columns, rows = pixels(border[0], border[1])
     gain_row = (2 * np.arange(cells[1]) + 1) * colours[1] // (2 * cells[1])
     gain_column = (2 * np.arange(cells[0]) + 1) * colours[0] // (2 * cells[0])
@@ -36,9 +37,10 @@ def seam_difference(
     ]
     looks = []
     usable = np.ones((border[1], border[0]), bool)
-    for layer, field, box, gain in ((layer_a, field_a, box_a, gain_a), (layer_b, field_b, box_b, gain_b)):
+    sides = (layer_a, field_a, box_a, gain_a, clipped_a), (layer_b, field_b, box_b, gain_b, clipped_b)
+    for layer, field, box, gain, clipped in sides:
         seen = layer_seen(layer, field, box, columns, rows, border, lens)
-        usable &= (seen[..., 3] > 0) & (seen[..., :3] <= clipped).all(-1)
+        usable &= (seen[..., 3] > 0) & (seen[..., :3] <= np.float32(clipped)[:3]).all(-1)
         here = gain[gain_row[cell[1]][:, None], gain_column[cell[0]][None], :3].astype(np.float64)
         shifted = exposure_shift(seen[..., :3], here, shoulder)
         looks.append(shifted if shoulder else np.sqrt(np.maximum(shifted, 0)))

@@ -1,0 +1,134 @@
+"""What photos show white: what they do not show any brighter (kernels/saturation.cl).
+
+A photo is clipped at full scale. If its exposure was corrected afterwards, as nona does where Hugin has found
+exposures, what is clipped becomes some grey, and nothing in the layer is brighter. That grey is no colour: it
+tells nothing of exposure, and another photo that shows more of that place is the better one. A flat lamp in a
+dark photo looks the same; but another photo shows it, compared by their exposures, no brighter.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import numpy.typing as npt
+
+from hugin_abflow.geometry import Pair
+from hugin_abflow.opencl import Device
+from hugin_abflow.working import WorkingLayer
+
+Values = npt.NDArray[np.float32]
+White = tuple[float, float, float]
+
+# Working pixels from one that is looked at to the next, and the least number of them that tells something.
+_EVERY, _ENOUGH = 8, 30
+# Levels of 8 bits: white may be so far below the brightest, where that is overshoot; so far from white others
+# are to be fewer; and so near to it is white.
+_OVERSHOOT, _APART, _NEAR = 12, 6, 2.0
+# The least share of a layer that is white, how many times as many pixels as are a little darker, and what
+# part of them may be brighter.
+_SHARE, _DISTINCT, _BEYOND = 0.003, 3.0, 1 / 8
+# What is brighter than this, of full scale, is clipped as it is; what is darker than that is noise.
+_FULL, _DARK = 0.97, 0.02
+# By how much another photo has to show brighter what is clipped here, at least, and in how much of it.
+_BRIGHTER, _PART = 1.05, 0.03
+
+
+@dataclass(frozen=True)
+class _Picked:
+    """Some of a layer's pixels: place (left, top) among those of the grid, (height, width, 4)."""
+
+    left: int
+    top: int
+    pixels: Values
+
+
+def found(device: Device, layers: Sequence[WorkingLayer], pairs: Sequence[Pair]) -> list[WorkingLayer]:
+    """The same layers, with what they show white.
+
+    pairs       layers that overlap.
+    """
+    if not pairs or layers[0].layer.dtype.kind != "u":
+        return list(layers)
+    picked = [_pick(device, layer) for layer in layers]
+    whites = [_brightest(one.pixels) for one in picked]
+    result = list(layers)
+    for k, white in enumerate(whites):
+        if white is None:
+            continue
+        others = [pair.b if pair.a == k else pair.a for pair in pairs if k in (pair.a, pair.b)]
+        told = np.concatenate([_brighter(*_common(picked[k], picked[j]), white) for j in others])
+        if np.count_nonzero(told) >= max(_ENOUGH, _PART * told.size):
+            result[k] = replace(layers[k], white=white)
+    return result
+
+
+def _pick(device: Device, layer: WorkingLayer) -> _Picked:
+    """Every so many-th pixel of a layer."""
+    left, top, width, height = layer.box
+    first = -(-left // _EVERY), -(-top // _EVERY)
+    size = -(-(left + width) // _EVERY) - first[0], -(-(top + height) // _EVERY) - first[1]
+    pixels = device.empty((size[1], size[0], 4))
+    device.run(
+        "saturation", "saturation_pick", size, layer.pixels, layer.box, _EVERY, (*first, *size), pixels
+    )
+    return _Picked(*first, pixels.get())
+
+
+def _brightest(pixels: Values) -> White | None:
+    """The grey of which there is much and nothing beyond, where it is not full white; None: there is none."""
+    seen = pixels[pixels[..., 3] > 0][:, :3]
+    if len(seen) < _ENOUGH:
+        return None
+    white = [_spike(channel) for channel in seen.T]
+    if min(white) == 0 or min(white) > _FULL:
+        return None
+    return white[0], white[1], white[2]
+
+
+def _spike(values: Values) -> float:
+    """The brightness of which there are many values and none that are clearly brighter; 0: there is none."""
+    counts = np.bincount(np.rint(values * 255).astype(np.int64), minlength=256)
+    around = np.convolve(counts, (1, 1, 1), "same")
+    last = int(np.flatnonzero(counts[::-1].cumsum()[::-1] > _SHARE / 4 * values.size).max())
+    low = max(last - _OVERSHOOT, _APART)
+    level = low + int(np.argmax(around[low : last + 2]))
+    least = max(_SHARE * values.size, _DISTINCT * around[level - _APART])
+    if around[level] < least or counts[level + 2 :].sum() > _BEYOND * around[level]:
+        return 0.0
+    near = np.abs(values * 255 - level) < 1.5
+    return float(np.mean(values[near], dtype=np.float64))
+
+
+def _common(a: _Picked, b: _Picked) -> tuple[Values, Values]:
+    """Pixels (n, 3) that two layers have in common."""
+    left, top = max(a.left, b.left), max(a.top, b.top)
+    (height, width), (high, wide) = a.pixels.shape[:2], b.pixels.shape[:2]
+    right, bottom = min(a.left + width, b.left + wide), min(a.top + height, b.top + high)
+    if right <= left or bottom <= top:
+        return np.zeros((0, 3), np.float32), np.zeros((0, 3), np.float32)
+    of_a, of_b = (
+        one.pixels[top - one.top : bottom - one.top, left - one.left : right - one.left] for one in (a, b)
+    )
+    both = (of_a[..., 3] > 0) & (of_b[..., 3] > 0)
+    return of_a[both][:, :3], of_b[both][:, :3]
+
+
+def _brighter(values: Values, others: Values, white: White) -> npt.NDArray[np.bool_]:
+    """Whether the other layer shows it clearly brighter, for each pixel that is white here.
+
+    What is brightest in one layer is brightest in the other: sorted, they are compared without knowing where
+    things are, of which near ones have moved.
+    """
+    here = np.asarray(white, np.float32)
+    count = np.count_nonzero((values > here - _NEAR / 255).all(1))
+    rest = len(values) - count
+    if min(count, rest) < _ENOUGH:
+        return np.zeros(0, bool)
+    a, b = np.sort(values, axis=0), np.sort(others, axis=0)
+    middle = slice(rest // 10, rest - rest // 10)
+    ratios = np.maximum(b[middle], _DARK) / np.maximum(a[middle], _DARK)
+    low, exposure, high = np.quantile(ratios, (0.15, 0.5, 0.85), axis=0)
+    unsure = float(np.max((high - low) / exposure))
+    return np.asarray((b[rest:] / (exposure * here)).mean(1) > _BRIGHTER + unsure / 2)
