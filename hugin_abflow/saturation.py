@@ -55,9 +55,9 @@ def found(device: Device, layers: Sequence[WorkingLayer], pairs: Sequence[Pair])
     whites = [_brightest(one.pixels) for one in picked]
     result = list(layers)
     for k, white in enumerate(whites):
-        if white is None:
-            continue
         others = [pair.b if pair.a == k else pair.a for pair in pairs if k in (pair.a, pair.b)]
+        if white is None or not others:
+            continue
         told = np.concatenate([_brighter(*_common(picked[k], picked[j]), white) for j in others])
         if np.count_nonzero(told) >= max(_ENOUGH, _PART * told.size):
             result[k] = replace(layers[k], white=white)

@@ -102,8 +102,9 @@ def test_what_nobody_shows_brighter_is_not_white(device: Device) -> None:
     """Both photos are clipped alike; and one alone tells nothing."""
     clipped = photo(scene(), 1.5, 0.6)
     assert whites(device, clipped, clipped.copy(), shift=3) == [UNKNOWN] * 2
-    layers = [on_device(device, clipped)]
-    assert saturation.found(device, layers, []) == layers
+    for layers, pairs in (([clipped], []), ([clipped] * 3, [Pair(0, 2)])):
+        alone = [on_device(device, one) for one in layers]
+        assert saturation.found(device, alone, pairs) == alone
 
 
 def test_smooth_brightness_is_not_white(device: Device) -> None:
