@@ -1,8 +1,8 @@
 """What one photo shows clipped is taken from another that does not (kernels/highlights.cl).
 
-Where a photo runs into white, a darker one beside it still has structure. The softmax knows nothing of that.
-So a layer's colour weight falls with how much more of its surroundings it shows clipped than the layer that
-shows least so,
+Where a photo runs into white (saturation.py), a darker one beside it still has structure. The softmax knows
+nothing of that. So a layer's colour weight falls with how much more of its surroundings it shows clipped than
+the layer that shows least so,
 
     s_k <- s_k exp(-strength * e_k),    e_k = c_k - min_j c_j
 
