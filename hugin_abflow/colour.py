@@ -37,7 +37,7 @@ _CELL = 16
 # Layers that lie on each other, by their cubic mean: from here on cells grow with them, because the solution
 # takes time by cells^1.5 and layers^3.
 _DEEP = 4.0
-# Samples brighter than this, of full scale, may be clipped and measure nothing (integer images only).
+# Samples brighter than this, of what a layer shows white, may be clipped and measure nothing (integers only).
 _CLIPPED = 0.98
 # Standard deviation of the differences within a cell that halves its trust, on the exposure scale.
 _SPREAD = 0.3

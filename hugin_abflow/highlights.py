@@ -23,7 +23,7 @@ from hugin_abflow.settings import Settings
 from hugin_abflow.transition import transition_grid
 from hugin_abflow.working import Grid, WorkingLayer
 
-# A pixel's brightest channel, of full scale, from which on it may be clipped, and where it surely is.
+# A pixel's brightest channel, of white, from which on it may be clipped, and where it surely is.
 _NEARLY, _SURELY = 0.9, 0.98
 # The softmax's own weights span e^10: with as much, layers are mixed next to the border of the darker one.
 _STRENGTH = 10.0

@@ -148,7 +148,7 @@ def prepare(
     order = {id(layer): index for index, layer in enumerate(layers)}
     numbers = [order[id(one.layer)] for one in reduced]
     overlaps = _overlaps(device, reduced, masks)
-    reduced = saturation.found(device, reduced, [pair for pair, _ in overlaps])
+    reduced = saturation.with_whites(device, reduced, [pair for pair, _ in overlaps])
     _check_memory(device, reduced, overlaps, masks, grid, settings)
     its_guides = by_pair(guides if settings.guides else ())
     flows, shifts, singles = (

@@ -4,7 +4,7 @@
 older it may say "generic", which its own compiler then refuses: no program builds at all (PoCL's issue 1049).
 So does PoCL 3.0 of PyPI, with LLVM 14, on AMD's Zen 5. The device is given the name of an older processor.
 
-**A home that cannot be written**, as in containers and of services. PoCL keeps what it compiled there, and
+**A home that cannot be written**, as in containers, and of services. PoCL keeps what it compiled there, and
 offers no device if it cannot; pyopencl fails as well. On a full disk, or one that no program may be run from,
 it ends the process. They are given a folder among temporary files.
 """
@@ -34,6 +34,9 @@ _PROCESSORS: tuple[tuple[str, str, Set[str]], ...] = (
     ("avx2", "haswell", {"sse4_2", "popcnt", "fma", "f16c", "bmi1", "bmi2", "abm", "movbe"}),
 )
 
+# Where PoCL and pyopencl keep things, in a folder for caches.
+_CACHES = ("pocl/kcache", "pytools")
+
 # Where temporary files may be, beside where TMPDIR says.
 _PLACES = ("/tmp", "/var/tmp")
 
@@ -55,12 +58,12 @@ def find_cache() -> None:
         own = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
     except RuntimeError:  # the system does not know the user
         own = None
-    if own and _holds_programs(own):
+    if own and all(_holds_programs(own / name) for name in _CACHES):
         if "HOME" not in os.environ:  # PoCL would take a folder that all users share, or cannot
             os.environ["XDG_CACHE_HOME"] = str(own)
         return
     for place in (os.environ.get("TMPDIR") or _PLACES[0], *_PLACES):
-        folder = Path(place, f"hugin-abflow-cache-{os.getuid()}")
+        folder = Path(place, f"hugin-abflow-cache-{os.getuid()}").absolute()
         if _holds_programs(folder) and _make_private(folder):
             os.environ["XDG_CACHE_HOME"] = str(folder)
             return
@@ -70,13 +73,18 @@ def _holds_programs(folder: Path) -> bool:
     """Whether programs can be written to a folder, which may have to be made itself, and run from there."""
     try:
         there = folder.absolute()
-        while not there.exists():
+        while not there.exists() and not there.is_symlink():
             there = there.parent
         system = os.statvfs(there)
-    except OSError:  # it must not even be looked at
+    except OSError:  # it must not even be looked at, or leads nowhere
         return False
-    room = system.f_bavail * system.f_frsize >= _LEAST_ROOM and not system.f_flag & os.ST_NOEXEC
-    return room and there.is_dir() and os.access(there, os.W_OK | os.X_OK)
+    full = system.f_blocks and system.f_bavail * system.f_frsize < _LEAST_ROOM  # some systems do not tell
+    return (
+        not full
+        and not system.f_flag & os.ST_NOEXEC
+        and there.is_dir()
+        and os.access(there, os.W_OK | os.X_OK)
+    )
 
 
 def _make_private(folder: Path) -> bool:
@@ -94,8 +102,8 @@ def name_processor(version: str, record: int) -> None:
     version     what the device says of itself (CL_DEVICE_VERSION); PoCL's ends with the processor's name.
     record      the address of its `cl_device_id`; parts of it (sub-devices) have to be made afterwards.
 
-    Nothing happens on other systems than Linux on x86-64, whose compilers know "generic", on processors that
-    can do less than AVX2, or if the record is not as expected: that programs do not build is told there.
+    Nothing happens on other systems than Linux on x86-64, on processors that can do less than AVX2, or if the
+    record is not as expected: that programs do not build is told there.
     """
     if not ("pocl" in version.lower() and version.endswith("-generic")):
         return

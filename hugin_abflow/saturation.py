@@ -4,6 +4,8 @@ A photo is clipped at full scale. If its exposure was corrected afterwards, as n
 exposures, what is clipped becomes some grey, and nothing in the layer is brighter. That grey is no colour: it
 tells nothing of exposure, and another photo that shows more of that place is the better one. A flat lamp in a
 dark photo looks the same; but another photo shows it, compared by their exposures, no brighter.
+
+Not found is what was clipped in one channel only, or where vignetting was corrected as well.
 """
 
 from __future__ import annotations
@@ -21,18 +23,26 @@ from hugin_abflow.working import WorkingLayer
 Values = npt.NDArray[np.float32]
 White = tuple[float, float, float]
 
-# Working pixels from one that is looked at to the next, and the least number of them that tells something.
-_EVERY, _ENOUGH = 8, 30
-# Levels of 8 bits: white may be so far below the brightest, where that is overshoot; so far from white others
-# are to be fewer; and so near to it is white.
-_OVERSHOOT, _APART, _NEAR = 12, 6, 2.0
-# The least share of a layer that is white, how many times as many pixels as are a little darker, and what
-# part of them may be brighter.
-_SHARE, _DISTINCT, _BEYOND = 0.003, 3.0, 1 / 8
-# What is brighter than this, of full scale, is clipped as it is; what is darker than that is noise.
-_FULL, _DARK = 0.97, 0.02
+# Working pixels from one that is looked at to the next.
+_EVERY = 8
+# The least number of such pixels that tells something.
+_ENOUGH = 30
+# Levels of 8 bits from the brightest down to white, at most: between is overshoot, of sampling.
+_OVERSHOOT = 12
+# So many levels below white there are fewer pixels, by this factor.
+_APART, _DISTINCT = 6, 3.0
+# The least share of a layer that is white, and what part of that may be brighter.
+_SHARE, _BEYOND = 0.003, 1 / 8
+# Levels of 8 bits below white that are white.
+_NEAR = 2.0
+# Nothing darker is white: exposures are not corrected by so much.
+_LEAST = 64
+# What is brighter than this, of full scale, is clipped as it is.
+_FULL = 0.98
+# What is darker than this, of full scale, is noise.
+_DARK = 0.02
 # By how much another photo has to show brighter what is clipped here, at least, and in how much of it.
-_BRIGHTER, _PART = 1.05, 0.03
+_BRIGHTER, _PART = 1.1, 0.03
 
 
 @dataclass(frozen=True)
@@ -44,7 +54,7 @@ class _Picked:
     pixels: Values
 
 
-def found(device: Device, layers: Sequence[WorkingLayer], pairs: Sequence[Pair]) -> list[WorkingLayer]:
+def with_whites(device: Device, layers: Sequence[WorkingLayer], pairs: Sequence[Pair]) -> list[WorkingLayer]:
     """The same layers, with what they show white.
 
     pairs       layers that overlap.
@@ -58,8 +68,8 @@ def found(device: Device, layers: Sequence[WorkingLayer], pairs: Sequence[Pair])
         others = [pair.b if pair.a == k else pair.a for pair in pairs if k in (pair.a, pair.b)]
         if white is None or not others:
             continue
-        told = np.concatenate([_brighter(*_common(picked[k], picked[j]), white) for j in others])
-        if np.count_nonzero(told) >= max(_ENOUGH, _PART * told.size):
+        brighter = np.concatenate([_brighter(*_common(picked[k], picked[j]), white) for j in others])
+        if np.count_nonzero(brighter) >= max(_ENOUGH, _PART * brighter.size):
             result[k] = replace(layers[k], white=white)
     return result
 
@@ -81,22 +91,24 @@ def _brightest(pixels: Values) -> White | None:
     seen = pixels[pixels[..., 3] > 0][:, :3]
     if len(seen) < _ENOUGH:
         return None
-    white = [_spike(channel) for channel in seen.T]
-    if min(white) == 0 or min(white) > _FULL:
+    red, green, blue = (_spike(channel) for channel in seen.T)
+    if red is None or green is None or blue is None or min(red, green, blue) > _FULL:
         return None
-    return white[0], white[1], white[2]
+    return red, green, blue
 
 
-def _spike(values: Values) -> float:
-    """The brightness of which there are many values and none that are clearly brighter; 0: there is none."""
+def _spike(values: Values) -> float | None:
+    """The brightness of which there are many values and hardly any that are brighter; None: there is none."""
     counts = np.bincount(np.rint(values * 255).astype(np.int64), minlength=256)
     around = np.convolve(counts, (1, 1, 1), "same")
     last = int(np.flatnonzero(counts[::-1].cumsum()[::-1] > _SHARE / 4 * values.size).max())
-    low = max(last - _OVERSHOOT, _APART)
+    low = max(last - _OVERSHOOT, _LEAST)
+    if last < low:
+        return None
     level = low + int(np.argmax(around[low : last + 2]))
     least = max(_SHARE * values.size, _DISTINCT * around[level - _APART])
     if around[level] < least or counts[level + 2 :].sum() > _BEYOND * around[level]:
-        return 0.0
+        return None
     near = np.abs(values * 255 - level) < 1.5
     return float(np.mean(values[near], dtype=np.float64))
 
@@ -116,10 +128,12 @@ def _common(a: _Picked, b: _Picked) -> tuple[Values, Values]:
 
 
 def _brighter(values: Values, others: Values, white: White) -> npt.NDArray[np.bool_]:
-    """Whether the other layer shows it clearly brighter, for each pixel that is white here.
+    """Whether the other layer's brightest are clearly brighter: as many values as are white here.
+
+    values, others    of the same places, (n, 3).
 
     What is brightest in one layer is brightest in the other: sorted, they are compared without knowing where
-    things are, of which near ones have moved.
+    things are, of which near ones have moved. Exposures are compared by what is neither dark nor white.
     """
     here = np.asarray(white, np.float32)
     count = np.count_nonzero((values > here - _NEAR / 255).all(1))

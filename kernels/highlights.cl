@@ -1,7 +1,7 @@
 /* What a layer shows clipped counts less beside a layer that shows more of it. */
 
 /* How much of a layer's pixels in a cell is clipped, 0..1; each counts from nothing at `nearly` to all at `surely`,
-   of full scale. 0 where the layer is not. */
+   of what the layer shows white. 0 where the layer is not. */
 __kernel void highlights_share(__global const float4 *layer, /* (box.w, box.z) r, g, b, valid */
                                int4 box,                     /* place on the working grid */
                                int4 border, int4 cells,      /* working grid; transition grid, run size */

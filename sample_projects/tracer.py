@@ -19,7 +19,7 @@ import numpy as np
 import numpy.typing as npt
 import pyopencl as cl
 
-from hugin_abflow.pocl import name_processor
+from hugin_abflow import pocl
 
 Floats = npt.NDArray[np.float32]
 Vector = Sequence[float] | npt.NDArray[np.float64]
@@ -373,12 +373,13 @@ class Tracer:
 
 def _device() -> cl.Device:
     """A CPU where there is one, for the same picture everywhere; else the first device."""
+    pocl.find_cache()
     devices = [device for platform in cl.get_platforms() for device in platform.get_devices()]
     if not devices:
         raise RuntimeError("no OpenCL device; install one, such as PoCL (pip install 'pyopencl[pocl]')")
     cpus = [device for device in devices if device.type & cl.device_type.CPU]
     device = (cpus or devices)[0]
-    name_processor(device.version, device.int_ptr)
+    pocl.name_processor(device.version, device.int_ptr)
     return device
 
 

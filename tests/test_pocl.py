@@ -18,7 +18,7 @@ from hugin_abflow.opencl import Device
 NAMELESS = "OpenCL 3.0 PoCL HSTR: pthread-x86_64-unknown-linux-gnu-generic"
 HERE = sys.platform == "linux" and platform.machine() == "x86_64"
 only_linux = pytest.mark.skipif(sys.platform != "linux", reason="caches are elsewhere on other systems")
-only_here = pytest.mark.skipif(not HERE, reason="other compilers know a processor without a name")
+only_here = pytest.mark.skipif(not HERE, reason="no help there")
 
 AVX2 = {"sse2", "sse4_2", "popcnt", "avx", "avx2", "fma", "f16c", "bmi1", "bmi2", "abm", "movbe"}
 AVX512 = AVX2 | {"avx512f", "avx512bw", "avx512cd", "avx512dq", "avx512vl", "adx", "clflushopt"}
@@ -165,6 +165,32 @@ def test_without_a_home_the_cache_is_ones_own(nobody: Path) -> None:
 
 
 @only_linux
+@pytest.mark.parametrize("blocked", ["pocl", "pocl/kcache", "pytools", "."])
+def test_a_cache_that_is_blocked_is_none(
+    monkeypatch: pytest.MonkeyPatch, nobody: Path, tmp_path: Path, blocked: str
+) -> None:
+    """By a file in place of a folder, or a link to what is not there."""
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    place = tmp_path / "cache" / blocked
+    if blocked == ".":
+        place.symlink_to(tmp_path / "gone")
+    else:
+        place.parent.mkdir(parents=True)
+        place.touch()
+    pocl.find_cache()
+    assert Path(os.environ["XDG_CACHE_HOME"]).parent == nobody
+
+
+@only_linux
+def test_the_cache_is_the_same_from_everywhere(monkeypatch: pytest.MonkeyPatch, nobody: Path) -> None:
+    """pyopencl takes no notice of a relative one."""
+    monkeypatch.chdir(nobody.parent)
+    monkeypatch.setenv("TMPDIR", nobody.name)
+    pocl.find_cache()
+    assert Path(os.environ["XDG_CACHE_HOME"]).parent == nobody
+
+
+@only_linux
 def test_a_home_that_is_not_named_is_looked_up(monkeypatch: pytest.MonkeyPatch, nobody: Path) -> None:
     """PoCL alone would take a folder that belongs to whoever came first."""
     monkeypatch.delenv("HOME")
@@ -186,7 +212,11 @@ def test_programs_of_others_are_not_run(monkeypatch: pytest.MonkeyPatch, nobody:
     monkeypatch.setattr(pocl, "_PLACES", (str(nobody),))
     pocl.find_cache()
     (cache,) = nobody.iterdir()
-    for spoil in (lambda: cache.chmod(0o777), lambda: (cache.rmdir(), cache.symlink_to(nobody))):
+    spoils = [lambda: cache.chmod(0o720), lambda: cache.chmod(0o702)]
+    spoils += [lambda: (cache.rmdir(), cache.symlink_to(nobody)), lambda: (cache.unlink(), cache.touch())]
+    if os.getuid() == 0:
+        spoils += [lambda: (cache.unlink(), cache.mkdir(0o700), os.chown(cache, 1, 1))]
+    for spoil in spoils:
         os.environ.pop("XDG_CACHE_HOME", None)
         spoil()
         pocl.find_cache()
@@ -199,7 +229,7 @@ def test_disks_that_hold_no_programs_are_passed_over(
     monkeypatch: pytest.MonkeyPatch, nobody: Path, fault: dict[str, int]
 ) -> None:
     """Full ones, and those from which none may be run."""
-    home, good = nobody / "home", {"f_bavail": 1 << 20, "f_frsize": 4096, "f_flag": 0}
+    home, good = nobody / "home", {"f_blocks": 1 << 20, "f_bavail": 1 << 20, "f_frsize": 4096, "f_flag": 0}
     home.mkdir()
     monkeypatch.setenv("HOME", str(home))
     monkeypatch.setattr(

@@ -6,14 +6,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from grids import on_device, random_layer
+from grids import GRIDS, on_device, random_layer
 from hypothesis import given
 from hypothesis import strategies as st
 from pictures import merged, one_device
 from reference.saturation import saturation_pick
 from scipy import ndimage
 
-from hugin_abflow import saturation
+from hugin_abflow import colour, saturation, seam
 from hugin_abflow.geometry import Pair
 from hugin_abflow.layer import Canvas, Layer
 from hugin_abflow.opencl import Device
@@ -54,9 +54,16 @@ def photo(light: np.ndarray, exposure: float = 1.0, corrected: float | tuple[flo
     return np.rint(255 * np.clip(pixels, 0, 1)).astype(np.float32) / np.float32(255)
 
 
-def whites(device: Device, *pixels: np.ndarray, shift: int = 0, dtype: type = np.uint8) -> list:
-    layers = [on_device(device, one, k * shift, 0, dtype) for k, one in enumerate(pixels)]
-    return [one.white for one in saturation.found(device, layers, BOTH)]
+def whites(
+    device: Device,
+    *pixels: np.ndarray,
+    shift: int = 0,
+    down: int = 0,
+    pairs: list[Pair] = BOTH,
+    dtype: type = np.uint8,
+) -> list:
+    layers = [on_device(device, one, k * shift, k * down, dtype) for k, one in enumerate(pixels)]
+    return [one.white for one in saturation.with_whites(device, layers, pairs)]
 
 
 UNKNOWN = (1.0, 1.0, 1.0)
@@ -67,9 +74,65 @@ def test_what_is_clipped_and_then_darkened_is_white(device: Device) -> None:
     corrected = (0.6, 0.5, 0.55)
     clipped = photo(scene(), 1.5, corrected)
     assert (clipped[..., :3].max((0, 1)) < 0.61).all()
-    found, other = whites(device, clipped, photo(scene(), 0.8), shift=5)
-    assert found == pytest.approx(corrected, abs=1 / 255)
-    assert other == UNKNOWN
+    for down in (0, 9):
+        found, other = whites(device, clipped, photo(scene(), 0.8), shift=5, down=down)
+        assert found == pytest.approx(corrected, abs=1 / 255)
+        assert other == UNKNOWN
+
+
+def test_any_photo_beside_it_may_tell(device: Device) -> None:
+    """But none that it does not overlap."""
+    clipped, darker = photo(scene(), 1.5, 0.6), photo(scene(), 0.8)
+    for pairs, known in (([(0, 1), (0, 2)], True), ([(1, 2), (0, 2)], True), ([(0, 1), (1, 2)], False)):
+        found, *_ = whites(device, clipped, clipped, darker, pairs=[Pair(*pair) for pair in pairs])
+        assert (found != UNKNOWN) == known
+
+
+def test_where_a_photo_is_empty_it_tells_nothing(device: Device) -> None:
+    """Nor do pixels that are not valid count as dark ones."""
+    clipped, darker = photo(scene(), 1.5, 0.6), photo(scene(), 0.8)
+    clipped[:, 250:] = darker[:, :250] = 0
+    assert whites(device, clipped, darker) == [UNKNOWN] * 2
+    darker[:, 100:250] = photo(scene(), 0.8)[:, 100:250]
+    assert whites(device, clipped, darker)[0] == pytest.approx((0.6,) * 3, abs=1 / 255)
+
+
+@given(
+    st.lists(st.tuples(st.integers(0, 255), st.integers(1, 400)), min_size=1, max_size=6),
+    st.sampled_from([1, 3, 9]),
+)
+def test_any_values_have_a_white_or_none(groups: list[tuple[int, int]], together: int) -> None:
+    values = np.repeat([level for level, _ in groups], [count * together for _, count in groups])
+    white = saturation._spike((values / 255).astype(np.float32))
+    if white is not None:
+        near = np.abs(values - 255 * white) < 2
+        assert 0.25 <= white <= 1
+        assert near.mean() > 0.003
+        assert (values > 255 * white + 3).sum() <= near.sum() / 8
+
+
+@pytest.mark.parametrize("brightest", [0, 1, 3, 8, 40])
+def test_dark_photos_have_none(device: Device, brightest: int) -> None:
+    """All of them, and in one channel alone."""
+    dark = photo(np.full((HEIGHT, WIDTH, 3), brightest / 255))
+    assert whites(device, dark, photo(scene())) == [UNKNOWN] * 2
+    red = photo(scene(), 1.5, (0.6, 0.6, brightest / 255))
+    assert whites(device, red, photo(scene())) == [UNKNOWN] * 2
+
+
+def test_noise_is_not_brighter(device: Device) -> None:
+    light = 0.7 * scene() / scene().max()
+    light[100:200, 150:300] = 0.75
+    noisy = light + np.random.default_rng(2).normal(scale=0.02, size=light.shape)
+    assert whites(device, photo(light, 0.8), photo(noisy, 0.8)) == [UNKNOWN] * 2
+
+
+def test_where_exposures_cannot_be_compared_nothing_is_told(device: Device) -> None:
+    """Photos of another contrast: what is brighter by a tenth says little then."""
+    light = 0.7 * scene() / scene().max()
+    light[100:200, 150:300] = 0.8
+    dark = photo(light, 0.6)
+    assert whites(device, dark, photo(dark[..., :3] ** 1.1)) == [UNKNOWN] * 2
 
 
 @given(st.floats(0.35, 0.9), st.floats(0.4, 0.75))
@@ -104,7 +167,7 @@ def test_what_nobody_shows_brighter_is_not_white(device: Device) -> None:
     assert whites(device, clipped, clipped.copy(), shift=3) == [UNKNOWN] * 2
     for layers, pairs in (([clipped], []), ([clipped] * 3, [Pair(0, 2)])):
         alone = [on_device(device, one) for one in layers]
-        assert saturation.found(device, alone, pairs) == alone
+        assert saturation.with_whites(device, alone, pairs) == alone
 
 
 def test_smooth_brightness_is_not_white(device: Device) -> None:
@@ -123,6 +186,31 @@ def test_layers_apart_tell_nothing(device: Device) -> None:
     assert whites(device, clipped, other, shift=WIDTH) == [UNKNOWN] * 2
     clipped[:, :-4, 3] = other[:, 4:, 3] = 0  # they touch, and have hardly a pixel in common
     assert whites(device, clipped, other, shift=WIDTH - 8) == [UNKNOWN] * 2
+
+
+# What is made of it
+
+
+@pytest.mark.parametrize("clipped", [0, 1, None])
+def test_each_layer_is_compared_up_to_its_own_white(device: Device, clipped: int | None) -> None:
+    """One of two is clipped throughout, the darker or the brighter one: exposures differ by that at least,
+    and nothing is left to be compared; else all is."""
+    grid = GRIDS["plane"]
+    random = np.random.default_rng(4).random((*grid.shape, 4)).astype(np.float32)
+    colours = np.float32([1, 1, 1, 0]) * (0.3 + 0.1 * random) + np.float32([0, 0, 0, 1])
+    layers = [on_device(device, colours * np.float32([k, k, k, 1])) for k in (1.0, 1.5)]
+    if clipped is not None:
+        layers[clipped] = replace(layers[clipped], white=(0.2, 1.0, 1.0))
+    still = [device.zeros((*grid.shape, 4)) for _ in layers]
+    cells = grid.resized(7, 3)
+    overlap = colour._Overlap(device, layers, still, Pair(0, 1), grid, cells)
+    found = overlap.difference(1.0)
+    assert (found.values[..., 3] > 0).all() == (clipped is None)
+    assert (np.sign(found.beyond[..., 3]) == {0: 1, 1: -1, None: 0}[clipped]).all()
+    assert (overlap.misfit().max() > 0) == (clipped is None)
+    none = colour.Correction(cells, 1.0, (None, None))
+    residual = seam.residuals(device, layers, still, [Pair(0, 1)], none, grid)
+    assert residual.told.all() == (clipped is None) == residual.told.any()
 
 
 # The panorama
@@ -153,5 +241,5 @@ def test_grey_that_was_white_comes_from_the_darker_photo(monkeypatch: pytest.Mon
 
     canvas = Canvas.plane(WIDTH, HEIGHT)
     assert likeness(merged(layers, canvas)) > 0.4
-    monkeypatch.setattr(saturation, "found", unknown)
+    monkeypatch.setattr(saturation, "with_whites", unknown)
     assert likeness(merged(layers, canvas)) < 0.1
