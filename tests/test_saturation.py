@@ -83,7 +83,7 @@ def test_what_is_clipped_and_then_darkened_is_white(device: Device) -> None:
 def test_any_photo_beside_it_may_tell(device: Device) -> None:
     """But none that it does not overlap."""
     clipped, darker = photo(scene(), 1.5, 0.6), photo(scene(), 0.8)
-    for pairs, known in (([(0, 1), (0, 2)], True), ([(1, 2), (0, 2)], True), ([(0, 1), (1, 2)], False)):
+    for pairs, known in (([(0, 1), (0, 2)], True), ([(1, 2), (0, 2)], True), ([(0, 1), (2, 1)], False)):
         found, *_ = whites(device, clipped, clipped, darker, pairs=[Pair(*pair) for pair in pairs])
         assert (found != UNKNOWN) == known
 
@@ -106,7 +106,7 @@ def test_any_values_have_a_white_or_none(groups: list[tuple[int, int]], together
     white = saturation._spike((values / 255).astype(np.float32))
     if white is not None:
         near = np.abs(values - 255 * white) < 2
-        assert 0.25 <= white <= 1
+        assert saturation._LEAST - 1.5 <= 255 * white <= 255.001
         assert near.mean() > 0.003
         assert (values > 255 * white + 3).sum() <= near.sum() / 8
 
