@@ -112,37 +112,24 @@ def _displacement(
     every: int = 1,
 ) -> Buffer:
     """One layer's of `displacements`."""
-    field = _sum_of_flows(device, index, layers, coefficients, flows, grid, every, None)
-    for _ in range(settings.fixed_point_steps):
-        field = _sum_of_flows(device, index, layers, coefficients, flows, grid, every, field)
-    return field
-
-
-def _sum_of_flows(
-    device: Device,
-    index: int,
-    layers: Sequence[WorkingLayer],
-    coefficients: Sequence[Coefficients],
-    flows: Sequence[PairFlow],
-    grid: Grid,
-    every: int,
-    guess: Buffer | None,
-) -> Buffer:
     layer = layers[index]
     size = tuple(-(-n // every) for n in layer.box[2:])
     four_at_a_time = (-(-size[0] // 4), size[1])
-    field = device.zeros((*size[::-1], 4))
-    for pair in flows:
-        if index not in (pair.a, pair.b):
-            continue
-        other = pair.b if index == pair.a else pair.a
-        flow = pair.between(other if guess is None else index)
-        chart_grid = (pair.chart.width, pair.chart.height, int(pair.chart.wraps), 0)
-        device.run(
-            "geometry", "geometry_add", four_at_a_time, coefficients[other].blend, layers[other].box,
-            layer.pixels, layer.box, every, grid.border, grid.lens, flow, chart_grid, pair.chart.transform,
-            int(guess is not None), guess or field, field, size,
-        )  # fmt: skip
+    guess: Buffer | None = None
+    for _ in range(1 + settings.fixed_point_steps):
+        field = device.zeros((*size[::-1], 4))
+        for pair in flows:
+            if index not in (pair.a, pair.b):
+                continue
+            other = pair.b if index == pair.a else pair.a
+            flow = pair.between(other if guess is None else index)
+            chart_grid = (pair.chart.width, pair.chart.height, int(pair.chart.wraps), 0)
+            device.run(
+                "geometry", "geometry_add", four_at_a_time, coefficients[other].blend, layers[other].box,
+                layer.pixels, layer.box, every, grid.border, grid.lens, flow, chart_grid,
+                pair.chart.transform, int(guess is not None), guess or field, field, size,
+            )  # fmt: skip
+        guess = field
     return field
 
 

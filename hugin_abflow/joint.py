@@ -308,7 +308,7 @@ def _read(
             reduced = [job.result() for job in jobs]
         finally:
             decoders.shutdown(cancel_futures=True)
-        device.give_back()
+        device.give_back()  # it waits: else the last rows' time would be told as that of what follows
     return sorted(reduced, key=_place)
 
 
@@ -437,5 +437,5 @@ def _flows(
                 shifts.append(figures.parallax(device, its_flow, images, grid))
             advance(1)
         mend()
-        device.give_back()
+        device.give_back()  # it waits: else the last pair's time would be told as that of what follows
     return result, shifts, singles
