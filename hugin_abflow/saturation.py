@@ -17,6 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from hugin_abflow.geometry import Pair
+from hugin_abflow.layer import Box
 from hugin_abflow.opencl import Device
 from hugin_abflow.working import WorkingLayer
 
@@ -47,11 +48,15 @@ _BRIGHTER, _PART = 1.1, 0.03
 
 @dataclass(frozen=True)
 class _Picked:
-    """Some of a layer's pixels: place (left, top) among those of the grid, (height, width, 4)."""
+    """Some of a layer's pixels, (height, width, 4), and their place among those of the grid."""
 
-    left: int
-    top: int
+    place: Box
     pixels: Values
+
+    def at(self, place: Box) -> Values:
+        """Those of a part of the place."""
+        top, left = place.top - self.place.top, place.left - self.place.left
+        return self.pixels[top : top + place.height, left : left + place.width]
 
 
 def with_whites(device: Device, layers: Sequence[WorkingLayer], pairs: Sequence[Pair]) -> list[WorkingLayer]:
@@ -77,13 +82,14 @@ def with_whites(device: Device, layers: Sequence[WorkingLayer], pairs: Sequence[
 def _pick(device: Device, layer: WorkingLayer) -> _Picked:
     """Every so many-th pixel of a layer."""
     left, top, width, height = layer.box
-    first = -(-left // _EVERY), -(-top // _EVERY)
-    size = -(-(left + width) // _EVERY) - first[0], -(-(top + height) // _EVERY) - first[1]
-    pixels = device.empty((size[1], size[0], 4))
+    place = Box(*(-(-edge // _EVERY) for edge in (left, top, left + width, top + height)))
+    size = place.width, place.height
+    pixels = device.empty((place.height, place.width, 4))
     device.run(
-        "saturation", "saturation_pick", size, layer.pixels, layer.box, _EVERY, (*first, *size), pixels
-    )
-    return _Picked(*first, pixels.get())
+        "saturation", "saturation_pick", size,
+        layer.pixels, layer.box, _EVERY, (place.left, place.top, *size), pixels,
+    )  # fmt: skip
+    return _Picked(place, pixels.get())
 
 
 def _brightest(pixels: Values) -> White | None:
@@ -115,14 +121,8 @@ def _spike(values: Values) -> float | None:
 
 def _common(a: _Picked, b: _Picked) -> tuple[Values, Values]:
     """Pixels (n, 3) that two layers have in common."""
-    left, top = max(a.left, b.left), max(a.top, b.top)
-    (height, width), (high, wide) = a.pixels.shape[:2], b.pixels.shape[:2]
-    right, bottom = min(a.left + width, b.left + wide), min(a.top + height, b.top + high)
-    if right <= left or bottom <= top:
-        return np.zeros((0, 3), np.float32), np.zeros((0, 3), np.float32)
-    of_a, of_b = (
-        one.pixels[top - one.top : bottom - one.top, left - one.left : right - one.left] for one in (a, b)
-    )
+    place = a.place.intersect(b.place)
+    of_a, of_b = a.at(place), b.at(place)
     both = (of_a[..., 3] > 0) & (of_b[..., 3] > 0)
     return of_a[both][:, :3], of_b[both][:, :3]
 

@@ -35,7 +35,7 @@ def test_pixels_are_those_of_the_twin(device: Device, box: tuple[int, int, int, 
         len(range(-(-box[1] // every) * every, box[1] + box[3], every)),
         len(range(-(-box[0] // every) * every, box[0] + box[2], every)),
     )
-    expected = saturation_pick(layer, box, every, (picked.left, picked.top, width, height))
+    expected = saturation_pick(layer, box, every, (picked.place.left, picked.place.top, width, height))
     np.testing.assert_array_equal(picked.pixels, expected)
 
 
