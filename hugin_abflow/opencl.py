@@ -357,7 +357,12 @@ class Device:
                 f"kernels/{module}.cl does not build on {self.device.name.strip()}: {error}; "
                 "update the OpenCL driver or choose another --device"
             ) from error
-        return {kernel.function_name: kernel for kernel in program.all_kernels()}
+        kernels = {kernel.function_name: kernel for kernel in program.all_kernels()}
+        if not kernels:  # some drivers call that a success
+            raise DeviceError(
+                f"kernels/{module}.cl has no kernels for {self.device.name.strip()}; use another --device"
+            )
+        return kernels
 
     def run(
         self,

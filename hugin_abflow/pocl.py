@@ -2,7 +2,9 @@
 
 **A processor that is newer than its compiler.** PoCL asks its LLVM for the processor's name. Where LLVM is
 older it may say "generic", which its own compiler then refuses: no program builds at all (PoCL's issue 1049).
-So does PoCL 3.0 of PyPI, with LLVM 14, on AMD's Zen 5. The device is given the name of an older processor.
+So does PoCL 3.0 of PyPI, with LLVM 14, on AMD's Zen 5. Or it says what came before: on Zen 4, Zen 3, which
+has no AVX-512, while PoCL loads its functions for AVX-512. They pass long vectors in another way, and the
+compiler does not end. Either device is given the name of another processor.
 
 **A home that cannot be written**, as in containers, and of services. PoCL keeps what it compiled there, and
 offers no device if it cannot; pyopencl fails as well. On a full disk, or one that no program may be run from,
@@ -24,7 +26,8 @@ from pathlib import Path
 
 _log = logging.getLogger(__name__)
 
-_UNKNOWN = b"generic\0"
+# What LLVM calls processors that it may not know; programs for these use no AVX-512.
+_GUESSES = ("generic", "znver1", "znver2", "znver3")
 
 # PoCL's libraries of functions, and the processors for which they are compiled: which one is loaded depends
 # on the first feature alone, in the words of /proc/cpuinfo; programs may expect the others as well. If they
@@ -105,13 +108,17 @@ def name_processor(version: str, record: int) -> None:
     Nothing happens on other systems than Linux on x86-64, on processors that can do less than AVX2, or if the
     record is not as expected: that programs do not build is told there.
     """
-    if not ("pocl" in version.lower() and version.endswith("-generic")):
+    guess = version.rpartition("-")[2]
+    if "pocl" not in version.lower() or guess not in _GUESSES:
         return
     if sys.platform != "linux" or platform.machine() != "x86_64":
         return
     try:
-        name = _like(_features())
-        if name and _rename(record, name):
+        features = _features()
+        if guess != "generic" and "avx512f" not in features:  # a good guess
+            return
+        name = _like(features)
+        if name and _rename(record, guess, name):
             _log.debug("PoCL does not know this processor; it compiles for %s", name)
     except OSError as error:
         _log.debug("PoCL does not know this processor, and cannot be told: %s", error)
@@ -131,15 +138,16 @@ def _like(features: Set[str]) -> str | None:
     return None
 
 
-def _rename(record: int, name: str) -> bool:
-    """Have the device's record hold this name in place of none; returns whether it held none."""
+def _rename(record: int, guess: str, name: str) -> bool:
+    """Have the device's record hold this name in place of the guess; returns whether it held that."""
+    wanted = guess.encode() + b"\0"
     # this file fails where an address leads nowhere, and a pointer would end the process
     memory = os.open("/proc/self/mem", os.O_RDWR)
     try:
         words = os.pread(memory, _RECORD, record)
         for place in range(0, len(words) - 7, 8):
             (address,) = struct.unpack_from("@Q", words, place)
-            if _read(memory, address) == _UNKNOWN:
+            if _read(memory, address, len(wanted)) == wanted:
                 os.pwrite(memory, struct.pack("@Q", _copied(name)), record + place)
                 return True
         return False
@@ -147,10 +155,10 @@ def _rename(record: int, name: str) -> bool:
         os.close(memory)
 
 
-def _read(memory: int, address: int) -> bytes:
-    """As many bytes as the unknown name has; none where there is no memory."""
+def _read(memory: int, address: int, size: int) -> bytes:
+    """So many bytes; none where there is no memory."""
     try:
-        return os.pread(memory, len(_UNKNOWN), address)
+        return os.pread(memory, size, address)
     except (OSError, OverflowError):
         return b""
 

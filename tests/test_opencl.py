@@ -61,6 +61,14 @@ def test_every_file_builds_alone_without_warnings(device: Device, module: str, o
     assert built == sorted(kernels_of(module))
 
 
+def test_a_file_without_kernels_is_a_device_error_with_its_name(
+    device: Device, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(opencl, "kernel_source", lambda module: "int nothing(void) { return 0; }")
+    with pytest.raises(DeviceError, match=r"kernels/hollow\.cl has no kernels for .*--device"):
+        device.kernel("hollow", "hollow")
+
+
 def test_a_file_that_does_not_build_is_a_device_error_with_its_name(
     device: Device, monkeypatch: pytest.MonkeyPatch
 ) -> None:
