@@ -113,7 +113,7 @@ def _band_height(
     used = memory.resident() + device.own_memory + _SLACK
     while True:
         plan = _plan(layers, full, grid, crop, height)
-        needed = used + _pass_memory(layers, plan, full.height / grid.height)
+        needed = used + _pass_memory(layers, plan, grid.row_height)
         if needed <= limit or height <= _LEAST_ROWS:
             break
         height = max(_LEAST_ROWS, height // 2)
@@ -175,7 +175,7 @@ def _bands(
     longitudes = _turn(device, full.lens[0], full.lens[1], crop.left - region.left, crop.width)
     plan = _plan(layers, full, grid, crop, height)
     ways, gained, added = (
-        _Slices(device, arrays, full, coarse, plan)
+        _Slices(device, arrays, coarse, plan)
         for arrays, coarse in ((fields, grid), (gains, gain_grid), (offsets, offset_grid))
     )
     with _Store(
@@ -187,7 +187,7 @@ def _bands(
             groups = -(-part.width // together), part.height
             store.next()
             places = [slices.take(part) for slices in (ways, gained, added)]
-            _hide(device, ways.values, places[0], part, full, grid, share)
+            _hide(device, ways.values, places[0], part, grid, share)
             table = np.zeros((len(layers), 24), np.int32)
             for k, (layer, (start, end)) in enumerate(zip(layers, band.rows, strict=True)):
                 box, ring = layer.layer.box, store.shelves.rings[k]
@@ -224,12 +224,11 @@ class _Slices:
         self,
         device: Device,
         arrays: Sequence[_Coarse | None],
-        full: Grid,
         grid: Grid,
         plan: Sequence[_Band],
     ) -> None:
         self._arrays = arrays
-        self._scale = full.height / grid.height
+        self._scale = grid.row_height
         most = max(int(places[:, 2] @ places[:, 3]) for places in (self._places(band.part) for band in plan))
         self.values = device.empty((most, 4))
 
@@ -260,12 +259,11 @@ def _hide(
     ways: Buffer,
     places: npt.NDArray[np.int32],
     part: Box,
-    full: Grid,
     grid: Grid,
     share: float,
 ) -> None:
     """Make weights of `ways` negative that are less than a share of what all layers have in their place."""
-    first, last = _coarse_rows((0, 0, grid.width, grid.height), part, full.height / grid.height)
+    first, last = _coarse_rows((0, 0, grid.width, grid.height), part, grid.row_height)
     run = 0, first, grid.width, last - first
     device.run(
         "blend", "blend_hide", run[2:], ways, device.upload(places), len(places), run, share,
@@ -301,8 +299,7 @@ def _plan(layers: Sequence[BlendLayer], full: Grid, grid: Grid, crop: Box, heigh
         Box(crop.left - left, start - top, crop.right - left, min(start + height, crop.bottom) - top)
         for start in range(crop.top, crop.bottom, height)
     ]
-    scale = full.height / grid.height
-    spans = [[_rows_needed(layer, full, part, scale) for layer in layers] for part in parts]
+    spans = [[_rows_needed(layer, full, part, grid.row_height) for layer in layers] for part in parts]
     for k in range(len(layers)):
         touched = [i for i, rows in enumerate(spans) if rows[k][0] < rows[k][1]]
         for before, after in pairwise(touched):

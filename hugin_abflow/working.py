@@ -68,6 +68,11 @@ class Grid:
         return self.width, self.height, int(self.wraps), self.poles
 
     @property
+    def row_height(self) -> float:
+        """Of a row of the grid, full-resolution px."""
+        return self.region.height / self.height
+
+    @property
     def circumference(self) -> float:
         """The canvas's width as the flow-magnitude term takes it: radians on the sphere, else grid px."""
         if self.lens[1] and self.wraps:
