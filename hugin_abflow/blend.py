@@ -38,6 +38,15 @@ _WHOLE_STRIP = 2 << 20
 _QUARTER_LEVEL = {np.dtype(np.uint8): 0.25 / 255}
 _QUARTER_FINE_LEVEL = 0.25 / 65535
 
+# A row of the table of layers: `blend_layer` of kernels/blend.cl.
+_LAYER = np.dtype(
+    [
+        *((box, np.int32, 4) for box in ("place", "way", "gain", "offset")),
+        *((number, np.int32) for number in ("ways", "gains", "offsets", "rows", "ring", "turn")),
+        ("unused", np.int32, 2),
+    ]
+)
+
 Span = tuple[int, int]
 _Coarse = tuple[tuple[int, int, int, int], Buffer]  # place on a coarse grid; float32 (height, width, 4)
 
@@ -188,14 +197,15 @@ def _bands(
             store.next()
             places = [slices.take(part) for slices in (ways, gained, added)]
             _hide(device, ways.values, places[0], part, grid, share)
-            table = np.zeros((len(layers), 24), np.int32)
-            for k, (layer, (start, end)) in enumerate(zip(layers, band.rows, strict=True)):
-                box, ring = layer.layer.box, store.shelves.rings[k]
-                table[k, :4] = box.left - region.left, box.top - region.top + start, box.width, end - start
-                table[k, 19:22] = ring.start, ring.rows, start % ring.rows
-            for number, its_places in enumerate(places):
-                table[:, 4 + 4 * number : 8 + 4 * number] = its_places[:, :4]
-                table[:, 16 + number] = its_places[:, 4]
+            table = np.zeros(len(layers), _LAYER)
+            for row, layer, ring, (start, end) in zip(
+                table, layers, store.shelves.rings, band.rows, strict=True
+            ):
+                box = layer.layer.box
+                row["place"] = box.left - region.left, box.top - region.top + start, box.width, end - start
+                row["rows"], row["ring"], row["turn"] = ring.start, ring.rows, start % ring.rows
+            for name, its_places in zip(("way", "gain", "offset"), places, strict=True):
+                table[name], table[name + "s"] = its_places[:, :4], its_places[:, 4]
             used = [k for k, (start, end) in enumerate(band.rows) if start < end]
             latitudes = _turn(device, full.lens[2], -full.lens[3], part.top, part.height)
             out = device.empty((part.height, part.width, first.channels + 1), device_dtype(first))
