@@ -70,6 +70,11 @@ def find_cache() -> None:
         if _holds_programs(folder) and _make_private(folder):
             os.environ["XDG_CACHE_HOME"] = str(folder)
             return
+    _log.warning(
+        "no folder is found for compiled kernels, OpenCL may fail: set XDG_CACHE_HOME to one that you can "
+        "write, with %d MiB of room, on a disk from which programs may be run",
+        _LEAST_ROOM >> 20,
+    )
 
 
 def _holds_programs(folder: Path) -> bool:

@@ -259,6 +259,17 @@ def test_disks_that_hold_no_programs_are_passed_over(
     assert not list(home.iterdir())
 
 
+@only_linux
+def test_no_place_for_a_cache_is_said(
+    monkeypatch: pytest.MonkeyPatch, nobody: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr(pocl, "_holds_programs", lambda folder: False)
+    pocl.find_cache()
+    assert "XDG_CACHE_HOME" not in os.environ
+    (said,) = caplog.messages
+    assert "set XDG_CACHE_HOME" in said and "32 MiB" in said
+
+
 _HOMELESS_RUN = """
 from hugin_abflow.opencl import Device
 
