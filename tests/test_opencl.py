@@ -61,20 +61,19 @@ def test_every_file_builds_alone_without_warnings(device: Device, module: str, o
     assert built == sorted(kernels_of(module))
 
 
-def test_a_file_without_kernels_is_a_device_error_with_its_name(
-    device: Device, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize(
+    ("module", "source", "said"),
+    [
+        ("broken", "__kernel void broken( {", r"(?s)kernels/broken\.cl does not build on .*driver"),
+        ("hollow", "int nothing(void) { return 0; }", r"kernels/hollow\.cl has no kernels for .*--device"),
+    ],
+)
+def test_a_file_that_gives_no_kernels_is_a_device_error_with_its_name(
+    device: Device, monkeypatch: pytest.MonkeyPatch, module: str, source: str, said: str
 ) -> None:
-    monkeypatch.setattr(opencl, "kernel_source", lambda module: "int nothing(void) { return 0; }")
-    with pytest.raises(DeviceError, match=r"kernels/hollow\.cl has no kernels for .*--device"):
-        device.kernel("hollow", "hollow")
-
-
-def test_a_file_that_does_not_build_is_a_device_error_with_its_name(
-    device: Device, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(opencl, "kernel_source", lambda module: "__kernel void broken( {")
-    with pytest.raises(DeviceError, match=r"(?s)kernels/broken\.cl does not build on .*driver"):
-        device.kernel("broken", "broken")
+    monkeypatch.setattr(opencl, "kernel_source", lambda module: source)
+    with pytest.raises(DeviceError, match=said):
+        device.kernel(module, module)
 
 
 def test_what_is_built_does_not_wait_for_what_is_being_built(

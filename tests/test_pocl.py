@@ -15,13 +15,17 @@ import pytest
 from hugin_abflow import pocl
 from hugin_abflow.opencl import Device
 
-NAMELESS = "OpenCL 3.0 PoCL HSTR: pthread-x86_64-unknown-linux-gnu-generic"
 HERE = sys.platform == "linux" and platform.machine() == "x86_64"
 only_linux = pytest.mark.skipif(sys.platform != "linux", reason="caches are elsewhere on other systems")
 only_here = pytest.mark.skipif(not HERE, reason="no help there")
 
 AVX2 = {"sse2", "sse4_2", "popcnt", "avx", "avx2", "fma", "f16c", "bmi1", "bmi2", "abm", "movbe"}
 AVX512 = AVX2 | {"avx512f", "avx512bw", "avx512cd", "avx512dq", "avx512vl", "adx", "clflushopt"}
+
+
+def version_of(processor: str) -> str:
+    """What PoCL says of a device whose processor it calls so."""
+    return f"OpenCL 3.0 PoCL HSTR: pthread-x86_64-unknown-linux-gnu-{processor}"
 
 
 class Record(ctypes.Structure):
@@ -49,7 +53,7 @@ def test_the_name_alone_is_changed(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(pocl, "_features", lambda: AVX2)
     record = record_of(b"generic")
     before = bytes(record)
-    pocl.name_processor(NAMELESS, ctypes.addressof(record))
+    pocl.name_processor(version_of("generic"), ctypes.addressof(record))
     assert record.processor == b"haswell"
     field = Record.processor
     after = bytearray(bytes(record))
@@ -66,7 +70,7 @@ def test_a_name_without_avx512_goes_where_there_is_avx512(
     """PoCL loads its functions for AVX-512 there, as on Zen 4, which its compiler takes for Zen 3."""
     monkeypatch.setattr(pocl, "_features", lambda: features)
     record = record_of(guess.encode())
-    pocl.name_processor(NAMELESS.replace("generic", guess), ctypes.addressof(record))
+    pocl.name_processor(version_of(guess), ctypes.addressof(record))
     assert record.processor == (named or guess).encode()
 
 
@@ -74,7 +78,7 @@ def test_a_name_without_avx512_goes_where_there_is_avx512(
 def test_a_name_stays() -> None:
     for processor in (b"znver3", b"generic-rv64"):
         record = record_of(processor)
-        pocl.name_processor(NAMELESS, ctypes.addressof(record))
+        pocl.name_processor(version_of("generic"), ctypes.addressof(record))
         assert record.processor == processor
 
 
@@ -82,8 +86,8 @@ def test_a_name_stays() -> None:
 @pytest.mark.parametrize(
     "version",
     [
-        "OpenCL 3.0 PoCL HSTR: pthread-x86_64-unknown-linux-gnu-haswell",
-        "OpenCL 3.0 PoCL HSTR: pthread-x86_64-unknown-linux-gnu-znver4",
+        version_of("haswell"),
+        version_of("znver4"),
         "OpenCL 3.0 CUDA 12.4.0",
         "OpenCL 3.0 of another kind-generic",
     ],
@@ -96,7 +100,7 @@ def test_other_devices_are_left_alone(version: str) -> None:
 
 @only_here
 def test_what_cannot_be_read_is_no_error() -> None:
-    pocl.name_processor(NAMELESS, 8)
+    pocl.name_processor(version_of("generic"), 8)
 
 
 def test_processors_are_taken_for_what_their_library_is_compiled_for() -> None:
@@ -133,13 +137,14 @@ def test_a_processor_with_another_name_builds(guess: str, device: Device, tmp_pa
     """This machine's own is given that name first."""
     version = device.device.version
     if "PoCL" not in version or "-gnu-" not in version:
-        pytest.skip("the device is none of PoCL's")
+        pytest.skip("the device is none of PoCL's")  # only those are named
     features = pocl._features()
     if pocl._like(features) is None or (guess != "generic" and "avx512f" not in features):
+        # programs would be built for what it cannot do
         pytest.skip("this processor can do less than those that PoCL may be told of")
     own = version.partition("-gnu-")[2]
     done = subprocess.run(
-        [sys.executable, "-c", _RENAMED_RUN, own, NAMELESS.replace("generic", guess), guess, OPTIONS],
+        [sys.executable, "-c", _RENAMED_RUN, own, version_of(guess), guess, OPTIONS],
         timeout=120,
         env=os.environ | {"POCL_CACHE_DIR": str(tmp_path), "PYOPENCL_NO_CACHE": "1"},
         capture_output=True,
