@@ -231,11 +231,7 @@ class _Slices:
     """
 
     def __init__(
-        self,
-        device: Device,
-        arrays: Sequence[_Coarse | None],
-        grid: Grid,
-        plan: Sequence[_Band],
+        self, device: Device, arrays: Sequence[_Coarse | None], grid: Grid, plan: Sequence[_Band]
     ) -> None:
         self._arrays = arrays
         self._scale = grid.row_height
@@ -265,12 +261,7 @@ class _Slices:
 
 
 def _hide(
-    device: Device,
-    ways: Buffer,
-    places: npt.NDArray[np.int32],
-    part: Box,
-    grid: Grid,
-    share: float,
+    device: Device, ways: Buffer, places: npt.NDArray[np.int32], part: Box, grid: Grid, share: float
 ) -> None:
     """Make weights of `ways` negative that are less than a share of what all layers have in their place."""
     first, last = _coarse_rows((0, 0, grid.width, grid.height), part, grid.row_height)

@@ -145,10 +145,9 @@ def shown_at(
     displacements = field.get()[..., :3].astype(np.float64)
     left, top, width, height = box
     points = grid.points(places)
-    scale = np.array([grid.width / grid.region.width, grid.height / grid.region.height])
     shown = places
     for _ in range(_FOLLOWING_STEPS):
-        column, row = np.floor((shown - (grid.region.left, grid.region.top)) * scale).astype(int).T
+        column, row = np.floor((shown - (grid.region.left, grid.region.top)) * grid.ratios).astype(int).T
         column = column % grid.width if grid.wraps else column
         inside = (column >= left) & (column < left + width) & (row >= top) & (row < top + height)
         moved = displacements[np.where(inside, row - top, 0), np.where(inside, column - left, 0)]

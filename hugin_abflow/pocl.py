@@ -110,8 +110,8 @@ def name_processor(version: str, record: int) -> None:
     version     what the device says of itself (CL_DEVICE_VERSION); PoCL's ends with the processor's name.
     record      the address of its `cl_device_id`; parts of it (sub-devices) have to be made afterwards.
 
-    Nothing happens on other systems than Linux on x86-64, on processors that can do less than AVX2, or if the
-    record is not as expected: that programs do not build is told there.
+    Nothing happens on other systems than Linux on x86-64, on processors that can do less than AVX2, where the
+    name will do, or if the record is not as expected: that programs do not build is told there.
     """
     guess = version.rpartition("-")[2]
     if "pocl" not in version.lower() or guess not in _GUESSES:
@@ -120,7 +120,7 @@ def name_processor(version: str, record: int) -> None:
         return
     try:
         features = _features()
-        if guess != "generic" and "avx512f" not in features:  # a good guess
+        if guess != "generic" and "avx512f" not in features:  # the name will do
             return
         name = _like(features)
         if name and _rename(record, guess, name):

@@ -82,7 +82,7 @@ class Grid:
 
     def points(self, places: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
         """Points (n, 3) in the scene (kernels/common.cl) of canvas positions (n, 2), full-resolution px."""
-        x, y = ((places - (self.region.left, self.region.top)) * self._ratios).T
+        x, y = ((places - (self.region.left, self.region.top)) * self.ratios).T
         if not self.lens[1]:
             return np.stack([x, y, np.zeros_like(x)], 1)
         lon, lat = self.lens[0] + x * self.lens[1], self.lens[2] - y * self.lens[3]
@@ -94,10 +94,10 @@ class Grid:
         if self.lens[1]:
             lon, lat = np.arctan2(x, y), np.arctan2(z, np.hypot(x, y))
             x, y = (lon - self.lens[0]) / self.lens[1], (self.lens[2] - lat) / self.lens[3]
-        return np.stack([x, y], 1) / self._ratios + (self.region.left, self.region.top)
+        return np.stack([x, y], 1) / self.ratios + (self.region.left, self.region.top)
 
     @property
-    def _ratios(self) -> tuple[float, float]:
+    def ratios(self) -> tuple[float, float]:
         """Pixels of the grid per full-resolution pixel."""
         return self.width / self.region.width, self.height / self.region.height
 
