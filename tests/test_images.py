@@ -178,6 +178,7 @@ UNUSABLE = {
         p, np.zeros((5, 7), np.uint8), photometric="palette", colormap=np.zeros((3, 256), np.uint16)
     ),
     "CMYK": lambda p: tifffile.imwrite(p, np.zeros((5, 7, 4), np.uint8), photometric="separated"),
+    "Lab": lambda p: tifffile.imwrite(p, np.zeros((5, 7, 3), np.uint8), photometric="cielab"),
     "1-bit": lambda p: tifffile.imwrite(p, np.zeros((5, 7), bool), photometric="minisblack"),
     "int16": lambda p: tifffile.imwrite(p, np.zeros((5, 7, 3), np.int16), photometric="rgb"),
     "double": lambda p: tifffile.imwrite(p, np.zeros((5, 7, 3), np.float64), photometric="rgb"),
