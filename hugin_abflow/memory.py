@@ -27,7 +27,8 @@ _CONTAINER_LIMITS = ("/sys/fs/cgroup/memory.max", "/sys/fs/cgroup/memory/memory.
 
 def parse_size(text: str) -> int:
     """Bytes of ``800M``, ``1.5G``, ``2GiB``; units are powers of 1024. Raises `SettingsError`."""
-    found = re.fullmatch(r"(\d+(?:\.\d*)?)\s*([KMGT]?)(?:i?B)?", text.strip(), re.IGNORECASE)
+    # so many digits that a float still holds them
+    found = re.fullmatch(r"(\d{1,99}(?:\.\d*)?)\s*([KMGT]?)(?:i?B)?", text.strip(), re.IGNORECASE)
     if not found:
         raise SettingsError(f"{text!r} is no size; give a number with K, M or G, such as 800M or 1.5G")
     return int(float(found[1]) * _UNITS[found[2].upper()])

@@ -9,6 +9,7 @@ import click
 
 from hugin_abflow import memory
 from hugin_abflow.errors import SettingsError
+from hugin_abflow.settings import MOST_MEMORY
 
 # Where a context keeps the arguments as they were given.
 ARGUMENTS = "hugin_abflow.arguments"
@@ -23,16 +24,20 @@ class Option(click.Option):
 
 
 class Size(click.ParamType):  # type: ignore[type-arg]
-    """Bytes, as `memory.parse_size` reads them."""
+    """Bytes of memory, as `memory.parse_size` reads them; 0, which is no choice in `Settings`, is none."""
 
     name = "size"
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> int:
-        """The number of bytes; ends with click's message for what is none."""
+        """The number of bytes; ends with click's message for what is none, or out of range."""
         try:
-            return memory.parse_size(value)
+            size = memory.parse_size(value)
         except SettingsError as error:
             self.fail(str(error), param, ctx)
+        if not 0 < size <= MOST_MEMORY:
+            most = f"{MOST_MEMORY >> 40}T"
+            self.fail(f"{value} is out of range; choose more than 0, at most {most}", param, ctx)
+        return size
 
 
 class NewFile(click.Path):

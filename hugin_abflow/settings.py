@@ -16,6 +16,7 @@ LargeMotion = Literal["auto", "on", "off"]
 
 _WORKING_PIXELS: dict[FlowQuality, int] = {"fast": 500_000, "normal": 2_100_000, "best": 6_300_000}
 _LEAST_WORKING_PIXELS = 1024
+MOST_MEMORY = 1 << 50  # of `Settings.max_memory`
 
 
 @dataclass(frozen=True)
@@ -89,7 +90,7 @@ class Settings:
             ("border_feather", 0, 1000),
             ("fixed_point_steps", 0, 20),
             ("band_rows", 0, 1 << 20),
-            ("max_memory", 0, 1 << 50),
+            ("max_memory", 0, MOST_MEMORY),
             ("threads", 0, 1024),
         ):
             value = getattr(self, name)

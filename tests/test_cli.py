@@ -142,6 +142,10 @@ def test_layers_takes_several_files(calls: Calls, given: str, layers: str, proje
         (["--softmax-sharpness", "nan", "a.pto"], "nan"),
         (["--softmax-sharpness", "-1", "a.pto"], "-1"),
         (["--flow-magnitude", "1e9", "a.pto"], "choose a value from 0 to 10000"),
+        (["--max-memory", "0", "a.pto"], "'--max-memory': 0 is out of range"),
+        (["--max-memory", "0.1B", "a.pto"], "'--max-memory': 0.1B is out of range"),
+        (["--max-memory", "1025T", "a.pto"], "choose more than 0, at most 1024T"),
+        (["--max-memory", "9" * 400, "a.pto"], "is no size"),
         (["a.pto", "--layers"], "--layers"),
         (["--report", "a.pto", "b.pto"], "'--report': a.pto is a project"),  # from --report *.pto
         (["--log", "a.PTO", "b.pto"], "'--log': a.PTO is a project"),
