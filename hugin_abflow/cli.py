@@ -99,7 +99,7 @@ _information = partial(click.option, cls=Option, group="Information")
     "--jpeg-quality",
     metavar="PERCENT",
     type=click.IntRange(1, 100),
-    help="JPEG quality. [default: the project's]",
+    help="Quality of JPEG, and of jpeg in TIFF. [default: the project's]",
 )
 @_result(
     "--no-metadata",

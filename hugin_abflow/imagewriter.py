@@ -71,10 +71,10 @@ class ImageWriter:
                     with 8 bit, PNG with 8 or 16; EXR needs floats.
     offset          (x, y) on the canvas: TIFF position at 150 dpi as enblend writes it, EXR data window.
     canvas_size     (width, height) for the EXR display window; default: the data window.
-    compression     TIFF: none, lzw (default), packbits, deflate, zstd, jpeg (or jpeg:85; 8-bit RGB, else
-                    deflate, with a warning; it blurs alpha, too). EXR: none, rle, zips, zip (default),
+    compression     TIFF: none, lzw (default), packbits, deflate, zstd, jpeg (8-bit RGB, else deflate, with
+                    a warning; it blurs alpha, too). EXR: none, rle, zips, zip (default),
                     piz. JPEG and PNG: not used.
-    jpeg_quality    1..100, default 90.
+    jpeg_quality    of JPEG, and of jpeg in TIFF; 1..100, default 90.
     threads         cores that encode TIFF; default: all.
     icc             profile, carried as it is; PNG leaves a broken one out, with a warning.
     metadata        EXIF and XMP; of EXR what OpenImageIO carries, as its attributes.
@@ -400,17 +400,14 @@ def _compression(
         return "deflate", None
     known = _TIFF_COMPRESSIONS if format_name == "tiff" else _EXR_COMPRESSIONS
     wanted = (name or ("lzw" if format_name == "tiff" else "zip")).lower()
-    if wanted.partition(":")[0] not in known:
+    if wanted not in known:
         offered = ", ".join(COMPRESSIONS["TIFF" if format_name == "tiff" else "EXR"])
         raise OutputError(f"{path}: compression {name!r}; choose one of {offered}")
-    used = known[wanted.partition(":")[0]]
+    used = known[wanted]
     if used == "jpeg":
         if stored != np.uint8 or channels != 3:  # of grey OpenImageIO misreads the alpha
             log.warning("%s: jpeg in TIFF is for 8-bit RGB; deflate is used", path)
             return "deflate", None
-        quality_given = wanted.partition(":")[2]
-        if jpeg_quality is None and quality_given.isdecimal():
-            jpeg_quality = int(quality_given)
         return f"jpeg:{_jpeg_quality(path, jpeg_quality)}", None
     return used, used
 

@@ -317,6 +317,8 @@ def test_output_errors_name_the_file_and_what_to_do(tmp_path):
         write_image(make_folder(tmp_path / "b.tif"), pixels)
     with pytest.raises(OutputError, match=r"'lzma'; choose one of none, packbits, lzw, deflate, zstd, jpeg$"):
         write_image(tmp_path / "a.tif", pixels, compression="lzma")
+    with pytest.raises(OutputError, match="'jpeg:85'; choose one of"):  # quality has an argument of its own
+        write_image(tmp_path / "a.tif", pixels, compression="jpeg:85")
     with pytest.raises(OutputError, match="quality 101"):
         write_image(tmp_path / "a.jpg", pixels, jpeg_quality=101)
     with pytest.raises(OutputError, match="65500"):

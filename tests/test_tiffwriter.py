@@ -27,11 +27,11 @@ def test_jpeg_in_tiff_is_as_good_as_asked_for(tmp_path):
     y, x = np.mgrid[:77, :131]
     smooth = np.stack([x, y, x + y, np.full_like(x, 255)], -1).astype(np.uint8)
     sizes = []
-    for compression, quality in (("jpeg", None), ("jpeg:30", None), ("jpeg", 98)):
-        write_image(tmp_path / "a.tif", smooth, compression=compression, jpeg_quality=quality)
+    for quality in (None, 30, 98):
+        write_image(tmp_path / "a.tif", smooth, compression="jpeg", jpeg_quality=quality)
         assert int(tifffile.TiffFile(tmp_path / "a.tif").pages[0].compression) == 7
         for read in (tifffile.imread(tmp_path / "a.tif"), whole(read_layer(tmp_path / "a.tif"))):
-            assert np.abs(read.astype(int) - smooth).max() <= (24 if compression == "jpeg:30" else 6)
+            assert np.abs(read.astype(int) - smooth).max() <= (24 if quality == 30 else 6)
         sizes.append((tmp_path / "a.tif").stat().st_size)
     assert sizes[1] < sizes[0] < sizes[2]
 
