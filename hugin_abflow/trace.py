@@ -8,10 +8,11 @@ from __future__ import annotations
 
 import json
 import os
+import stat
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, TextIO
 
@@ -58,8 +59,17 @@ class _Recorder:
         with self._lock:
             self._events += events
 
-    def write(self, file: TextIO) -> None:
-        json.dump({"traceEvents": self.take(), "displayTimeUnit": "ms"}, file)
+    def write(self, file: TextIO, path: Path) -> None:
+        """Write all into `file` and close it; of half a trace nothing is left."""
+        ordinary = stat.S_ISREG(os.fstat(file.fileno()).st_mode)  # a device stays
+        try:
+            with file:
+                json.dump({"traceEvents": self.take(), "displayTimeUnit": "ms"}, file)
+        except BaseException:
+            if ordinary:
+                with suppress(OSError):
+                    path.resolve().unlink()  # through a link, as it was written
+            raise
 
 
 @contextmanager
@@ -83,7 +93,7 @@ def extend(events: Sequence[Event]) -> None:
 def recording(path: Path | None) -> Iterator[None]:
     """Record what happens inside, also what fails, into the file `path`; None: do nothing.
 
-    Raises `OutputError` if the file cannot be written.
+    Raises `OutputError` if the file cannot be written; never instead of what ended the block.
     """
     global _recorder
     if path is None:
@@ -92,14 +102,23 @@ def recording(path: Path | None) -> Iterator[None]:
     try:
         file = path.open("w", encoding="utf-8")  # now: a run may be long
     except OSError as error:
-        raise OutputError(f"the profile {path} cannot be written: {error.strerror}; name another") from None
-    with file:
-        recorder = _recorder = _Recorder()
+        raise _unwritable(path, error) from None
+    recorder = _recorder = _Recorder()
+    complete = False
+    try:
+        yield
+        complete = True
+    finally:
+        _recorder = None
         try:
-            yield
-        finally:
-            _recorder = None
-            recorder.write(file)
+            recorder.write(file, path)
+        except OSError as error:
+            if complete:
+                raise _unwritable(path, error) from None
+
+
+def _unwritable(path: Path, error: OSError) -> OutputError:
+    return OutputError(f"the profile {path} cannot be written: {error.strerror}; name another")
 
 
 def is_recording() -> bool:

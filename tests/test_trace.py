@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 import threading
 import weakref
 from pathlib import Path
-from typing import Any
+from typing import Any, TextIO
 
 import numpy as np
 import pytest
@@ -134,6 +135,32 @@ def test_a_profile_that_cannot_be_written_ends_the_run_before_it_starts(
     assert cli.main([str(project(tmp_path)), "--profile", str(tmp_path)]) == ExitCode.OUTPUT
     assert "name another" in capsys.readouterr().err
     assert not (tmp_path / "pano.tif").exists()
+
+
+def test_half_a_profile_is_told_and_removed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def fill(values: object, file: TextIO) -> None:
+        file.write("half")
+        raise OSError(errno.ENOSPC, "No space left")
+
+    monkeypatch.setattr(json, "dump", fill)
+    (tmp_path / "link").symlink_to(tmp_path / "trace.json")
+    with pytest.raises(OutputError, match="No space left"), trace.recording(tmp_path / "link"):
+        pass
+    assert [path.name for path in tmp_path.iterdir()] == ["link"]
+    with pytest.raises(ValueError, match="mine"), trace.recording(tmp_path / "trace.json"):
+        raise ValueError("mine")  # not hidden by the other
+    assert [path.name for path in tmp_path.iterdir()] == ["link"]
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="needs named pipes")
+def test_a_profile_that_fails_as_it_is_closed_is_told(tmp_path: Path) -> None:
+    """That is when a short one is written; what is no ordinary file stays."""
+    pipe = tmp_path / "pipe"
+    os.mkfifo(pipe)
+    reader = os.open(pipe, os.O_RDONLY | os.O_NONBLOCK)
+    with pytest.raises(OutputError, match="pipe cannot be written"), trace.recording(pipe):
+        os.close(reader)
+    assert pipe.is_fifo()
 
 
 def test_processes_side_by_side_have_one_trace(tmp_path: Path) -> None:
