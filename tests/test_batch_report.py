@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import re
 from collections.abc import Callable
 from pathlib import Path
@@ -101,3 +102,27 @@ def test_report_is_replaced_whole(tmp_path: Path) -> None:
     with pytest.raises(OutputError, match="--report"):
         write_report(report, [], [])
     assert [path.name for path in tmp_path.iterdir()] == ["r.json"]
+
+
+def test_report_follows_links(tmp_path: Path) -> None:
+    (tmp_path / "else").mkdir()
+    link, report = tmp_path / "link.json", tmp_path / "else" / "r.json"
+    link.symlink_to(report)
+    for _ in range(2):  # of a new file, and of one that is replaced
+        write_report(link, [Record(Path("a.pto"))], [])
+        assert json.loads(report.read_text("utf-8"))["projects"] and link.is_symlink()
+    assert [path.name for path in report.parent.iterdir()] == ["r.json"]
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="needs named pipes")
+def test_a_pipe_gets_one_report(replace: Callable[..., None], tmp_path: Path) -> None:
+    replace(lambda path, **keywords: path.with_suffix(".tif"))
+    os.mkfifo(tmp_path / "pipe")
+    (tmp_path / "link").symlink_to("pipe")
+    reader = os.open(tmp_path / "pipe", os.O_RDONLY | os.O_NONBLOCK)
+    try:
+        assert cli.main([str(tmp_path / "a.pto"), "--report", str(tmp_path / "link")]) == 0
+        assert len(json.loads(os.read(reader, 1 << 16))["projects"]) == 1
+    finally:
+        os.close(reader)
+    assert (tmp_path / "pipe").is_fifo() and (tmp_path / "link").is_symlink()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import stat
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -76,13 +77,29 @@ class Record:
         return cls(**known)
 
 
+def is_special(path: Path) -> bool:
+    """Whether it is a pipe or a device, or leads to one: it can be written to, but not replaced."""
+    try:
+        mode = path.stat().st_mode
+    except OSError:  # there is nothing yet, or writing will tell why not
+        return False
+    return not stat.S_ISREG(mode) and not stat.S_ISDIR(mode)
+
+
 def write_json(path: Path, values: object) -> None:
-    """Write values as readable JSON, whole or not at all. Raises OSError."""
+    """Write values as readable JSON. Raises OSError.
+
+    A file is written whole or not at all, through links; a pipe or a device directly.
+    """
     # names that are not UTF-8 stay readable for JSON's readers as escapes
     text = json.dumps(values, indent=2, ensure_ascii=False).encode("utf-8", "backslashreplace")
-    with part_beside(path) as part:
+    if is_special(path):
+        path.write_bytes(text + b"\n")
+        return
+    final = Path(os.path.realpath(path))  # through a link: replace what it points to, not the link
+    with part_beside(final) as part:
         with part.open("wb") as file:
             file.write(text + b"\n")
             file.flush()
             os.fsync(file.fileno())  # else a power cut may leave an empty file of the final name
-        part.replace(path)
+        part.replace(final)

@@ -53,7 +53,7 @@ def _shown(project: Path) -> str:
 
 
 def write_report(path: Path, records: Sequence[Record], arguments: Sequence[str]) -> None:
-    """Write the report, whole or not at all. Raises `OutputError`."""
+    """Write the report as `write_json` does. Raises `OutputError`."""
     try:
         write_json(path, summary(records, arguments))
     except OSError as error:

@@ -14,7 +14,7 @@ from hugin_abflow import trace
 from hugin_abflow.batch.cluster import Cluster
 from hugin_abflow.batch.display import Display, choose_display, open_log
 from hugin_abflow.batch.pool import Alone, Pool
-from hugin_abflow.batch.record import Record
+from hugin_abflow.batch.record import Record, is_special
 from hugin_abflow.batch.report import print_table, write_report
 from hugin_abflow.batch.task import Task
 from hugin_abflow.errors import AbflowError, ExitCode, OutputError
@@ -63,7 +63,7 @@ def run(tasks: Iterable[Task | None], how: Run, lone: bool = False) -> ExitCode:
     with ExitStack() as stack:
         log = stack.enter_context(open_log(how.log))
         stack.enter_context(trace.recording(how.profile))
-        if how.report:
+        if how.report and not is_special(how.report):  # who reads a pipe expects one report
             write_report(how.report, [], how.arguments)  # now: a run may be long
         try:
             with choose_display(lone, how.quiet, how.verbose, log) as display:
