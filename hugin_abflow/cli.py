@@ -69,8 +69,7 @@ def _names_of_compressions() -> str:
     return "; ".join(f"{kind}: {', '.join(names)}" for kind, names in COMPRESSIONS.items())
 
 
-_file = click.Path(path_type=Path)
-_new_file = NewFile(path_type=Path)
+_file, _new_file, _new_image = click.Path(path_type=Path), NewFile(), NewFile(image=True)
 _layers = partial(click.option, cls=Option, group="Layers")
 _blending = partial(click.option, cls=Option, group="Blending", show_default=True)
 _result = partial(click.option, cls=Option, group="Result")
@@ -85,7 +84,7 @@ _information = partial(click.option, cls=Option, group="Information")
     "-o",
     "--output",
     metavar="FILE",
-    type=_new_file,
+    type=_new_image,
     help="The panorama; its ending chooses the type: .tif, .jpg, .png or .exr. Only with one project. "
     "[default: name and type that the project asks for, beside it]",
 )

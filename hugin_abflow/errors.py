@@ -124,7 +124,7 @@ class SettingsError(AbflowError):
 
 
 class SameOutputError(AbflowError):
-    """Two projects of a run would write the same panorama."""
+    """Two projects of a run would write the same panorama, or two options name the same file."""
 
     exit_code = ExitCode.USAGE
 

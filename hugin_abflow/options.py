@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 import click
 
 from hugin_abflow import memory
 from hugin_abflow.errors import SettingsError
+from hugin_abflow.images import ENDINGS
 from hugin_abflow.settings import MOST_MEMORY
 
 # Where a context keeps the arguments as they were given.
@@ -41,13 +44,22 @@ class Size(click.ParamType):  # type: ignore[type-arg]
 
 
 class NewFile(click.Path):
-    """A file to be written: no project, as where its name was forgotten before ``*.pto``."""
+    """A file to be written: no project and, unless `image`, no photo, as where its own name was forgotten
+    before ``*.pto``.
+    """
 
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
-        """Its path; ends with click's message for a project."""
-        path = super().convert(value, param, ctx)
-        if str(path).lower().endswith(".pto"):
-            self.fail(f"{value} is a project, which is never written to; name another file", param, ctx)
+    def __init__(self, image: bool = False) -> None:
+        super().__init__(path_type=Path)
+        self.image = image
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Path:
+        """Its path; ends with click's message for a project or a photo, also behind a link."""
+        path = Path(os.fsdecode(super().convert(value, param, ctx)))
+        for name in (str(path).lower(), os.path.realpath(path).lower()):
+            if name.endswith(".pto"):
+                self.fail(f"{value} is a project, which is never written to; name another file", param, ctx)
+            if name.endswith(tuple(ENDINGS)) and not self.image:
+                self.fail(f"{value} is an image by its name; name another file", param, ctx)
         return path
 
 

@@ -3,6 +3,7 @@ tests/test_cli_end_to_end.py runs the real one."""
 
 from __future__ import annotations
 
+import os
 import re
 import tomllib
 from collections.abc import Callable
@@ -151,6 +152,11 @@ def test_layers_takes_several_files(calls: Calls, given: str, layers: str, proje
         (["--log", "a.PTO", "b.pto"], "'--log': a.PTO is a project"),
         (["--profile", "a.pto", "b.pto"], "'--profile': a.pto is a project"),
         (["-o", "a.pto", "b.pto"], "a.pto is a project"),
+        (["--report", "a.jpg", "b.pto"], "'--report': a.jpg is an image"),  # from --report *.jpg
+        (["--log", "a.TIFF", "b.pto"], "'--log': a.TIFF is an image"),
+        (["--profile", "a.tif", "-o", "a.tif", "b.pto"], "'--profile': a.tif is an image"),
+        (["--profile", "a", "--report", "./a", "b.pto"], "--report and --profile both name"),
+        (["--log", "a", "--report", "a", "b.pto"], "--report and --log both name a; give each its own"),
     ],
 )
 def test_wrong_command_line(
@@ -161,6 +167,21 @@ def test_wrong_command_line(
     assert output.err.startswith("hugin-abflow: error: ") and part in output.err
     assert "Traceback" not in output.err and output.out == ""
     assert calls == []
+
+
+def test_what_a_link_leads_to_is_not_overwritten(
+    calls: Calls, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    for name in ("a.pto", "photo.jpg"):
+        link = tmp_path / f"{name}.json"
+        link.symlink_to(name)
+        assert cli.main(["b.pto", "--report", str(link)]) == ExitCode.USAGE
+        assert f"{link} is " in capsys.readouterr().err
+    assert calls == []
+
+
+def test_devices_take_several_outputs(calls: Calls) -> None:
+    assert cli.main(["a.pto", "--log", os.devnull, "--report", os.devnull, "--profile", os.devnull]) == 0
 
 
 # Results, errors and exit codes

@@ -17,7 +17,7 @@ from hugin_abflow.batch.pool import Alone, Pool
 from hugin_abflow.batch.record import Record, is_special
 from hugin_abflow.batch.report import print_table, write_report
 from hugin_abflow.batch.task import Task
-from hugin_abflow.errors import AbflowError, ExitCode, OutputError
+from hugin_abflow.errors import AbflowError, ExitCode, OutputError, SameOutputError
 from hugin_abflow.stitch import show_project
 from hugin_abflow.terminal import complain, messages, print_path, print_result
 
@@ -32,6 +32,8 @@ class Run:
     arguments   the command line, for the report.
     profile     file for the trace, see trace.py.
     scheduler   address of a Dask scheduler, whose workers do the work; None: this machine does.
+
+    Raises `SameOutputError` where two of the files are one.
     """
 
     jobs: int | None = None
@@ -42,6 +44,14 @@ class Run:
     arguments: Sequence[str] = ()
     profile: Path | None = None
     scheduler: str | None = None
+
+    def __post_init__(self) -> None:
+        named: dict[str, str] = {}
+        for option, file in (("--report", self.report), ("--log", self.log), ("--profile", self.profile)):
+            if file and not is_special(file):  # a terminal or /dev/null takes all of them
+                other = named.setdefault(os.path.realpath(file), option)
+                if other != option:
+                    raise SameOutputError(f"{other} and {option} both name {file}; give each its own file")
 
 
 def default_jobs() -> int:
