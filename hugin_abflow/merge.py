@@ -220,7 +220,7 @@ def _target(plan: Plan, layers: Sequence[Layer], output: Path | str | None) -> P
     inputs = [layer.file for layer in layers if layer.file is not None]
     if output is None:
         return plan.default_output(inputs)
-    refuse_input(Path(output), [plan.file, *(image.photo for image in plan.images), *inputs])
+    refuse_input(Path(output), [plan.file, *plan.photos, *inputs])
     return Path(output)
 
 

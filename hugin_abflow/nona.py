@@ -140,7 +140,7 @@ def _layer_path(prefix: str, index: int, ending: str) -> Path:
 def _find_under(plan: Plan, prefix: str) -> _Found | None:
     """Layers that begin with `prefix`, if any."""
     endings = (".exr", ".tif", ".tiff") if plan.hdr else (".tif", ".tiff", ".exr")
-    photos = {image.photo for image in plan.images}  # may be named alike: img0000.tif of img.pto
+    photos = set(plan.photos)  # may be named alike: img0000.tif of img.pto
     for ending in endings:
         paths = {image.index: _layer_path(prefix, image.index, ending) for image in plan.images}
         files = {index: path for index, path in paths.items() if path.is_file() and path not in photos}
@@ -431,7 +431,7 @@ def _failure(plan: Plan, folder: Path, code: int, lines: list[str]) -> NonaFaile
 
 def _keep(plan: Plan, prefix: str, made: dict[int, Path]) -> dict[int, Path]:
     """Move layers beside the project, each whole or not at all."""
-    photos = {image.photo.resolve() for image in plan.images}
+    photos = {photo.resolve() for photo in plan.photos}
     kept, advice = {}, "leave out --keep-layers or free the folder"
     for index, path in made.items():
         final = _layer_path(prefix, index, path.suffix)

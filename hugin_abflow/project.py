@@ -70,6 +70,7 @@ class Plan:
     canvas          the panorama's pixel grid; its crop is what is output.
     projection      of the canvas, in words.
     images          active images in the project's order.
+    photos          where all photos of the project are, those of images that are not active too: inputs.
     output          type of the panorama's file.
     hdr             layers are scene-linear EXR (nona ``-r hdr``) instead of TIFF in the photos' depth.
     ignore_exposure layers keep their photos' exposure (nona ``--ignore-exposure``), to be fused.
@@ -80,6 +81,7 @@ class Plan:
     canvas: Canvas
     projection: str
     images: tuple[PlannedImage, ...]
+    photos: tuple[Path, ...]
     output: Output
     hdr: bool
     hugin_prefix: str
@@ -107,7 +109,7 @@ class Plan:
         If that is a photo of the project or one of `taken` (the layers' files), ``pano_abflow.tif``,
         then ``pano_abflow2.tif`` and so on: inputs are never replaced.
         """
-        inputs = {_key(path) for path in [*(image.photo for image in self.images), *taken]}
+        inputs = {_key(path) for path in [*self.photos, *taken]}
         path, attempt = self.folder / f"{self.stem}{self.output.ending}", 0
         while _key(path) in inputs:
             attempt += 1
@@ -125,9 +127,10 @@ def read_plan(path: Path | str) -> Plan:
     file = Path(path).absolute()
     project = pto.load(file)
     names = [image.filename for image in project.images]
+    photos = tuple(locate_photo(file.parent, name) for name in names)
     images = tuple(
-        PlannedImage(image.index, image.filename, locate_photo(file.parent, image.filename))
-        for image in project.images
+        PlannedImage(image.index, image.filename, photo)
+        for image, photo in zip(project.images, photos, strict=True)
         if not image.disabled
     )
     if not images:
@@ -138,6 +141,7 @@ def read_plan(path: Path | str) -> Plan:
         canvas=_canvas(file, project.panorama),
         projection=_projection(project.panorama.projection),
         images=images,
+        photos=photos,
         output=read_output(project, hdr),
         hdr=hdr,
         hugin_prefix=f"{_stem(names[0])} - {_stem(names[-1])}",

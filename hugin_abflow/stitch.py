@@ -232,8 +232,7 @@ class _Maker:
     def _target(self, step: Step, files: dict[str, Path], scratch: Path) -> Path:
         """Where the result goes, which must be none of the inputs."""
         target = (self.plan.folder if step.wanted else scratch) / step.result
-        photos = (image.photo for image in self.plan.images)
-        refuse_input(target, [self.plan.file, *photos, *(files[name] for name in step.inputs)])
+        refuse_input(target, [self.plan.file, *self.plan.photos, *(files[name] for name in step.inputs)])
         return target
 
     def _run(self, step: Step, files: dict[str, Path], scratch: Path) -> Path:

@@ -242,6 +242,16 @@ def test_output_may_be_no_input(folder):
     assert (folder / "pano0000.tif").read_bytes() == before
 
 
+def test_output_may_be_no_photo_of_a_disabled_image(folder):
+    added = "\n#-hugin  cropFactor=1 disabled\n#-hugin  cropFactor=1\ni w100"
+    (folder / "pano.pto").write_text(PROJECT.replace("\ni w100", added, 1))
+    photo = folder / "a.jpg"
+    photo.write_bytes(b"a photo")
+    with pytest.raises(OutputError, match=r"a\.jpg is an input"):
+        merge_project(folder / "pano.pto", prefix="pano", output=photo)
+    assert photo.read_bytes() == b"a photo"
+
+
 def test_device_that_is_none(folder):
     with pytest.raises(DeviceError, match="no OpenCL device fits --device nonesuch"):
         merge_project(folder / "pano.pto", Settings(device="nonesuch"), prefix="pano")

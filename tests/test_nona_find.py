@@ -98,6 +98,21 @@ def test_photos_named_like_layers_are_no_layers(make_project, nona, temporary):
         pass
 
 
+def test_photos_of_disabled_images_are_no_layers(make_project, nona, temporary):
+    project = make_project(photo="pano{:04d}.tif", disabled=(0,))
+    (project.parent / "pano0001.tif").rename(project.parent / "first.tif")
+    text = project.read_text().replace("pano0001", "first").replace("pano0002", "last")
+    project.write_text(text.replace("pano0000", "pano0002").replace("last", "pano0000"))
+    plan = read_plan(project)
+    photo = plan.folder / "pano0002.tif"  # of the first image, named like the last one's layer
+    before = photo.read_bytes()
+    with open_layers(plan) as layers:
+        assert all(temporary in layer.file.parents for layer in layers)
+    with pytest.raises(OutputError, match=r"pano0002\.tif is a photo"), open_layers(plan, keep_layers=True):
+        pass
+    assert photo.read_bytes() == before
+
+
 def test_only_missing_layers_are_made(make_project, nona):
     plan = read_plan(make_project())
     remap(plan, "pano")

@@ -213,8 +213,10 @@ def test_default_output_is_beside_the_project_and_never_an_input(make_project, t
     assert plan.default_output([first, second]) == plan.folder / "mein päno_abflow2.tif"
 
 
-def test_default_output_is_no_photo(make_project):
-    plan = read_plan(make_project(stem="photo 1"))
+@pytest.mark.parametrize("disabled", [(), (1,)])
+def test_default_output_is_no_photo(make_project, disabled):
+    plan = read_plan(make_project(stem="photo 1", disabled=disabled))
+    assert [photo.name for photo in plan.photos] == ["photo 0.tif", "photo 1.tif", "photo 2.tif"]
     assert plan.default_output() == plan.folder / "photo 1_abflow.tif"
 
 

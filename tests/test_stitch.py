@@ -221,8 +221,9 @@ def test_compression_that_enfuse_does_not_know(make_project: ProjectMaker, caplo
     assert caplog.text.count("enfuse knows no compression zstd; its files get LZW") == 1
 
 
-def test_photo_is_never_replaced(make_project: ProjectMaker) -> None:
-    project = make_project(panorama=CANVAS, photo="pano_stack_ldr_{:04d}.tif".replace("{:04d}", "000{}"))
+@pytest.mark.parametrize("disabled", [(), (0,)])
+def test_photo_is_never_replaced(make_project: ProjectMaker, disabled: tuple[int, ...]) -> None:
+    project = make_project(panorama=CANVAS, photo="pano_stack_ldr_000{}.tif", disabled=disabled)
     project.write_text(project.read_text() + asked(Kind.STACKS))
     before = {path: path.read_bytes() for path in project.parent.iterdir()}
     with pytest.raises(OutputError, match=r"pano_stack_ldr_0000\.tif is an input"):
