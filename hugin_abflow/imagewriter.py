@@ -55,6 +55,7 @@ _EXR_COMPRESSIONS = {"none": "none", "rle": "rle", "zip": "zip", "zips": "zips",
 _PNG_LEVEL = 4  # twice as fast as zlib's usual 6 for 2 % more bytes
 _JPEG_LIMIT = 65500  # pixels a side, of libjpeg
 _JPEG_WORST, _JPEG_LEAST = 2, 1 << 16  # bytes that noise takes for each sample, and a file beside them
+_JPEG_BLANK = 1 / 64  # bytes that nothing takes for each sample
 _CLASSIC_LIMIT = 0xFFFFFFFF - (16 << 20)  # bytes of a classic TIFF, with room for tags and metadata
 _LZW_WORST = 1.5  # LZW codes of up to 12 bits may stand for a byte each
 
@@ -202,6 +203,8 @@ class ImageWriter:
                 big=int(np.prod(shape)) * self.stored.itemsize * worst > _CLASSIC_LIMIT,
             )  # fmt: skip
             return ""
+        if self.format == "jpeg":
+            self._refuse_full_disk(0)
         self._output = oiio.ImageOutput.create(str(self._part))
         if self._output is None:
             return str(oiio.geterror())
@@ -237,7 +240,7 @@ class ImageWriter:
             self._done += len(rows)
             return
         if self.format == "jpeg":
-            self._refuse_full_disk(_JPEG_WORST * samples.nbytes + _JPEG_LEAST)
+            self._refuse_full_disk(samples.nbytes)
         top = self._spec.y + self._done
         with trace.span("encode", trace.FILE, rows=len(rows)):
             written = self._output.write_scanlines(top, top + len(rows), 0, samples)
@@ -257,8 +260,13 @@ class ImageWriter:
         """Whether a disk was full, of which PNG's writer only takes a note; TIFF's notes are no errors."""
         return self.format == "png" and bool(output.has_error)
 
-    def _refuse_full_disk(self, needed: int) -> None:
-        """Raise `OutputError` before libjpeg meets a full disk: it would end the process, untidily."""
+    def _refuse_full_disk(self, samples: int) -> None:
+        """Raise `OutputError` before libjpeg meets a full disk: it would end the process, untidily.
+
+        samples     that are written next. OpenImageIO completes with blanks what is closed before its end.
+        """
+        blank = _JPEG_BLANK * self.width * (self.height - self._done) * self.channels
+        needed = _JPEG_WORST * samples + blank + _JPEG_LEAST
         disk = shutil.disk_usage(self._part.parent)
         if disk.total and disk.free < needed:  # some network folders say 0 of 0
             raise self._failure(os.strerror(errno.ENOSPC))
@@ -299,6 +307,8 @@ class ImageWriter:
             tiff.abandon()
         output, self._output = self._output, None
         if output is not None:
+            with contextlib.suppress(OSError):
+                os.truncate(self._part, 0)  # room for the blanks that complete a JPEG
             with contextlib.suppress(RuntimeError):
                 output.close()
         self._scratch.close()

@@ -6,6 +6,7 @@ import os
 import shutil
 import signal
 import subprocess
+import sys
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
@@ -159,6 +160,23 @@ def noise(dtype, channels: int = 3, width: int = 131, height: int = 77, seed: in
         pixels = np.rint(values * full_scale(dtype)).astype(dtype)
     pixels[..., -1] = np.where(values[..., -1] > 0.4, full_scale(dtype), 0)
     return pixels
+
+
+def on_small_disk(folder: Path, size: str, script: str) -> subprocess.CompletedProcess[str]:
+    """Run a shell's script in `folder`, on which a disk of `size` is mounted for as long as it runs."""
+    if sys.platform != "linux":
+        pytest.skip("needs Linux's file systems")
+    inside = f'mount -t tmpfs -o size={size} none "$0" && cd "$0" && {script}'
+    done = subprocess.run(
+        ["unshare", "--user", "--map-root-user", "--mount", "sh", "-c", inside, str(folder)],
+        capture_output=True,
+        text=True,
+        timeout=120,
+    )
+    # some containers forbid it; a disk cannot be filled otherwise
+    if "unshare" in done.stderr or "mount:" in done.stderr:
+        pytest.skip(f"no disk of its own can be mounted here: {done.stderr.strip()}")
+    return done
 
 
 def names_in(folder: Path) -> list[str]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import os
+import shlex
 import shutil
 import subprocess
 import sys
@@ -16,7 +17,7 @@ import numpy as np
 import OpenImageIO as oiio
 import pytest
 import tifffile
-from conftest import DTYPES, ICC, names_in, noise, photo_pixels, whole
+from conftest import DTYPES, ICC, names_in, noise, on_small_disk, photo_pixels, whole
 
 from hugin_abflow import imagewriter
 from hugin_abflow.errors import OutputError
@@ -394,6 +395,30 @@ def test_jpeg_stops_before_the_disk_is_full(tmp_path, monkeypatch):
     disk.total = disk.free = 0
     write_image(tmp_path / "b.jpg", pixels)
     assert (tmp_path / "b.jpg").is_file()
+
+
+_ON_A_FULL_DISK = """
+import os, sys, numpy as np
+from hugin_abflow.errors import OutputError
+from hugin_abflow.images import ImageWriter
+noise = np.random.default_rng(0).integers(0, 256, (4, 4001, 4), np.uint8)
+for rows, height in ((4, 3003), (0, 40003)):  # it fills up; even blanks have no room
+    try:
+        with ImageWriter("a.jpg", 4001, height, 3, np.uint8) as writer:
+            for _ in range(height // 4 if rows else 0):
+                writer.write_rows(noise)
+    except OutputError as error:
+        print(error)
+print(os.listdir("."))
+"""
+
+
+def test_jpeg_is_given_up_on_a_full_disk(tmp_path):
+    """OpenImageIO completes a JPEG that is given up; without room for that libjpeg ended the process."""
+    done = on_small_disk(tmp_path, "1m", shlex.join([sys.executable, "-c", _ON_A_FULL_DISK]))
+    *refused, left = done.stdout.splitlines()
+    assert len(refused) == 2 and all("a.jpg cannot be written: No space left" in line for line in refused)
+    assert left == "[]" and done.returncode == 0
 
 
 @pytest.mark.parametrize("dtype", DTYPES)
