@@ -21,6 +21,8 @@ from contextlib import contextmanager, suppress
 from functools import partial
 from pathlib import Path
 
+from hugin_abflow.errors import OutputError
+
 _HOST = hashlib.blake2b(platform.node().encode(), digest_size=4).hexdigest()
 _PART = re.compile(r"\.abflow-([0-9a-f]{8})-[0-9a-f]{12}(\.\w+)?")
 _FOLDER = re.compile(r"hugin-abflow-([0-9a-f]{8})-\w+")
@@ -77,23 +79,28 @@ def _create(final: Path, suffix: str) -> tuple[Path, int | None]:
 
 @contextmanager
 def work_folder() -> Iterator[Path]:
-    """A folder for temporary files under TMPDIR; nothing is left of it. Raises OSError."""
+    """A folder for temporary files under TMPDIR; nothing is left of it. Raises `OutputError`."""
     parent = root()
     sweep(parent)
     folder: Path | None = None
     descriptor: int | None = None
     try:
-        while True:
-            folder = parent / f"hugin-abflow-{_HOST}-{secrets.token_hex(6)}"
-            _ours.add(folder)
-            folder.mkdir(0o700)
-            with suppress(FileNotFoundError):  # swept before it had a lock
-                descriptor = os.open(folder / _LOCK, os.O_CREAT | os.O_WRONLY, 0o600)
-                _lock(descriptor)
-                if os.fstat(descriptor).st_nlink:
-                    break
-                os.close(descriptor)  # swept before it was locked
-                descriptor = None
+        try:
+            while True:
+                folder = parent / f"hugin-abflow-{_HOST}-{secrets.token_hex(6)}"
+                _ours.add(folder)
+                folder.mkdir(0o700)
+                with suppress(FileNotFoundError):  # swept before it had a lock
+                    descriptor = os.open(folder / _LOCK, os.O_CREAT | os.O_WRONLY, 0o600)
+                    _lock(descriptor)
+                    if os.fstat(descriptor).st_nlink:
+                        break
+                    os.close(descriptor)  # swept before it was locked
+                    descriptor = None
+        except OSError as error:
+            raise OutputError(
+                f"no temporary folder can be made in {parent}: {error.strerror}; TMPDIR chooses another place"
+            ) from None
         yield folder
     finally:
         if descriptor is not None:

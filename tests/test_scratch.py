@@ -13,6 +13,7 @@ import pytest
 from conftest import age, names_in
 
 from hugin_abflow import scratch
+from hugin_abflow.errors import OutputError
 from hugin_abflow.scratch import part_beside, sweep, work_folder
 
 # A process that makes both kinds, says so, and waits to be killed.
@@ -47,6 +48,13 @@ def test_nothing_is_left(root: Path) -> None:
         part.write_text("whole")
         part.replace(final)
     assert names_in(root) == ["pano.tif"] and final.read_text() == "whole"
+
+
+def test_place_that_takes_no_folder_is_told(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (root / "file").write_bytes(b"")
+    monkeypatch.setattr(scratch, "root", lambda: root / "file")
+    with pytest.raises(OutputError, match=r"in .*file: .*TMPDIR chooses another place"), work_folder():
+        pass
 
 
 def test_what_fails_leaves_nothing(root: Path) -> None:
