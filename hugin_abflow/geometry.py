@@ -71,7 +71,7 @@ def fields(
         device.run(
             "geometry", "geometry_activation", layer.box[2:],
             field, coefficient.blend, layer.box, grid.border,
-            float(settings.softmax_sharpness), float(settings.flow_magnitude), float(grid.circumference),
+            settings.softmax_sharpness, settings.flow_magnitude, float(grid.circumference),
             furthest, highest,
         )  # fmt: skip
     for layer, field, coefficient in zip(layers, result, coefficients, strict=True):

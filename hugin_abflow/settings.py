@@ -101,6 +101,8 @@ class Settings:
                 raise SettingsError(f"{name} is {value!r}; choose a {kind} from {low} to {high}")
             if not low <= value <= high:  # NaN neither
                 raise SettingsError(f"{name} is {value}; choose a value from {low} to {high}")
+            # else kernels would read the bits of an integer as a float
+            object.__setattr__(self, name, int(value) if whole else float(value))
         for name, kinds in (
             ("merge", MergeMode),
             ("interpolation", Interpolation),

@@ -256,9 +256,11 @@ def test_settings_of_a_wrong_type(values):
         Settings(**values)
 
 
-def test_numbers_of_numpy_are_settings():
-    settings = Settings(softmax_sharpness=np.float32(3), flow_magnitude=7, working_pixels=np.int64(5000))
-    assert (settings.softmax_sharpness, settings.flow_magnitude, settings.working_pixels) == (3, 7, 5000)
+def test_numbers_become_what_kernels_take():
+    """An integer's bits would be read as those of a tiny float."""
+    settings = Settings(softmax_sharpness=np.float32(3), border_feather=7, working_pixels=np.int64(5000))
+    numbers = settings.softmax_sharpness, settings.border_feather, settings.working_pixels
+    assert numbers == (3, 7, 5000) and list(map(type, numbers)) == [float, float, int]
 
 
 @pytest.mark.parametrize(
