@@ -26,7 +26,8 @@ from hugin_abflow.working import Grid, WorkingLayer
 # A pixel's brightest channel, of white, from which on it may be clipped, and where it surely is.
 _NEARLY, _SURELY = 0.9, 0.98
 # The softmax's own weights span e^10: with as much, layers are mixed next to the border of the darker one.
-_STRENGTH = 10.0
+# A little more, as dark spots are not clipped, and what white leaves of these looks like no photo.
+_STRENGTH = 12.0
 
 
 def excess(
