@@ -99,7 +99,9 @@ def lead(
     wrong = np.any([np.linalg.norm(way.residuals, axis=1) > parameters.agreement for way in ways], axis=0)
     if not wrong.any():
         return flows
-    reasons = doubts(guides.at_a, ways[0].moves, parameters.radius * circumference)
+    width, _, wraps, _ = images[0].grid
+    around = width if wraps else math.inf
+    reasons = doubts(guides.at_a, ways[0].moves, parameters.radius * circumference, around)
     for name, reason, counts in zip(guides.names, reasons, wrong, strict=True):
         if reason and counts:
             _log.info("%s is ignored: %s", name, reason)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
@@ -40,11 +41,12 @@ class Guide:
     name: str = "guide"
 
 
-def doubts(places: Points, moves: Points, radius: float) -> list[str]:
+def doubts(places: Points, moves: Points, radius: float, around: float = math.inf) -> list[str]:
     """Why each guide of one pair of layers is to be ignored; "" where it is not.
 
     places  (n, 2) px, one end of each guide; moves: (n, 2) px, from there to the other end.
     radius  px: neighbours are the nearest guides within it.
+    around  px after which columns repeat, where they do.
 
     Repeated guides count once. Guides that send one place to two are both ignored. Else a guide is an
     outlier if its move is far from the median of three neighbours or more, and none of them moves like it:
@@ -52,12 +54,12 @@ def doubts(places: Points, moves: Points, radius: float) -> list[str]:
     """
     reasons = [""] * len(places)
     for i in range(len(places)):  # row by row: a project may have ten thousand points
-        again = (_distances(places, i) < _SAME_PLACE) & (_distances(moves, i) < _SAME_PLACE)
+        again = (_distances(places, i, around) < _SAME_PLACE) & (_distances(moves, i) < _SAME_PLACE)
         for j in np.flatnonzero(again[i + 1 :]) if not reasons[i] else ():
             reasons[i + 1 + j] = "it repeats another"
     counted = np.array([not reason for reason in reasons], bool)
     for i in map(int, np.flatnonzero(counted)):
-        apart = np.where(counted, _distances(places, i), np.inf)
+        apart = np.where(counted, _distances(places, i, around), np.inf)
         apart[i] = np.inf
         others = np.argsort(apart, kind="stable")[:_MOST_NEIGHBOURS]
         others = others[apart[others] < radius]
@@ -79,9 +81,12 @@ def by_pair(guides: Iterable[Guide]) -> dict[tuple[int, int], list[Guide]]:
     return pairs
 
 
-def _distances(points: Points, index: int) -> npt.NDArray[np.float64]:
-    """From one of the points to each of them."""
-    distances: npt.NDArray[np.float64] = np.linalg.norm(points - points[index], axis=1)
+def _distances(points: Points, index: int, around: float = math.inf) -> npt.NDArray[np.float64]:
+    """From one of the points to each of them; `around`: as of `doubts`."""
+    apart = np.abs(points - points[index])
+    columns = apart[:, 0] % around
+    apart[:, 0] = np.minimum(columns, around - columns)
+    distances: npt.NDArray[np.float64] = np.linalg.norm(apart, axis=1)
     return distances
 
 

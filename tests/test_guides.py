@@ -46,6 +46,14 @@ def test_outlier_is_found_whatever_its_place_in_the_list():
         assert "neighbours move otherwise" in max(reasons)
 
 
+def test_neighbours_are_found_around_the_canvas():
+    places = np.array(AROUND, float)
+    places[:, 0] = (places[:, 0] - 25) % 1000
+    moves = np.array([(10, 0), (11, 0), (9, 0), (10.5, 1), (40, -30)])
+    assert [bool(reason) for reason in doubts(places, moves, 100, 1000)] == [False] * 4 + [True]
+    assert not any(doubts(places, moves, 100))
+
+
 def test_two_on_a_near_thing_vouch_for_each_other():
     places = np.array([*AROUND, (24, 26)], float)
     moves = np.array([(10, 0), (11, 0), (9, 0), (10.5, 1), (40, -30), (43, -28)])
