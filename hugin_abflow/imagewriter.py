@@ -157,7 +157,7 @@ class ImageWriter:
 
     def __enter__(self) -> ImageWriter:
         # through a link: replace what it points to, not the link
-        self._final = self.path.resolve()
+        self._final = Path(os.path.realpath(self.path))
         if not named_in_unicode(self._final.parent):
             raise OutputError(
                 f"{self.path} cannot be written: the path of its folder is not valid UTF-8; rename that, "

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import os
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import closing
@@ -226,5 +227,5 @@ def _target(plan: Plan, layers: Sequence[Layer], output: Path | str | None) -> P
 
 def refuse_input(output: Path, inputs: Iterable[Path]) -> None:
     """Raise `OutputError` for an output that is one of the inputs."""
-    if output.resolve() in {file.resolve() for file in inputs}:
+    if os.path.realpath(output) in map(os.path.realpath, inputs):
         raise OutputError(f"{output} is an input of this panorama; choose another name with -o")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path, PureWindowsPath
@@ -229,4 +230,4 @@ def _stem(name: str) -> str:
 
 def _key(path: Path) -> str:
     """Equal for names of one file, also where the file system ignores case."""
-    return str(path.resolve()).casefold()
+    return os.path.realpath(path).casefold()

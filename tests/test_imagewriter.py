@@ -397,6 +397,15 @@ def test_jpeg_stops_before_the_disk_is_full(tmp_path, monkeypatch):
     assert (tmp_path / "b.jpg").is_file()
 
 
+@pytest.mark.skipif(os.name == "nt", reason="only administrators make links on Windows")
+def test_link_to_itself_is_replaced(tmp_path):
+    """Nothing else can come of it; Python before 3.13 takes it for an error of the program."""
+    (tmp_path / "a.tif").symlink_to("a.tif")
+    pixels = noise(np.uint8)
+    write_image(tmp_path / "a.tif", pixels)
+    assert np.array_equal(whole(read_layer(tmp_path / "a.tif")), pixels)
+
+
 _ON_A_FULL_DISK = """
 import os, sys, numpy as np
 from hugin_abflow.errors import OutputError
