@@ -21,7 +21,7 @@ from hugin_abflow.images import COMPRESSIONS
 from hugin_abflow.metadata import PROGRAM, version
 from hugin_abflow.nona import Remap
 from hugin_abflow.opencl import list_devices
-from hugin_abflow.options import ARGUMENTS, Command, NewFile, Option, Size
+from hugin_abflow.options import ARGUMENTS, Command, Compression, NewFile, Option, Size
 from hugin_abflow.settings import FlowQuality, LargeMotion, MergeMode, Settings
 from hugin_abflow.terminal import complain, interruptible, print_result, say
 
@@ -91,6 +91,7 @@ _information = partial(click.option, cls=Option, group="Information")
 @_result(
     "--compression",
     metavar="NAME",
+    type=Compression(),
     help=f"Compression of the file. {_names_of_compressions()}. "
     "[default: the project's; TIFF: else lzw; EXR: else zip]",
 )

@@ -11,7 +11,7 @@ import click
 
 from hugin_abflow import memory
 from hugin_abflow.errors import SettingsError
-from hugin_abflow.images import ENDINGS
+from hugin_abflow.images import COMPRESSIONS, ENDINGS
 from hugin_abflow.settings import MOST_MEMORY
 
 # Where a context keeps the arguments as they were given.
@@ -41,6 +41,19 @@ class Size(click.ParamType):  # type: ignore[type-arg]
             most = f"{MOST_MEMORY >> 40}T"
             self.fail(f"{value} is out of range; choose more than 0, at most {most}", param, ctx)
         return size
+
+
+class Compression(click.ParamType):  # type: ignore[type-arg]
+    """A name of a compression that some type of file has: it is asked for before layers are made."""
+
+    name = "compression"
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> str:
+        """The name as it was given; ends with click's message for any other."""
+        known = dict.fromkeys(name for names in COMPRESSIONS.values() for name in names)
+        if str(value).lower() not in known:
+            self.fail(f"{value!r} is no compression; choose one of {', '.join(known)}", param, ctx)
+        return str(value)
 
 
 class NewFile(click.Path):

@@ -143,6 +143,7 @@ def test_layers_takes_several_files(calls: Calls, given: str, layers: str, proje
         (["--softmax-sharpness", "nan", "a.pto"], "nan"),
         (["--softmax-sharpness", "-1", "a.pto"], "-1"),
         (["--flow-magnitude", "1e9", "a.pto"], "choose a value from 0 to 10000"),
+        (["--compression", "jpeg:85", "a.pto"], "'--compression': 'jpeg:85' is no compression; choose"),
         (["--max-memory", "0", "a.pto"], "'--max-memory': 0 is out of range"),
         (["--max-memory", "0.1B", "a.pto"], "'--max-memory': 0.1B is out of range"),
         (["--max-memory", "1025T", "a.pto"], "choose more than 0, at most 1024T"),
