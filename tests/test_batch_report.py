@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import re
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 
@@ -88,6 +89,21 @@ def test_report_that_cannot_be_written_ends_the_run_before_it_starts(
     assert cli.main(["a.pto", "--report", str(tmp_path / "no" / "r.json")]) == ExitCode.OUTPUT
     output = capsys.readouterr()
     assert output.out == "" and "--report" in output.err
+
+
+def test_report_that_cannot_be_written_hides_no_other_end(
+    replace: Callable[..., None], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    report = tmp_path / "folder" / "r.json"
+    report.parent.mkdir()
+
+    def interrupted(path: Path, **_: object) -> None:
+        shutil.rmtree(report.parent)
+        raise KeyboardInterrupt
+
+    replace(interrupted)
+    assert cli.main(["a.pto", "--report", str(report)]) == ExitCode.INTERRUPTED
+    assert "--report" in capsys.readouterr().err
 
 
 def test_report_is_replaced_whole(tmp_path: Path) -> None:

@@ -70,6 +70,7 @@ def run(tasks: Iterable[Task | None], how: Run, lone: bool = False) -> ExitCode:
     order: dict[Path, int] = {}
     running: set[Path] = set()
     unprinted: OutputError | None = None
+    complete = False
     with ExitStack() as stack:
         log = stack.enter_context(open_log(how.log))
         stack.enter_context(trace.recording(how.profile))
@@ -92,12 +93,18 @@ def run(tasks: Iterable[Task | None], how: Run, lone: bool = False) -> ExitCode:
                                     print_path(file)
                             except OutputError as error:
                                 unprinted = error  # the panoramas are there, and others wait
+            complete = True
         finally:
             records.sort(key=lambda record: order.get(record.project, 0))
             if records and not lone and not how.quiet:
                 print_table(records)
             if how.report:
-                write_report(how.report, records, how.arguments)
+                try:
+                    write_report(how.report, records, how.arguments)
+                except OutputError as error:
+                    if complete:
+                        raise
+                    complain(str(error))  # beside what ended the run, not instead of it
     if unprinted:
         raise unprinted
     return combine([record.exit_code for record in records])
