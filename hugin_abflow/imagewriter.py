@@ -23,7 +23,7 @@ from hugin_abflow import tiffwriter, trace
 from hugin_abflow.errors import OutputError
 from hugin_abflow.exif import Metadata, embed
 from hugin_abflow.layer import full_scale
-from hugin_abflow.scratch import part_beside
+from hugin_abflow.scratch import is_special, part_beside
 
 Pixels = npt.NDArray[Any]
 
@@ -167,7 +167,7 @@ class ImageWriter:
             if self._final.is_dir():
                 raise OutputError(f"{self.path} is a folder; name a file with -o")
             # a device or a pipe, reached by a link: the rename would take its place
-            if self._final.exists() and not self._final.is_file():
+            if is_special(self._final):
                 raise OutputError(f"{self.path} is no ordinary file; name one with -o")
             # made here, not by OpenImageIO: a clear reason
             self._part = self._scratch.enter_context(part_beside(self._final, self.path.suffix))

@@ -62,7 +62,7 @@ class NewFile(click.Path):
     """
 
     def __init__(self, image: bool = False) -> None:
-        super().__init__(path_type=Path)
+        super().__init__()
         self.image = image
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Path:

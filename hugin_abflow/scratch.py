@@ -13,6 +13,7 @@ import platform
 import re
 import secrets
 import shutil
+import stat
 import sys
 import tempfile
 import time
@@ -41,6 +42,15 @@ def tidy() -> None:
             with suppress(OSError):
                 path.unlink(missing_ok=True)
         _ours.discard(path)  # not before: this, too, may be broken off, and begun anew
+
+
+def is_special(path: Path) -> bool:
+    """Whether it is a pipe or a device, or leads to one: it can be written to, but not replaced."""
+    try:
+        mode = path.stat().st_mode
+    except OSError:  # there is nothing yet, or writing will tell why not
+        return False
+    return not stat.S_ISREG(mode) and not stat.S_ISDIR(mode)
 
 
 @contextmanager

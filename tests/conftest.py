@@ -165,7 +165,7 @@ def noise(dtype, channels: int = 3, width: int = 131, height: int = 77, seed: in
 def on_small_disk(folder: Path, size: str, script: str) -> subprocess.CompletedProcess[str]:
     """Run a shell's script in `folder`, on which a disk of `size` is mounted for as long as it runs."""
     if sys.platform != "linux":
-        pytest.skip("needs Linux's file systems")
+        pytest.skip("needs Linux's file systems")  # others have neither unshare(1) nor tmpfs
     inside = f'mount -t tmpfs -o size={size} none "$0" && cd "$0" && {script}'
     done = subprocess.run(
         ["unshare", "--user", "--map-root-user", "--mount", "sh", "-c", inside, str(folder)],

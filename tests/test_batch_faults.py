@@ -117,7 +117,6 @@ def mounted(shoot: Path, size: str, script: str, *arguments: object) -> subproce
     return done
 
 
-@linux
 def test_full_disk(shoot: Path) -> None:
     """Room for three projects and one panorama and a half."""
     room = sum(path.stat().st_size for path in shoot.glob("b[0-2]*")) + WIDTH * HEIGHT * 4
@@ -129,7 +128,6 @@ def test_full_disk(shoot: Path) -> None:
     assert [name for name in names if name.startswith(".abflow-")] == []
 
 
-@linux
 def test_folder_that_cannot_be_written(shoot: Path) -> None:
     done = mounted(shoot, "9m", "mount -o remount,ro . &&")
     code, *names = done.stdout.split()

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import json
 import os
-import stat
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
 from hugin_abflow.errors import ExitCode
-from hugin_abflow.scratch import part_beside
+from hugin_abflow.scratch import is_special, part_beside
 
 Result = Literal["made", "skipped", "failed"]
 
@@ -75,15 +74,6 @@ class Record:
             "exit_code": ExitCode(values["exit_code"]),
         }
         return cls(**known)
-
-
-def is_special(path: Path) -> bool:
-    """Whether it is a pipe or a device, or leads to one: it can be written to, but not replaced."""
-    try:
-        mode = path.stat().st_mode
-    except OSError:  # there is nothing yet, or writing will tell why not
-        return False
-    return not stat.S_ISREG(mode) and not stat.S_ISDIR(mode)
 
 
 def write_json(path: Path, values: object) -> None:

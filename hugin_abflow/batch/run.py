@@ -14,10 +14,11 @@ from hugin_abflow import trace
 from hugin_abflow.batch.cluster import Cluster
 from hugin_abflow.batch.display import Display, choose_display, open_log
 from hugin_abflow.batch.pool import Alone, Pool
-from hugin_abflow.batch.record import Record, is_special
+from hugin_abflow.batch.record import Record
 from hugin_abflow.batch.report import print_table, write_report
 from hugin_abflow.batch.task import Task
 from hugin_abflow.errors import AbflowError, ExitCode, OutputError, SameOutputError
+from hugin_abflow.scratch import is_special
 from hugin_abflow.stitch import show_project
 from hugin_abflow.terminal import complain, messages, print_path, print_result
 
