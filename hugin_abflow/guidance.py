@@ -51,6 +51,7 @@ class GuidanceParameters:
     misfit: float = 1.25  # of the images' contrast there, if it is not worse than none, ...
     fit: float = 0.5  # or below this share, however well the old flow fits, ...
     blank: float = 0.06  # or if there is less contrast than this: nobody but the guide knows
+    heard: float = 0.25  # share of the window that both images must show, to be heard at all
 
 
 @dataclass(frozen=True)
@@ -257,7 +258,7 @@ def _refusals(rivals: Sequence[_Rivals], ways: Sequence[_Way], parameters: Guida
     weights = np.exp(-0.5 * (steps / parameters.witness) ** 2)
     window = weights[:, None] * weights
     count = len(ways[0].places)
-    costs, contrast, moved = np.zeros((count, 2)), np.zeros(count), np.zeros(count)
+    costs, contrast, moved, heard = np.zeros((count, 2)), np.zeros(count), np.zeros(count), np.zeros(count)
     for rival, way in zip(rivals, ways, strict=True):
         feature, *brought = (buffer.get()[0] for buffer in (rival.feature, *rival.brought))
         shift = np.linalg.norm(rival.new.get() - rival.old.get(), axis=-1)
@@ -270,17 +271,20 @@ def _refusals(rivals: Sequence[_Rivals], ways: Sequence[_Way], parameters: Guida
             at = np.ix_(np.clip(rows, 0, height - 1), columns % width)
             seen = inside & (feature[at][..., 3] * brought[0][at][..., 3] * brought[1][at][..., 3] > 0)
             share = window * seen
+            heard[i] = max(heard[i], share.sum() / window.sum())
             contrast[i] += (share * _cost(feature[at], 0 * feature[at])).sum() / max(share.sum(), 1.0)
             for k in (0, 1):
                 costs[i, k] += (share * _cost(feature[at], brought[k][at])).sum() / max(share.sum(), 1.0)
             moved[i] = max(moved[i], shift[row, column % width])
     old, new = costs.T
     better = (new < parameters.gain * old) & (new < parameters.misfit * contrast)
-    fits = (new < parameters.fit * contrast) | (contrast < parameters.blank)
-    return [
-        "the images lead back" if back else "" if good else "the images do not confirm it"
-        for back, good in zip(moved < parameters.agreement, better | fits, strict=True)
-    ]
+    fits = new < parameters.fit * contrast
+    plain = contrast < parameters.blank
+    reasons = np.where(better | fits | plain, "", "the images do not confirm it")
+    reasons = np.where(moved < parameters.agreement, "the images lead back", reasons)
+    # a place that one photo does not show has no contrast, but is not plain
+    reasons = np.where(heard < parameters.heard, "one of the photos does not show the place", reasons)
+    return [str(reason) for reason in reasons]
 
 
 def _cost(a: npt.NDArray[np.float32], b: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:

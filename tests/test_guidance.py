@@ -257,6 +257,23 @@ def test_guides_that_the_images_refute_are_ignored(device: Device, pair, caplog)
     assert [m.partition(" is ignored: ")[0] for m in caplog.messages] == ["guide 0", "guide 1"]
 
 
+def test_guides_on_what_one_photo_does_not_show_are_ignored(device: Device, caplog) -> None:
+    """Somebody who walked was masked in one photo, the control points on him are still there."""
+    image, _ = thing("texture", 0)
+    x, y = common.pixels(WIDTH, HEIGHT)
+    shown = (np.abs(x - 110) > 40) | (np.abs(y - 100) > 40)
+    images = level(device, log(image)), level(device, log(image), shown.astype(np.float32))
+    alone = flow.pair_flow(device, *images)
+    before = [one.get() for one in alone]
+    with caplog.at_level(logging.INFO, "hugin_abflow"):
+        led = guidance.lead(device, images, alone, guides_at((110, 95), (105, 108), move=(14, 9)), 2048.0)
+    for one, other in zip(led, before, strict=True):
+        assert np.array_equal(one.get(), other)
+    assert caplog.messages == [
+        f"guide {i} is ignored: one of the photos does not show the place" for i in (0, 1)
+    ]
+
+
 def test_outlier_is_named_and_ignored(device: Device, pair, caplog) -> None:
     images, alone, insides = pair("white")
     good, bad = ON_THE_THING, guides_at((128, 100), move=(-30, 20))
