@@ -129,7 +129,7 @@ def _finest(
         gain or field, correction.grid.border if gain else _NONE, correction.shoulder,
         level.box, half.border, level.colours, level.share,
     )  # fmt: skip
-    return _spread(device, level, widths)
+    return level  # smoothed later: each by its own side of a border, layers that agree would differ there
 
 
 def _differ(device: Device, finest: list[_Level], widths: Widths, once: npt.NDArray[Any]) -> None:

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 import pytest
 from grids import GRIDS, boxes, on_device, patches, plane, random_layer, sphere
+from pictures import masked, merged, one_device
 from reference import multiband as twin
 from reference.blend import read_field
 from reference.common import EXPOSURE_FLOOR, Array
@@ -15,8 +16,11 @@ from tolerances import SUM, assert_close
 
 from hugin_abflow import multiband
 from hugin_abflow.colour import Correction
+from hugin_abflow.layer import Canvas
 from hugin_abflow.opencl import Device
 from hugin_abflow.working import Grid
+
+shared_device = pytest.mark.usefixtures(one_device.__name__)
 
 
 def flat(grid: Grid, *colour: float) -> Array:
@@ -100,6 +104,27 @@ def test_layers_that_agree_where_both_are_do_not_change(device: Device, wraps: b
     own = np.broadcast_to((column >= 64) & (column < 192), grid.shape).astype(np.float32)
     found = offsets(device, grid, [picture * c[..., None] for c in (inner, outer)], [own, 1 - own])
     assert not any(offset.any() for offset in found)
+
+
+@shared_device
+@pytest.mark.parametrize("sphere", [True, False])
+def test_photos_that_agree_stay_as_they_are_beside_the_tip_of_an_overlap(sphere: bool) -> None:
+    """Where two end in a V, each is smoothed along rows by itself: not before it is compared."""
+    width, height = 401, 201
+    picture = np.random.default_rng(5).normal(size=(height, width, 3))
+    picture = ndimage.gaussian_filter(picture, (2, 2, 0))
+    picture = np.clip(128 + 60 * picture / picture.std(), 16, 239).round()
+    y, x = np.mgrid[:height, :width]
+    covered = [(x > 100) & (x - 200 < (146 - y) * 0.7), (x < 300) & (200 - x < (146 - y) * 0.7)]
+    layers = []
+    for seed, part in enumerate(covered):
+        photo = picture + np.random.default_rng(seed).integers(-1, 2, picture.shape)
+        opaque = np.dstack([photo, np.full((height, width), 255)]).astype(np.uint8)
+        layers.append(masked(opaque, part & (y < 150)))
+    canvas = Canvas.sphere(width, height) if sphere else Canvas.plane(width, height)
+    result = merged(layers, canvas, flow=False)
+    off = np.abs(result[..., :3] - picture).max(-1)[(covered[0] | covered[1]) & (y < 150)]
+    assert off.max() < 4
 
 
 def test_weights_that_are_the_same_everywhere_give_the_weighted_mean(device: Device) -> None:
