@@ -163,8 +163,11 @@ def _is_multilayer(path: Path) -> bool:
 
 def _find(plan: Plan) -> _Found | None:
     """Layers under the project's stem or Hugin's default prefix; complete and fresh ones first."""
-    names = [plan.layer_prefix(name) for name in (plan.stem, plan.hugin_prefix)]
-    names += [plan.stem, plan.hugin_prefix] if plan.hdr else []
+    other = plan.folder / f"{plan.hugin_prefix}.pto"  # layers of its name are its own
+    shared = not other.is_file() or other.samefile(plan.file)
+    stems = [plan.stem, plan.hugin_prefix] if shared else [plan.stem]
+    names = [plan.layer_prefix(name) for name in stems]
+    names += stems if plan.hdr else []
     found = [layers for name in names if (layers := _find_under(plan, str(plan.folder / name)))]
     if plan.hdr:  # what is linear; layers of the other panorama may lie there too
         found = [layers for layers in found if all(path.suffix == ".exr" for path in layers.in_order())]

@@ -69,6 +69,18 @@ def test_layers_beside_the_project_are_found(make_project, nona, prefix, monkeyp
         assert layers[0].file.parent == plan.folder
 
 
+def test_layers_named_as_another_project_are_its_own(make_project, nona, temporary):
+    """Hugin names layers by the first and the last photo, which several projects may have in common."""
+    plan = read_plan(make_project())
+    remap(plan, "photo 0 - photo 2")
+    other = plan.file.with_name("photo 0 - photo 2.pto")
+    shutil.copy2(plan.file, other)
+    with open_layers(plan) as layers:
+        assert all(temporary in layer.file.parents for layer in layers)
+    with open_layers(read_plan(other), remap="never") as layers:
+        assert names_of(layers) == [f"photo 0 - photo 2{index:04d}.tif" for index in range(3)]
+
+
 def test_complete_layers_go_before_incomplete_ones(make_project, nona, monkeypatch):
     plan = read_plan(make_project())
     remap(plan, "pano", "-i", "1")
