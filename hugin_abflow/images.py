@@ -16,13 +16,21 @@ import OpenImageIO as oiio  # noqa: N813
 
 from hugin_abflow import tiffreader, tifftags, trace
 from hugin_abflow.errors import ImageReadError
-from hugin_abflow.imagewriter import COMPRESSIONS, ENDINGS, ImageWriter, named_in_unicode, write_image
+from hugin_abflow.imagewriter import (
+    COMPRESSIONS,
+    ENDINGS,
+    ImageWriter,
+    check_target,
+    named_in_unicode,
+    write_image,
+)
 from hugin_abflow.layer import Box, Layer, full_scale
 
 __all__ = [
     "COMPRESSIONS",
     "ENDINGS",
     "ImageWriter",
+    "check_target",
     "read_layer",
     "read_layers",
     "use_threads",

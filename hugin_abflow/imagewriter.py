@@ -156,19 +156,8 @@ class ImageWriter:
         return spec
 
     def __enter__(self) -> ImageWriter:
-        # through a link: replace what it points to, not the link
-        self._final = Path(os.path.realpath(self.path))
-        if not named_in_unicode(self._final.parent):
-            raise OutputError(
-                f"{self.path} cannot be written: the path of its folder is not valid UTF-8; rename that, "
-                "or choose another with -o"
-            )
+        self._final = _final(self.path)
         try:
-            if self._final.is_dir():
-                raise OutputError(f"{self.path} is a folder; name a file with -o")
-            # a device or a pipe, reached by a link: the rename would take its place
-            if is_special(self._final):
-                raise OutputError(f"{self.path} is no ordinary file; name one with -o")
             # made here, not by OpenImageIO: a clear reason
             self._part = self._scratch.enter_context(part_beside(self._final, self.path.suffix))
         except OSError as error:
@@ -342,18 +331,39 @@ def write_image(
         )
     height, width, samples = pixels.shape
     with ImageWriter(
-        path,
-        width,
-        height,
-        samples - 1,
-        pixels.dtype,
-        offset=offset,
-        icc=icc,
-        compression=compression,
-        jpeg_quality=jpeg_quality,
-        canvas_size=canvas_size,
-    ) as writer:
+        path, width, height, samples - 1, pixels.dtype, offset=offset, icc=icc,
+        compression=compression, jpeg_quality=jpeg_quality, canvas_size=canvas_size,
+    ) as writer:  # fmt: skip
         writer.write_rows(pixels)
+
+
+def check_target(path: Path, compression: str | None) -> None:
+    """Raise `OutputError` for a file that cannot be written, or not so, whatever it is to hold."""
+    final, kind = _final(path), _format_of(path)
+    if not final.parent.is_dir():
+        raise OutputError(f"{path} cannot be written: {final.parent} is no folder; choose another with -o")
+    _compression(path, kind, np.dtype(np.uint8), 3, compression, None)
+
+
+def _final(path: Path) -> Path:
+    """The file that is replaced: through a link what it points to, not the link."""
+    final = Path(os.path.realpath(path))
+    if not named_in_unicode(final.parent):
+        raise OutputError(
+            f"{path} cannot be written: the path of its folder is not valid UTF-8; rename that, "
+            "or choose another with -o"
+        )
+    try:
+        if final.is_dir():
+            raise OutputError(f"{path} is a folder; name a file with -o")
+        # a device or a pipe, reached by a link: the rename would take its place
+        if is_special(final):
+            raise OutputError(f"{path} is no ordinary file; name one with -o")
+    except OSError as error:
+        raise OutputError(
+            f"{path} cannot be written: {final.parent}: {error.strerror}; choose another folder with -o"
+        ) from None
+    return final
 
 
 def named_in_unicode(path: Path) -> bool:

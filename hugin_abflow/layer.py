@@ -160,12 +160,16 @@ def bounding_box(layers: Sequence[Layer]) -> Box:
 def check_layers(canvas: Canvas, layers: Sequence[Layer]) -> None:
     """Raise `LayersMismatchError` unless the layers fit the canvas and each other.
 
-    Canvas size (where a layer's file tells it), place inside the canvas, depth, number of channels.
+    Alpha, canvas size (where a layer's file tells it), place inside the canvas, depth, number of channels.
     """
     size = f"{canvas.width}x{canvas.height}"
     again = "make the layers again with nona, or leave the file out"
     for layer in layers:
         name, box, first = layer.file or layer.name, layer.box, layers[0]
+        if not layer.has_alpha:
+            raise LayersMismatchError(
+                f"{name} has no alpha channel, so nothing says where it ends; have nona write TIFF"
+            )
         if layer.canvas_size not in (None, (canvas.width, canvas.height)):
             made_for = "{}x{}".format(*layer.canvas_size or ())
             raise LayersMismatchError(

@@ -18,11 +18,11 @@ from hugin_abflow import joint, sequential
 from hugin_abflow.errors import LayersMissingError, OutputError
 from hugin_abflow.exif import Metadata
 from hugin_abflow.guides import Guide
-from hugin_abflow.images import ENDINGS, ImageWriter, use_threads
+from hugin_abflow.images import ENDINGS, ImageWriter, check_target, use_threads
 from hugin_abflow.layer import Canvas, Layer, check_layers
 from hugin_abflow.metadata import describe
 from hugin_abflow.nona import Remap, open_layers
-from hugin_abflow.opencl import Device
+from hugin_abflow.opencl import Device, choose
 from hugin_abflow.pano_trafo import images_of, read_guides
 from hugin_abflow.progress import Progress, silent
 from hugin_abflow.project import Plan, read_plan
@@ -69,6 +69,7 @@ def merge_project(
     """
     plan = read_plan(path)
     settings = settings or Settings()
+    _check_early(plan, settings, output, compression)
     with open_layers(
         plan, prefix=prefix, layers=layers, remap=remap, keep_layers=keep_layers, progress=progress
     ) as opened:
@@ -107,22 +108,31 @@ def write_panorama(
     guides          gives the places that layers have in common; asked once the file can be written.
     method          merges the layers; default: what `settings.merge` says.
     depth, compression, jpeg_quality, metadata    of the file, see `images.ImageWriter`; half floats become
-                    floats in TIFF unless `depth` is said.
+                    floats in TIFF unless `depth` is said, integers in EXR always.
     open_device     see `merge_project`.
 
     Raises `OutputError`, `ImageReadError` (a layer cannot be decoded), `DeviceError`.
     """
     crop, first = canvas.crop, layers[0]
-    if depth is None and first.dtype == np.float16 and ENDINGS.get(target.suffix.lower()) == "tiff":
-        depth = np.float32  # few programs read TIFF with half floats; enblend writes floats, too
     with ImageWriter(
-        target, crop.width, crop.height, first.channels, first.dtype, depth=depth,
+        target, crop.width, crop.height, first.channels, first.dtype, depth=_depth(target, first, depth),
         offset=(crop.left, crop.top), canvas_size=(canvas.width, canvas.height), icc=first.icc,
         compression=compression, jpeg_quality=jpeg_quality, metadata=metadata,
         threads=settings.cores,
     ) as writer:  # fmt: skip
         _report(canvas, projection, layers, writer)
         _write(writer, _bands(layers, canvas, settings, progress, guides(), method, open_device))
+
+
+def _depth(target: Path, layer: Layer, wanted: npt.DTypeLike | None) -> npt.DTypeLike:
+    """Samples of a file: what is wanted, or else the layers', if files of its kind hold them."""
+    kind, depth = ENDINGS.get(target.suffix.lower()), np.dtype(layer.dtype if wanted is None else wanted)
+    if kind == "tiff" and wanted is None and depth == np.float16:
+        return np.float32  # few programs read TIFF with half floats; enblend writes floats, too
+    if kind == "openexr" and depth.kind != "f":
+        _log.warning("%s: EXR holds no %s samples; they are written as float", target, depth)
+        return np.float32
+    return depth
 
 
 def merge_layers(
@@ -221,8 +231,20 @@ def _target(plan: Plan, layers: Sequence[Layer], output: Path | str | None) -> P
     inputs = [layer.file for layer in layers if layer.file is not None]
     if output is None:
         return plan.default_output(inputs)
-    refuse_input(Path(output), [plan.file, *plan.photos, *inputs])
+    refuse_input(Path(output), inputs)
     return Path(output)
+
+
+def _check_early(plan: Plan, settings: Settings, output: Path | str | None, compression: str | None) -> None:
+    """Raise what would be raised in the end, too, but after minutes in which nona makes the layers."""
+    if output is None:
+        target = plan.default_output()
+    else:
+        target = Path(output)
+        refuse_input(target, [plan.file, *plan.photos])
+    check_target(target, compression)
+    if settings.device is not None:
+        choose(settings.device)
 
 
 def refuse_input(output: Path, inputs: Iterable[Path]) -> None:

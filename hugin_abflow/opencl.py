@@ -108,15 +108,15 @@ def list_devices() -> list[DeviceInfo]:
 
     Raises `DeviceError`, which says what to install, where there is none.
     """
-    found = _devices()
-    best = max(found, key=_speed)
+    found, best = _devices(), choose(None)
     return [
         DeviceInfo(i, d.name.strip(), d.platform.name.strip(), _kind(d), d.global_mem_size, d == best)
         for i, d in enumerate(found)
     ]
 
 
-def _choose(wanted: str | None) -> cl.Device:
+def choose(wanted: str | None) -> cl.Device:
+    """The device that --device means; None: the one used by default. Raises `DeviceError`: there is none."""
     found = _devices()
     if wanted is None:
         return max(found, key=_speed)
@@ -279,7 +279,7 @@ class Device:
     """
 
     def __init__(self, wanted: str | None = None, threads: int = 0) -> None:
-        chosen = _choose(wanted)
+        chosen = choose(wanted)
         pocl.name_processor(chosen.version, chosen.int_ptr)
         self.device = _part(chosen, threads)
         self.context = cl.Context([self.device])

@@ -177,6 +177,43 @@ def test_layer_that_cannot_be_decoded(folder: Path, capsys: pytest.CaptureFixtur
     assert code == ExitCode.IMAGE_READ and "tiny0001.tif" in message
 
 
+@pytest.mark.parametrize(
+    ("arguments", "expected"),
+    [
+        (["-o", "no/out.tif"], ExitCode.OUTPUT),
+        (["-o", "out.xyz"], ExitCode.OUTPUT),
+        (["-o", "folder.tif"], ExitCode.OUTPUT),
+        (["-o", "left.png"], ExitCode.OUTPUT),
+        (["-o", "out.tif", "--compression", "piz"], ExitCode.OUTPUT),
+        (["--device", "nobody's"], ExitCode.DEVICE),
+    ],
+)
+def test_mistakes_are_told_before_layers_are_made(
+    folder: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+    arguments: list[str],
+    expected: ExitCode,
+) -> None:
+    """nona may take minutes."""
+    monkeypatch.chdir(folder)
+    (folder / "folder.tif").mkdir()
+    for name in ("left.png", "right.png"):
+        (folder / name).write_bytes(b"no picture at all: nona would fail")
+    code, message = broken(folder, ["tiny.pto", "--remap", "always", *arguments], capsys)
+    assert code == expected and arguments[-1] in message
+
+
+def test_photos_are_no_layers(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Nothing in them says where they end."""
+    names = [str(folder / name) for name in ("left.jpg", "right.jpg")]
+    for name in names:
+        buffer = oiio.ImageBuf(oiio.ImageSpec(WIDTH // 2, HEIGHT // 2, 3, "uint8"))
+        assert buffer.write(name)
+    code, message = broken(folder, [str(folder / "tiny.pto"), "--layers", *names], capsys)
+    assert code == ExitCode.LAYERS_MISMATCH and "left.jpg has no alpha channel" in message
+
+
 @pytest.mark.parametrize("output", ["no/such/folder/out.tif", "out.xyz", "."])
 def test_output_that_cannot_be_written(
     folder: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, output: str

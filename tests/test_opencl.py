@@ -172,20 +172,20 @@ def test_environment_that_hides_devices_is_named_by_the_program(name: str) -> No
 
 
 def test_default_is_the_fastest_gpu(shelf: list[SimpleNamespace]) -> None:
-    assert opencl._choose(None) is shelf[2]
+    assert opencl.choose(None) is shelf[2]
     assert [d.default for d in list_devices()] == [False, False, True, False]
 
 
 def test_without_a_gpu_the_cpu_is_the_default(shelf: list[SimpleNamespace]) -> None:
     del shelf[1:3]
-    assert opencl._choose(None) is shelf[0]
+    assert opencl.choose(None) is shelf[0]
 
 
 @pytest.mark.parametrize(("wanted", "index"), [("0", 0), ("3", 3), ("large", 2), ("GREY", 1), ("odd ONE", 3)])
 def test_a_device_is_chosen_by_index_or_part_of_its_name(
     shelf: list[SimpleNamespace], wanted: str, index: int
 ) -> None:
-    assert opencl._choose(wanted) is shelf[index]
+    assert opencl.choose(wanted) is shelf[index]
 
 
 @pytest.mark.parametrize("wanted", ["4", "99", "no such"])

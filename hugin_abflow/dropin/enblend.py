@@ -10,9 +10,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
 
-import numpy as np
-import numpy.typing as npt
-
 from hugin_abflow import memory
 from hugin_abflow.dropin.request import HELP, Request, read_command_line
 from hugin_abflow.dropin.weights import MaskedMerge
@@ -101,10 +98,12 @@ def blend(request: Request, progress: Progress) -> None:
         canvas = _canvas(layers, request.crop, request.wraps)
         projection = "taken as equirectangular" if canvas.spherical else "taken as flat"
     check_layers(canvas, layers)
+    if len(layers) == 1:
+        _log.warning("only one layer: there is nothing to blend, the output is the layer")
     write_panorama(
         request.output, layers, canvas, settings, projection=projection, guides=guides,
         method=MaskedMerge(request.save_masks, request.load_masks, request.output),
-        depth=_depth(request, layers[0]), jpeg_quality=request.jpeg_quality,
+        depth=request.depth, jpeg_quality=request.jpeg_quality,
         # what the others call compression is not what enblend's option means
         compression=request.compression if request.output.suffix.lower() in (".tif", ".tiff") else None,
         metadata=metadata, progress=progress,
@@ -116,30 +115,13 @@ def _read(request: Request) -> list[Layer]:
     for path in request.inputs:
         if not path.is_file():
             raise LayersMissingError(f"{path}: no such file; name the layers that nona made")
-    layers = [layer for path in request.inputs for layer in read_layers(path)]
-    for layer in layers:
-        if not layer.has_alpha:
-            raise LayersMismatchError(
-                f"{layer.file} has no alpha channel, so nothing says where it ends; make the layer with nona"
-            )
-    if len(layers) == 1:
-        _log.warning("only one layer: there is nothing to blend, the output is the layer")
-    return layers
+    return [layer for path in request.inputs for layer in read_layers(path)]
 
 
 def _threads(said: str) -> int:
     """Cores to use, as OpenMP's variable says, which Hugin sets for enblend; 0: all."""
     first = said.partition(",")[0].strip()  # of a list, for nested loops
     return int(first) if re.fullmatch(r"0*[1-9]\d{0,2}", first) else 0
-
-
-def _depth(request: Request, layer: Layer) -> npt.DTypeLike | None:
-    """Samples of the output; None: the layers'. Of integers EXR gets floats, as enblend has it."""
-    depth = np.dtype(layer.dtype if request.depth is None else request.depth)
-    if request.output.suffix.lower() != ".exr" or depth.kind == "f":
-        return request.depth
-    _log.warning("%s: EXR holds no %s samples; they are written as float", request.output, depth)
-    return np.float32
 
 
 def _canvas(layers: Sequence[Layer], crop: Box | None, wraps: bool) -> Canvas:
