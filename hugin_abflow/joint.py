@@ -319,14 +319,17 @@ def _place(layer: WorkingLayer) -> tuple[int, ...]:
 
 def _redundant(index: int, layers: Sequence[WorkingLayer], masks: Masks) -> bool:
     """A layer wholly inside another has no area of its own; equal ones share."""
-    own = masks.host[index]
+    own, name = masks.host[index], layers[index].layer.name
     for other, mask in enumerate(masks.host):
         if other != index and not (own & ~mask).any() and (mask & ~own).any():
-            _unused_log.info(
-                "%s is not used: it lies wholly inside %s, so nothing is its own; where it shall show, "
-                "mask the other photos in Hugin",
-                layers[index].layer.name, layers[other].layer.name,
-            )  # fmt: skip
+            if own.any():
+                _unused_log.info(
+                    "%s is not used: it lies wholly inside %s, so nothing is its own; where it shall show, "
+                    "mask the other photos in Hugin",
+                    name, layers[other].layer.name,
+                )  # fmt: skip
+            else:
+                _unused_log.info("%s is not used: it shows nothing, or next to nothing", name)
             return True
     return False
 

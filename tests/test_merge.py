@@ -92,6 +92,16 @@ def test_layer_inside_another_takes_no_part(exposure, caplog):
 
 
 @shared_device
+def test_layer_that_shows_nothing_is_named(caplog):
+    layers = with_parallax(CANVASES["plane"])
+    empty = Layer.from_array("nothing", np.zeros((41, 57, 4), np.uint8), 31, 47)
+    with caplog.at_level(logging.INFO, "hugin_abflow"):
+        result = merged([empty, *layers], CANVASES["plane"])
+    np.testing.assert_array_equal(result, merged(layers, CANVASES["plane"]))
+    assert "nothing is not used: it shows nothing, or next to nothing" in caplog.messages
+
+
+@shared_device
 def test_layer_inside_another_but_for_a_column_still_shows_there(caplog):
     """At working resolution it is wholly inside; what it alone covers may not become a hole."""
     canvas = CANVASES["plane"]
