@@ -1,6 +1,8 @@
 """Where each layer is sampled and how much its colour counts (kernels/geometry.cl).
 
-x_k(p) = p + sum_j w_j(p) F_jk(p), and the softmax of Code 1 of Meng & Liu 2020, for any number of layers.
+x_k(p) = p + sum_j w_j(p) F_jk(p), and the softmax of Code 1 of Meng & Liu 2020, for any number of layers. Of
+F_jk(p) a part is read as -F_kj(p): so nothing is lost to first order where flow changes, and what is straight
+stays so beside the outlines of near things, see `geometry_add`.
 """
 
 from __future__ import annotations
@@ -21,6 +23,8 @@ from hugin_abflow.working import Grid, WorkingLayer
 # Flow longer than this share of the canvas's width is implausible; it does not sharpen the softmax further.
 _PLAUSIBLE = 0.1
 _FOLLOWING_STEPS = 8
+# Where `geometry_add` reads flow, as of kernels/geometry.cl.
+_THERE, _GUESSED, _BOTH = range(3)
 
 
 @dataclass(frozen=True)
@@ -122,12 +126,13 @@ def _displacement(
             if index not in (pair.a, pair.b):
                 continue
             other = pair.b if index == pair.a else pair.a
-            flow = pair.between(other if guess is None else index)
+            flow, back = pair.between(index if guess else other), pair.between(index)
+            start = _GUESSED if guess else _BOTH if settings.both_flows else _THERE
             chart_grid = (pair.chart.width, pair.chart.height, int(pair.chart.wraps), 0)
             device.run(
                 "geometry", "geometry_add", four_at_a_time, coefficients[other].blend, layers[other].box,
-                layer.pixels, layer.box, every, grid.border, grid.lens, flow, chart_grid,
-                pair.chart.transform, int(guess is not None), guess or field, field, size,
+                layer.pixels, layer.box, every, grid.border, grid.lens, flow, back, chart_grid,
+                pair.chart.transform, start, guess or field, field, size,
             )  # fmt: skip
         guess = field
     return field

@@ -49,6 +49,7 @@ class Settings:
                         1024; 0: chosen by flow_quality.
     border_feather      width of the ramp that brings a layer's weight to 0 at its own border, in working
                         pixels; 0: none, as published.
+    both_flows          where layer k is sampled is told by F_kj, too; else by F_jk alone, as published.
     fixed_point_steps   times that x_k <- p - sum_j w_j F_kj(x_k) is iterated; 0: flow is read at p,
                         as published.
     band_rows           rows of a full-resolution band; 0: chosen from the canvas width and `max_memory`.
@@ -75,6 +76,7 @@ class Settings:
     interpolation: Interpolation = "bicubic"
     working_pixels: int = 0
     border_feather: float = 6.0
+    both_flows: bool = True
     fixed_point_steps: int = 0
     band_rows: int = 0
     max_memory: int = 0
@@ -113,7 +115,16 @@ class Settings:
             if not isinstance(value, str) or value not in choices:
                 expected = " or ".join(map(repr, choices))
                 raise SettingsError(f"{name} is {value!r}; choose {expected}")
-        for name in ("flow", "exposure", "highlights", "seam", "movers", "foreground", "guides"):
+        for name in (
+            "flow",
+            "exposure",
+            "highlights",
+            "seam",
+            "movers",
+            "foreground",
+            "guides",
+            "both_flows",
+        ):
             if not isinstance(getattr(self, name), bool):
                 raise SettingsError(f"{name} is {getattr(self, name)!r}; choose True or False")
         if self.device is not None and not isinstance(self.device, str):

@@ -1,6 +1,6 @@
-/* Where each layer is sampled: x_k(p) = p + sum over j of w_j(p) F_jk(p). A field holds, on the box of one layer
-   of the working grid, (displacement, colour weight); the displacement is a difference of points, so that it
-   is continuous over the poles. */
+/* Where each layer is sampled: x_k(p) = p + sum over j of w_j(p) F_jk(p), or that with the mean of both flows of a
+   pair that geometry_add tells. A field holds, on the box of one layer of the working grid, (displacement, colour
+   weight); the displacement is a difference of points, so that it is continuous over the poles. */
 
 /* Coefficients below this move nothing by as much as a thousandth of a pixel. */
 #define GEOMETRY_NEGLIGIBLE 1e-5f
@@ -16,9 +16,23 @@ static inline float geometry_share(__global const float *blend_j, int4 box_j, __
     return w < GEOMETRY_NEGLIGIBLE || layer_k[y * box_k.z + x].w == 0.0f ? 0.0f : w;
 }
 
-/* From four points q the ways that flow leads, by its chart; moves: where it leads anywhere. */
-static inline points4 geometry_ways(points4 q, __global const float2 *flow, int4 grid, const float16 *chart,
-                                    int4 *moves) {
+/* Where geometry_add reads flow. */
+#define GEOMETRY_THERE 0   /* F_jk at p: first order, as published */
+#define GEOMETRY_GUESSED 1 /* F_kj at the place where layer k is guessed to be sampled */
+#define GEOMETRY_BOTH 2    /* F_jk and F_kj at p */
+
+/* Flow at four places of a chart. */
+static inline float4 geometry_read(__global const float2 *flow, float4 u, float4 v, int4 grid, float4 *fy) {
+    const float2 a = bilinear_flow(flow, (float2)(u.x, v.x), grid), b = bilinear_flow(flow, (float2)(u.y, v.y), grid);
+    const float2 c = bilinear_flow(flow, (float2)(u.z, v.z), grid), d = bilinear_flow(flow, (float2)(u.w, v.w), grid);
+    *fy = (float4)(a.y, b.y, c.y, d.y);
+    return (float4)(a.x, b.x, c.x, d.x);
+}
+
+/* From four points q the ways that flow leads, by its chart, and how much of flow `back` takes its place, turned
+   round; moves: where it leads anywhere. */
+static inline points4 geometry_ways(points4 q, __global const float2 *flow, __global const float2 *back, float4 turned,
+                                    int4 grid, const float16 *chart, int4 *moves) {
     const bool plane = chart->sd == 0.0f;
     float4 u, v;
     if (plane) {
@@ -31,9 +45,13 @@ static inline points4 geometry_ways(points4 q, __global const float2 *flow, int4
     } else {
         u = chart_sphere_position4(q, chart, &v);
     }
-    const float2 a = bilinear_flow(flow, (float2)(u.x, v.x), grid), b = bilinear_flow(flow, (float2)(u.y, v.y), grid);
-    const float2 c = bilinear_flow(flow, (float2)(u.z, v.z), grid), d = bilinear_flow(flow, (float2)(u.w, v.w), grid);
-    const float4 fx = (float4)(a.x, b.x, c.x, d.x), fy = (float4)(a.y, b.y, c.y, d.y);
+    float4 fy, fx = geometry_read(flow, u, v, grid, &fy);
+    if (back) {
+        float4 by;
+        const float4 bx = geometry_read(back, u, v, grid, &by);
+        fx = (1.0f - turned) * fx - turned * bx;
+        fy = (1.0f - turned) * fy - turned * by;
+    }
     *moves = fx != 0.0f || fy != 0.0f;
     if (plane) /* on one that wraps, u may be of a copy of q */
         return (points4){fx / chart->s9, fy / chart->sa, (float4)(0.0f)};
@@ -41,17 +59,22 @@ static inline points4 geometry_ways(points4 q, __global const float2 *flow, int4
     return (points4){to.x - q.x, to.y - q.y, to.z - q.z};
 }
 
-/* Add one other layer's part. guess = 0: read F_jk at p (first order, as published). Otherwise F_kj is read at
-   the place that `guess` says layer k is sampled, whose way to p it is: x_k = p - sum_j w_j F_kj(x_k). */
+/* Add one other layer's part. At the place x_k where layer k is sampled, F_kj is the way to what layer j shows of it,
+   so that x_k = p - w_j F_kj(x_k), in which `guess` may say where x_k is. At p one flow alone is too long or too
+   short where it changes: with g its gradient along itself, f its length, x_k is missed by g f w_j^2 with F_kj, and
+   on the other side by g f w_j (1 - w_j) with F_jk. So of -F_kj a share of 1 - w_j is read, and of F_jk one of w_j:
+   that leaves nothing of these, and beside things that hide others, where flow is no change but a step, each layer
+   goes by its own flow where it shows most. */
 __kernel void geometry_add(__global const float *blend_j,   /* (box_j.w, box_j.z) */
                            int4 box_j,                      /* place on the working grid */
                            __global const float4 *layer_k,  /* (box_k.w, box_k.z) r, g, b, valid */
                            int4 box_k,                      /* place on the working grid */
                            int every,                       /* columns and rows from one to the next */
                            int4 border, float4 lens,        /* working grid */
-                           __global const float2 *flow,     /* chart grid, px */
+                           __global const float2 *flow,     /* chart grid, px: F_jk; GUESSED: F_kj */
+                           __global const float2 *back,     /* chart grid, px: F_kj; read with BOTH */
                            int4 grid, float16 chart,        /* chart */
-                           int use_guess,
+                           int from,                        /* GEOMETRY_... */
                            __global const float4 *guess,    /* (size.y, size.x) displacement */
                            __global float4 *field,          /* (size.y, size.x) displacement is added */
                            int2 size)                       /* box_k.zw / every, rounded up; run size: that,
@@ -71,7 +94,7 @@ __kernel void geometry_add(__global const float *blend_j,   /* (box_j.w, box_j.z
     const float4 px = convert_float4((i + (int4)(0, 1, 2, 3)) * every + box_k.x) + 0.5f;
     const float4 py = (float4)(y + box_k.y + 0.5f);
     points4 q = lens.y == 0.0f ? (points4){px, py, (float4)(0.0f)} : canvas_sphere4(px, py, lens);
-    if (use_guess) {
+    if (from == GEOMETRY_GUESSED) {
         const float4 a = guess[at], b = guess[at + LEAST(1, last)];
         const float4 c = guess[at + LEAST(2, last)], d = guess[at + LEAST(3, last)];
         q = (points4){q.x + (float4)(a.x, b.x, c.x, d.x), q.y + (float4)(a.y, b.y, c.y, d.y),
@@ -82,13 +105,14 @@ __kernel void geometry_add(__global const float *blend_j,   /* (box_j.w, box_j.z
         }
     }
     int4 moves;
-    const points4 d = geometry_ways(q, flow, grid, &chart, &moves);
+    const float4 turned = 1.0f - (float4)(share[0], share[1], share[2], share[3]);
+    const points4 d = geometry_ways(q, flow, from == GEOMETRY_BOTH ? back : 0, turned, grid, &chart, &moves);
     const float3 way[GEOMETRY_CHUNK] = {(float3)(d.x.x, d.y.x, d.z.x), (float3)(d.x.y, d.y.y, d.z.y),
                                         (float3)(d.x.z, d.y.z, d.z.z), (float3)(d.x.w, d.y.w, d.z.w)};
     const int moved[GEOMETRY_CHUNK] = {moves.x, moves.y, moves.z, moves.w};
     for (int k = 0; k < GEOMETRY_CHUNK; ++k)
         if (share[k] > 0.0f && moved[k])
-            field[at + k].xyz += (use_guess ? -share[k] : share[k]) * way[k];
+            field[at + k].xyz += (from == GEOMETRY_GUESSED ? -share[k] : share[k]) * way[k];
 }
 
 /* a_k = sharpness * w_k * (1 + magnitude * f_k / width), with f_k = |displacement| / (1 - w_k); and the maximum

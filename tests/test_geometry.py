@@ -22,7 +22,7 @@ from hugin_abflow.settings import Settings
 from hugin_abflow.working import Grid, WorkingLayer
 
 NAMES = list(GRIDS)
-PUBLISHED = Settings(fixed_point_steps=0, border_feather=0.0)
+PUBLISHED = Settings(both_flows=False, fixed_point_steps=0, border_feather=0.0)
 
 
 def smooth_flow(seed: int, found: Chart, strength: float = 3.0) -> np.ndarray:
@@ -56,14 +56,16 @@ def test_twin_of_flow_reading_is_linear_interpolation(wraps: bool) -> None:
 
 
 @pytest.mark.parametrize("name", NAMES)
-@pytest.mark.parametrize(("use_guess", "every"), [(0, 1), (1, 1), (0, 3)])
-def test_add_equals_its_twin(device: Device, name: str, use_guess: int, every: int) -> None:
+@pytest.mark.parametrize(
+    ("start", "every"), [(twin.THERE, 1), (twin.GUESSED, 1), (twin.BOTH, 1), (twin.BOTH, 3)]
+)
+def test_add_equals_its_twin(device: Device, name: str, start: int, every: int) -> None:
     """On a chart of its own axis, for boxes that overlap in part."""
     grid = GRIDS[name]
     overlap = np.zeros(grid.shape, bool)
     overlap[: grid.height // 2, 20:40] = True
     found = pair_chart(overlap, grid, grid)
-    flow = smooth_flow(1, found)
+    flow, back = smooth_flow(1, found), smooth_flow(7, found)
     layer, box = random_layer(2, 51, 19), (5, 0, 51, 19)
     blend, box_j = patches(3, 40, 17, 0.8) * np.float32(0.7), (30, 1, 40, 17)
     blend[::7] *= 1e-5  # as good as nothing
@@ -76,10 +78,23 @@ def test_add_equals_its_twin(device: Device, name: str, use_guess: int, every: i
     device.run(
         "geometry", "geometry_add", (-(-size[0] // 4), size[1]),
         device.upload(blend), box_j, device.upload(layer), box, every, grid.border, grid.lens,
-        device.upload(flow), chart_grid, found.transform, use_guess, device.upload(guess), out, size,
+        device.upload(flow), device.upload(back), chart_grid, found.transform, start, device.upload(guess),
+        out, size,
     )  # fmt: skip
     expected = twin.geometry_add(
-        blend, box_j, layer, box, every, grid.lens, flow, chart_grid, found.transform, use_guess, guess, field
+        blend,
+        box_j,
+        layer,
+        box,
+        every,
+        grid.lens,
+        flow,
+        back,
+        chart_grid,
+        found.transform,
+        start,
+        guess,
+        field,
     )
     kernel = out.get()
     assert np.array_equal(kernel[..., 3], field[..., 3])
@@ -321,8 +336,8 @@ def test_identical_layers_do_not_move(device: Device, name: str) -> None:
             assert (field.get()[..., 3] == 1).all()
 
 
-def test_the_fixed_point_puts_layers_on_one_point(device: Device) -> None:
-    """With F_ab and F_ba inverse to each other, but not constant, x_b = x_a + F_ab(x_a) after some steps."""
+def test_both_flows_or_the_fixed_point_put_things_where_they_belong(device: Device) -> None:
+    """With F_ab and F_ba inverse to each other, but not constant, x_b = x_a + F_ab(x_a); p is between."""
     grid = plane(120, 90)
     found = whole_chart(grid)
     x, y = common.pixels(120, 90)
@@ -336,20 +351,22 @@ def test_the_fixed_point_puts_layers_on_one_point(device: Device) -> None:
     parts = [whole(device, grid, blend) for blend in (0.4, 0.6)]
     both = forward_at(place).astype(np.float32), backward.astype(np.float32)
     flows = [pair(device, 0, 1, found, *both)]
-    errors = []
-    for steps in (0, 6):
+    apart, beside = [], []
+    for settings in (PUBLISHED, Settings(), Settings(fixed_point_steps=6)):
         a, b = geometry.fields(
             device,
             [p[0] for p in parts],
             [p[1] for p in parts],
             [*flows],  # it is emptied
             grid,
-            Settings(fixed_point_steps=steps),
+            settings,
         )
         at_a, at_b = (place + one.get()[..., :2] for one in (a, b))
-        errors.append(np.abs(at_b - at_a - forward_at(at_a))[20:-20, 20:-20].max())
-    assert errors[0] > 0.02
-    assert errors[1] < errors[0] / 10
+        inner = np.s_[20:-20, 20:-20]
+        apart.append(np.abs(at_b - at_a - forward_at(at_a))[inner].max())
+        beside.append(np.abs(at_a + 0.6 * forward_at(at_a) - place)[inner].max())
+    assert beside[0] > 0.3 and beside[1] < beside[0] / 5 and beside[2] < beside[0] / 100
+    assert apart[0] > 0.02 and apart[1] < 0.1 and apart[2] < apart[0] / 10
 
 
 def test_displacement_over_the_pole_is_continuous(device: Device) -> None:

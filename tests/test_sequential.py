@@ -23,6 +23,7 @@ AS_PUBLISHED = {
     "exposure": False,
     "border_feather": 0.0,
     "highlights": False,
+    "both_flows": False,
     "fixed_point_steps": 0,
 }
 

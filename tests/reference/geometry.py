@@ -20,6 +20,8 @@ from reference.common import (
 
 # Coefficients below this move nothing.
 NEGLIGIBLE = 1e-5
+# Where flow is read.
+THERE, GUESSED, BOTH = range(3)
 
 
 def flow_at(flow: Array, u: Array, v: Array, grid: Sequence[int]) -> Array:
@@ -37,9 +39,10 @@ def geometry_add(
     every: int,
     lens: Numbers,
     flow: Array,
+    back: Array,
     grid: Sequence[int],
     chart: Numbers,
-    use_guess: int,
+    start: int,
     guess: Array,
     field: Array,
 ) -> Array:
@@ -48,15 +51,17 @@ def geometry_add(
     weight = np.where(layer_k[::every, ::every, 3] != 0, take(blend_j, box_j, x, y), 0.0)
     weight[weight < NEGLIGIBLE] = 0
     point = canvas_point(x + 0.5, y + 0.5, lens)
-    if use_guess:
+    if start == GUESSED:
         point = point + guess[..., :3]
         if lens[1]:
             point = point / np.linalg.norm(point, axis=-1, keepdims=True)
     u, v = chart_position(point, chart)
     moved = flow_at(flow, u, v, grid)
+    if start == BOTH:
+        moved = weight[..., None] * moved - (1 - weight[..., None]) * flow_at(back, u, v, grid)
     way = chart_point(u + moved[..., 0], v + moved[..., 1], chart) - chart_point(u, v, chart)
     result = field.astype(np.float64)
-    result[..., :3] += (-1 if use_guess else 1) * weight[..., None] * way
+    result[..., :3] += (-1 if start == GUESSED else 1) * weight[..., None] * way
     return result
 
 
