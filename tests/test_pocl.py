@@ -122,9 +122,9 @@ OPTIONS = "-DPIXEL=uchar -DSAMPLES=4 -DWHITE=255.0f -DINTEGER=1 -DPIXELS=4"
 _RENAMED_RUN = """
 import sys
 from hugin_abflow import pocl
-from hugin_abflow.opencl import Device, _choose
+from hugin_abflow.opencl import Device, choose
 
-chosen = _choose(None)
+chosen = choose(None)
 assert pocl._rename(chosen.int_ptr, sys.argv[1], sys.argv[3])
 pocl.name_processor(sys.argv[2], chosen.int_ptr)
 print(sorted(Device(threads=1).build("blend", sys.argv[4])))
