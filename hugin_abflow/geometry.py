@@ -126,7 +126,7 @@ def _displacement(
             if index not in (pair.a, pair.b):
                 continue
             other = pair.b if index == pair.a else pair.a
-            flow, back = pair.between(index if guess else other), pair.between(index)
+            flow, back = pair.between(other), pair.between(index)
             start = _GUESSED if guess else _BOTH if settings.both_flows else _THERE
             chart_grid = (pair.chart.width, pair.chart.height, int(pair.chart.wraps), 0)
             device.run(

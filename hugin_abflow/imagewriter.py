@@ -157,14 +157,9 @@ class ImageWriter:
 
     def __enter__(self) -> ImageWriter:
         self._final = _final(self.path)
-        try:
+        with _explained(self.path, self._final):
             # made here, not by OpenImageIO: a clear reason
             self._part = self._scratch.enter_context(part_beside(self._final, self.path.suffix))
-        except OSError as error:
-            raise OutputError(
-                f"{self.path} cannot be written: {self._final.parent}: {error.strerror}; "
-                "choose another folder with -o"
-            ) from None
         try:
             why = self._open()
             if why and self.format == "png" and self._spec.getattribute("ICCProfile") is not None:
@@ -340,8 +335,8 @@ def write_image(
 def check_target(path: Path, compression: str | None) -> None:
     """Raise `OutputError` for a file that cannot be written, or not so, whatever it is to hold."""
     final, kind = _final(path), _format_of(path)
-    if not final.parent.is_dir():
-        raise OutputError(f"{path} cannot be written: {final.parent} is no folder; choose another with -o")
+    with _explained(path, final):
+        os.stat(f"{final.parent}{os.sep}")  # noqa: PTH116 - so a file is no folder
     _compression(path, kind, np.dtype(np.uint8), 3, compression, None)
 
 
@@ -353,17 +348,24 @@ def _final(path: Path) -> Path:
             f"{path} cannot be written: the path of its folder is not valid UTF-8; rename that, "
             "or choose another with -o"
         )
-    try:
+    with _explained(path, final):
         if final.is_dir():
             raise OutputError(f"{path} is a folder; name a file with -o")
         # a device or a pipe, reached by a link: the rename would take its place
         if is_special(final):
             raise OutputError(f"{path} is no ordinary file; name one with -o")
+    return final
+
+
+@contextlib.contextmanager
+def _explained(path: Path, final: Path) -> Iterator[None]:
+    """Raise `OutputError` for what the system says of the folder of `final`, which `path` means."""
+    try:
+        yield
     except OSError as error:
         raise OutputError(
             f"{path} cannot be written: {final.parent}: {error.strerror}; choose another folder with -o"
         ) from None
-    return final
 
 
 def named_in_unicode(path: Path) -> bool:

@@ -116,15 +116,8 @@ class Settings:
                 expected = " or ".join(map(repr, choices))
                 raise SettingsError(f"{name} is {value!r}; choose {expected}")
         for name in (
-            "flow",
-            "exposure",
-            "highlights",
-            "seam",
-            "movers",
-            "foreground",
-            "guides",
-            "both_flows",
-        ):
+            "flow", "exposure", "highlights", "seam", "movers", "foreground", "guides", "both_flows",
+        ):  # fmt: skip
             if not isinstance(getattr(self, name), bool):
                 raise SettingsError(f"{name} is {getattr(self, name)!r}; choose True or False")
         if self.device is not None and not isinstance(self.device, str):

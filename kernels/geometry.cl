@@ -29,9 +29,9 @@ static inline float4 geometry_read(__global const float2 *flow, float4 u, float4
     return (float4)(a.x, b.x, c.x, d.x);
 }
 
-/* From four points q the ways that flow leads, by its chart, and how much of flow `back` takes its place, turned
-   round; moves: where it leads anywhere. */
-static inline points4 geometry_ways(points4 q, __global const float2 *flow, __global const float2 *back, float4 turned,
+/* From four points q the ways that flow leads, by its chart; with `back`, a share of it and for the rest `back`,
+   turned round; moves: where it leads anywhere. */
+static inline points4 geometry_ways(points4 q, __global const float2 *flow, __global const float2 *back, float4 share,
                                     int4 grid, const float16 *chart, int4 *moves) {
     const bool plane = chart->sd == 0.0f;
     float4 u, v;
@@ -49,8 +49,8 @@ static inline points4 geometry_ways(points4 q, __global const float2 *flow, __gl
     if (back) {
         float4 by;
         const float4 bx = geometry_read(back, u, v, grid, &by);
-        fx = (1.0f - turned) * fx - turned * bx;
-        fy = (1.0f - turned) * fy - turned * by;
+        fx = share * fx - (1.0f - share) * bx;
+        fy = share * fy - (1.0f - share) * by;
     }
     *moves = fx != 0.0f || fy != 0.0f;
     if (plane) /* on one that wraps, u may be of a copy of q */
@@ -71,8 +71,8 @@ __kernel void geometry_add(__global const float *blend_j,   /* (box_j.w, box_j.z
                            int4 box_k,                      /* place on the working grid */
                            int every,                       /* columns and rows from one to the next */
                            int4 border, float4 lens,        /* working grid */
-                           __global const float2 *flow,     /* chart grid, px: F_jk; GUESSED: F_kj */
-                           __global const float2 *back,     /* chart grid, px: F_kj; read with BOTH */
+                           __global const float2 *flow,     /* chart grid, px: F_jk */
+                           __global const float2 *back,     /* chart grid, px: F_kj */
                            int4 grid, float16 chart,        /* chart */
                            int from,                        /* GEOMETRY_... */
                            __global const float4 *guess,    /* (size.y, size.x) displacement */
@@ -105,8 +105,8 @@ __kernel void geometry_add(__global const float *blend_j,   /* (box_j.w, box_j.z
         }
     }
     int4 moves;
-    const float4 turned = 1.0f - (float4)(share[0], share[1], share[2], share[3]);
-    const points4 d = geometry_ways(q, flow, from == GEOMETRY_BOTH ? back : 0, turned, grid, &chart, &moves);
+    const points4 d = geometry_ways(q, from == GEOMETRY_GUESSED ? back : flow, from == GEOMETRY_BOTH ? back : 0,
+                                    (float4)(share[0], share[1], share[2], share[3]), grid, &chart, &moves);
     const float3 way[GEOMETRY_CHUNK] = {(float3)(d.x.x, d.y.x, d.z.x), (float3)(d.x.y, d.y.y, d.z.y),
                                         (float3)(d.x.z, d.y.z, d.z.z), (float3)(d.x.w, d.y.w, d.z.w)};
     const int moved[GEOMETRY_CHUNK] = {moves.x, moves.y, moves.z, moves.w};

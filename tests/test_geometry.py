@@ -82,20 +82,9 @@ def test_add_equals_its_twin(device: Device, name: str, start: int, every: int) 
         out, size,
     )  # fmt: skip
     expected = twin.geometry_add(
-        blend,
-        box_j,
-        layer,
-        box,
-        every,
-        grid.lens,
-        flow,
-        back,
-        chart_grid,
-        found.transform,
-        start,
-        guess,
+        blend, box_j, layer, box, every, grid.lens, flow, back, chart_grid, found.transform, start, guess,
         field,
-    )
+    )  # fmt: skip
     kernel = out.get()
     assert np.array_equal(kernel[..., 3], field[..., 3])
     moved = np.abs(expected - field).max(-1) > 0

@@ -56,7 +56,7 @@ def geometry_add(
         if lens[1]:
             point = point / np.linalg.norm(point, axis=-1, keepdims=True)
     u, v = chart_position(point, chart)
-    moved = flow_at(flow, u, v, grid)
+    moved = flow_at(back if start == GUESSED else flow, u, v, grid)
     if start == BOTH:
         moved = weight[..., None] * moved - (1 - weight[..., None]) * flow_at(back, u, v, grid)
     way = chart_point(u + moved[..., 0], v + moved[..., 1], chart) - chart_point(u, v, chart)
