@@ -24,6 +24,9 @@ from hugin_abflow.pyramid import Level
 # Pixels between start and return that leave a sixteenth of the trust. What is far off must leave next to
 # nothing: many such pixels would outweigh the few around them.
 _TOLERANCE = 2.2
+# What one photo shows and a near thing hides in the other has no place there. Flow squeezes it between its
+# neighbours, and leads back all the same. A pixel that this share of its area is left to has no trust.
+_SQUEEZED = 0.6
 # The level whose mean tells how much is trusted around a pixel, and the mean that is enough: less is found on
 # islands and lines on which wrong flows happen to lead back.
 _AROUND, _ENOUGH = 2, 0.3
@@ -63,8 +66,8 @@ def trust(
     distrusted = device.upload(np.zeros((1, 1), np.uint8) if whole is None else whole.astype(np.uint8))
     cells = (*distrusted.shape[::-1], CELL, 0)
     device.run(
-        "consistency", "consistency_trust", grid[:2], flow, back, grid, _TOLERANCE, distrusted, cells, image,
-        trusted,
+        "consistency", "consistency_trust", grid[:2], flow, back, grid, _TOLERANCE, _SQUEEZED,
+        distrusted, cells, image, trusted,
     )  # fmt: skip
     return trusted
 

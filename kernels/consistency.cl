@@ -6,12 +6,22 @@
 /* Brightness of what tells nothing. */
 #define UNTOLD 1e3f
 
-/* Trust in a flow, 1 / (1 + (e / tolerance)^2)^4 with e = |F_ab(q) + F_ba(q + F_ab(q))|; none in the place of
-   what is taken from one photo. */
+/* The area that a pixel's has become where its flow leads. Beyond a border that does not wrap flow is the same. */
+static inline float area_there(__global const float2 *flow, int x, int y, int4 grid) {
+    const int at = y * grid.x + x, turn = grid.z ? grid.x - 1 : 0;
+    const float2 left = flow[x > 0 ? at - 1 : at + turn], right = flow[x < grid.x - 1 ? at + 1 : at - turn];
+    const float2 above = flow[y > 0 ? at - grid.x : at], below = flow[y < grid.y - 1 ? at + grid.x : at];
+    const float2 across = 0.5f * (right - left), down = 0.5f * (below - above);
+    return (1.0f + across.x) * (1.0f + down.y) - across.y * down.x;
+}
+
+/* Trust in a flow, 1 / (1 + (e / tolerance)^2)^4 with e = |F_ab(q) + F_ba(q + F_ab(q))|, and less where it is
+   squeezed; none in the place of what is taken from one photo. */
 __kernel void consistency_trust(__global const float2 *flow, /* (grid.y, grid.x) F_ab, px */
                                 __global const float2 *back, /* (grid.y, grid.x) F_ba, px */
                                 int4 grid,                   /* width, height, wraps, 0; run size */
                                 float tolerance,             /* px that leave a sixteenth of the trust */
+                                float squeezed,              /* area of a pixel that leaves none, as a share */
                                 __global const uchar *once,  /* (cells.y, cells.x): what is taken from one photo */
                                 int4 cells,                  /* width, height, px of the chart per cell, 0 */
                                 __global const float *image, /* (grid.y, grid.x) a: log brightness, 0 outside */
@@ -30,8 +40,10 @@ __kernel void consistency_trust(__global const float2 *flow, /* (grid.y, grid.x)
     const float2 e = (f + bilinear_flow(back, q, grid)) / tolerance;
     const float c = 1.0f / (1.0f + square2(e));
     const int column = LEAST(x / cells.z, cells.x - 1), row = LEAST(y / cells.z, cells.y - 1);
+    const float room = (area_there(flow, x, y, grid) - squeezed) / (1.0f - squeezed);
+    const float shown = LIMITED(room, 0.0f, 1.0f);
     const bool single = once[row * cells.x + column];
-    trusted[at] = (float4)(f, single ? 0.0f : c * c * c * c, single ? UNTOLD : image[at]);
+    trusted[at] = (float4)(f, single ? 0.0f : shown * c * c * c * c, single ? UNTOLD : image[at]);
 }
 
 /* Halve: the mean flow, weighted by trust, the mean trust and the mean brightness; taps as in pyramid_reduce. */

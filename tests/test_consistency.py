@@ -1,4 +1,4 @@
-"""Trust in flow and its filling: kernels against twins, twins against SciPy, flows that are known."""
+"""Filling of flow: kernels against twins, twins against SciPy, flows that are known."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from grids import patches, plane, sphere
 from reference import common
 from reference import consistency as twin
 from scipy import ndimage
-from tolerances import POSITION, SUM, assert_close
+from tolerances import SUM, assert_close
 
 from hugin_abflow import consistency
 from hugin_abflow.cells import CELL, Whole
@@ -22,25 +22,6 @@ from hugin_abflow.working import Grid
 
 SIZES = [(77, 53), (64, 31), (5, 3), (1, 7), (1, 1)]
 WRAPS = [False, True]
-# Cells of which none moved, as the kernel takes them.
-NOTHING = np.zeros((1, 1), bool), (1, 1, CELL, 0)
-
-
-def smooth_flow(seed: int, width: int, height: int, most: float, wraps: bool) -> np.ndarray:
-    """Flow float32 (height, width, 2) of at most `most` px in each direction."""
-    random = np.random.default_rng(seed).normal(size=(height, width, 2))
-    flow = ndimage.gaussian_filter(
-        random, (5, 5, 0), mode=("nearest", "wrap" if wraps else "nearest", "nearest")
-    )
-    return (flow * most / max(np.abs(flow).max(), 1e-9)).astype(np.float32)
-
-
-def moved_cells(seed: int, width: int, height: int) -> np.ndarray:
-    """A random mask of the cells of a chart; one of them at least is set."""
-    rows, columns = (max(1, (n + CELL // 2 - 1) // CELL) for n in (height, width))
-    cells = np.random.default_rng(seed).random((rows, columns)) < 0.3
-    cells[-1, seed % columns] = True
-    return cells
 
 
 def random_trusted(seed: int, width: int, height: int) -> np.ndarray:
@@ -67,53 +48,6 @@ def on_tiles(values: np.ndarray, wraps: bool, by: int = 8) -> np.ndarray:
 def read_at(values: np.ndarray, x: np.ndarray, y: np.ndarray, wraps: bool, by: int = 8) -> np.ndarray:
     """SciPy's linear interpolation at positions whose pixel centres are at n + 0.5, up to `by` px outside."""
     return ndimage.map_coordinates(on_tiles(values, wraps, by), [y - 0.5 + by, x - 0.5 + by], order=1)
-
-
-@pytest.mark.parametrize("wraps", WRAPS)
-def test_twin_of_trust_is_the_formula(wraps: bool) -> None:
-    flow, back = (smooth_flow(k, 77, 53, 6.0, wraps).astype(np.float64) for k in (0, 1))
-    image = np.random.default_rng(2).normal(size=(53, 77))
-    trusted = twin.consistency_trust(flow, back, (77, 53, int(wraps), 0), 1.5, *NOTHING, image)
-    columns, rows = common.pixels(77, 53)
-    there = columns + 0.5 + flow[..., 0], rows + 0.5 + flow[..., 1]
-    u, v = (read_at(back[..., k], *there, wraps) for k in (0, 1))
-    squared = (flow[..., 0] + u) ** 2 + (flow[..., 1] + v) ** 2
-    assert np.allclose(trusted[..., 2], 1 / (1 + squared / 1.5**2) ** 4)
-    assert np.array_equal(trusted[..., :2], flow)
-    assert np.array_equal(trusted[..., 3], image)
-    off = np.array([[[1.5, 0.0]]])  # 1.5 px from the start: a sixteenth
-    little = twin.consistency_trust(off, 0 * off, (1, 1, 0, 0), 1.5, *NOTHING, np.zeros((1, 1)))
-    assert little[0, 0, 2] == pytest.approx(1 / 16)
-
-
-@pytest.mark.parametrize("size", SIZES)
-def test_twin_of_trust_has_none_in_what_moved(size: tuple[int, int]) -> None:
-    """Pixel by pixel, on cells of the size that cells.py makes, as many as have a pixel in their middle."""
-    moved, still = moved_cells(4, *size), np.zeros((size[1], size[0], 2))
-    rows, columns = moved.shape
-    grid, cells = (*size, 0, 0), (columns, rows, CELL, 0)
-    trusted = twin.consistency_trust(still, still, grid, 1.5, moved, cells, still[..., 0])
-    for y, x in np.ndindex(trusted.shape[:2]):
-        its = moved[min(y // CELL, rows - 1), min(x // CELL, columns - 1)]
-        assert tuple(trusted[y, x, 2:]) == ((0, twin.UNTOLD) if its else (1, 0))
-
-
-@pytest.mark.parametrize("size", SIZES)
-@pytest.mark.parametrize("wraps", WRAPS)
-def test_trust_equals_its_twin(device: Device, size: tuple[int, int], wraps: bool) -> None:
-    flow, back = (smooth_flow(k, *size, 6.0, wraps) for k in (2, 3))
-    image = random_trusted(4, *size)[..., 3]
-    for moved in (None, moved_cells(5, *size), moved_cells(6, *size)):
-        uploaded = device.upload(flow), device.upload(back), wraps, device.upload(image)
-        kernel = consistency.trust(device, *uploaded, moved).get()
-        given = NOTHING if moved is None else (moved, (*moved.shape[::-1], CELL, 0))
-        grid = (*size, int(wraps), 0)
-        expected = twin.consistency_trust(flow, back, grid, consistency._TOLERANCE, *given, image)
-        assert np.array_equal(kernel[..., :2], flow)
-        assert_close(kernel, expected, POSITION)
-        none = expected[..., 2] == 0
-        assert np.array_equal(kernel[..., 2] == 0, none)
-        assert none.any() == (moved is not None and bool(moved.any()))
 
 
 @pytest.mark.parametrize("wraps", WRAPS)
@@ -301,11 +235,12 @@ def test_a_flow_that_leads_back_exactly_stays_to_the_bit(device: Device, name: s
 
 @pytest.mark.parametrize("name", list(CANVASES))
 def test_consistent_flows_come_out_unchanged(device: Device, name: str) -> None:
-    """Of a smooth field, whose inverse is found by iteration: within the interpolation's own error."""
+    """Of a smooth field, whose inverse is found by iteration: nearly within the interpolation's own error,
+    though pixels of it become a quarter smaller."""
     found = chart_of(CANVASES[name])
     columns, rows = common.pixels(found.width, found.height)
-    turn = 6 * math.pi / found.width
-    forward = 3 * np.stack([np.sin(turn * columns + rows / 9), np.cos(rows / 7 - turn * columns)], -1)
+    turn = 4 * math.pi / found.width
+    forward = 2 * np.stack([np.sin(turn * columns + rows / 27), np.cos(rows / 21 - turn * columns)], -1)
     backward = np.zeros_like(forward)
     for _ in range(30):  # F_ba(q) = -F_ab(q + F_ba(q))
         x, y = columns + 0.5 + backward[..., 0], rows + 0.5 + backward[..., 1]
@@ -316,7 +251,7 @@ def test_consistent_flows_come_out_unchanged(device: Device, name: str) -> None:
     for result, flow in zip(
         mended(device, CANVASES[name], forward, backward), (forward, backward), strict=True
     ):
-        assert np.abs(flow[inner]).max() > 2.5
+        assert np.abs(flow[inner]).max() > 1.9
         assert np.abs(result - flow)[inner].max() < 0.01
 
 
@@ -358,7 +293,9 @@ def test_flow_of_what_moved_is_filled_from_around(device: Device, name: str, col
     filled = mended(device, CANVASES[name], *flows, Whole(*places))
     assert max(np.abs(flow).max() for flow in filled) < LEFT
     for kept, flow in zip(mended(device, CANVASES[name], *flows), flows, strict=True):
-        assert np.array_equal(kept[flow[..., 0] != 0], flow[flow[..., 0] != 0])
+        # at its outline what is before and what is behind are told apart by brightness, and here is none
+        inner = ndimage.binary_erosion(flow[..., 0] != 0, iterations=1)
+        assert np.array_equal(kept[inner], flow[inner])
 
 
 def test_near_flow_counts_before_far(device: Device) -> None:
@@ -395,6 +332,23 @@ def test_a_thing_keeps_its_motion_up_to_its_outline(device: Device, who: int) ->
     assert shown[gap].mean() < 0.7
     for place in (gap, gap & outline):
         assert shown[place].mean() < 0.6 * blind[place].mean()
+
+
+def test_what_a_near_thing_hides_moves_as_what_is_beside_it(device: Device) -> None:
+    """The thing, bright, goes 8 px over what is behind it, which stands still. The flow that was found
+    squeezes what is hidden, and more on both sides, and leads back."""
+    grid = plane(97, 61)
+    columns, _ = common.pixels(97, 61)
+    forward, backward = np.zeros((2, 61, 97, 2))
+    forward[..., 0] = np.interp(columns + 0.5, [40, 61], [8, 0])
+    backward[..., 0] = np.interp(columns + 0.5, [48, 61], [-8, 0])
+    right = np.where(columns < 50, 8.0, 0.0)
+    images = (np.where(columns < 50, 0.0, -1.0), None)
+    result = mended(device, grid, forward, backward, images=images)[0]
+    hidden = (columns >= 50) & (columns < 58)
+    before, after = (np.abs(flow[..., 0] - right)[hidden].mean() for flow in (forward, result))
+    assert after < 0.5 * before
+    assert np.abs(result[..., 0] - right).max() < 2  # at the outline, where it was 4
 
 
 def test_a_line_on_which_wrong_flows_lead_back_counts_little(device: Device) -> None:

@@ -12,17 +12,35 @@ from reference.common import Array, bilinear, pixels
 UNTOLD = 1e3
 
 
+def area_there(flow: Array, grid: Sequence[int]) -> Array:
+    """The determinant of the gradient of q + F(q), by central differences, (height, width)."""
+    padded = np.pad(flow.astype(np.float64), ((1, 1), (0, 0), (0, 0)), mode="edge")
+    padded = np.pad(padded, ((0, 0), (1, 1), (0, 0)), mode="wrap" if grid[2] else "edge")
+    across = (padded[1:-1, 2:] - padded[1:-1, :-2]) / 2 + [1, 0]
+    down = (padded[2:, 1:-1] - padded[:-2, 1:-1]) / 2 + [0, 1]
+    return across[..., 0] * down[..., 1] - across[..., 1] * down[..., 0]
+
+
+def on_pixels(cells: Array, size: int, grid: Sequence[int]) -> Array:
+    """A mask of cells of `size` px as one of pixels, (height, width); the last cells go on to the border."""
+    under = np.kron(cells, np.ones((size, size)))
+    beyond = [(0, max(0, wanted - there)) for wanted, there in zip(grid[1::-1], under.shape, strict=True)]
+    return np.pad(under, beyond, mode="edge")[: grid[1], : grid[0]] > 0
+
+
 def consistency_trust(
     flow: Array,
     back: Array,
     grid: Sequence[int],
     tolerance: float,
+    squeezed: float,
     moved: Array,
     cells: Sequence[int],
     image: Array,
 ) -> Array:
-    """Flow, how far going there and back again ends at the start, and the image, (height, width, 4); under
-    cells that moved, the last of which go on to the border, nothing is believed and the image tells nothing.
+    """Flow, how far going there and back again ends at the start, less where areas shrink, and the image,
+    (height, width, 4); under cells that moved, the last of which go on to the border, nothing is believed
+    and the image tells nothing.
     """
     columns, rows = pixels(grid[0], grid[1])
     x, y = columns + 0.5 + flow[..., 0], rows + 0.5 + flow[..., 1]
@@ -32,9 +50,8 @@ def consistency_trust(
     returned, share = bilinear(back, grid, x, y)
     away = np.linalg.norm(flow + returned / share[..., None], axis=-1)
     trust = (1 + (away / tolerance) ** 2) ** -4
-    under = np.kron(moved, np.ones((cells[2], cells[2])))
-    beyond = [(0, max(0, wanted - there)) for wanted, there in zip(grid[1::-1], under.shape, strict=True)]
-    gone = np.pad(under, beyond, mode="edge")[: grid[1], : grid[0]] > 0
+    trust = trust * np.clip((area_there(flow, grid) - squeezed) / (1 - squeezed), 0, 1)
+    gone = on_pixels(moved, cells[2], grid)
     return np.dstack([flow, np.where(gone, 0, trust), np.where(gone, UNTOLD, image)])
 
 
