@@ -11,6 +11,7 @@ import tifffile
 from layer_files import write_layer
 from pictures import one_device, texture
 
+from hugin_abflow import joint
 from hugin_abflow.dropin import enblend
 from hugin_abflow.dropin.weights import name
 from hugin_abflow.errors import CommandLineError
@@ -123,6 +124,19 @@ def test_masks_that_cannot_be(layers: list[str], capsys: pytest.CaptureFixture[s
     assert "is an input" in refused(capsys, "--save-masks=%p", *layers)
     assert "is an input" in refused(capsys, "--save-masks=%F.tif", layers[0])
     assert "%q in %q.tif means nothing" in refused(capsys, "--save-masks=%q.tif", *layers)
+
+
+def test_masks_that_cannot_be_written_are_told_before_the_work(
+    layers: list[str], capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def prepare(*_: object) -> None:
+        raise AssertionError("the work has begun")
+
+    monkeypatch.setattr(joint, "prepare_in_memory", prepare)
+    message = refused(capsys, "--save-masks=none/m%n.tif", *layers)
+    assert "none/m1.tif cannot be written" in message
+    assert "No such file or directory" in message
+    assert "m1.text: the ending must be one of" in refused(capsys, "--save-masks=m%n.text", *layers)
 
 
 @pytest.mark.parametrize(

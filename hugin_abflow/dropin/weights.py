@@ -16,7 +16,7 @@ from hugin_abflow.blend import BlendLayer
 from hugin_abflow.colour import Correction
 from hugin_abflow.errors import CommandLineError, LayersMismatchError, LayersMissingError
 from hugin_abflow.guides import Guide
-from hugin_abflow.images import ImageWriter, read_layer
+from hugin_abflow.images import ImageWriter, check_target, read_layer
 from hugin_abflow.joint import Prepared
 from hugin_abflow.layer import Box, Canvas, Layer, full_scale
 from hugin_abflow.merge import refuse_input
@@ -51,7 +51,8 @@ class MaskedMerge:
         guides: Sequence[Guide],
     ) -> Generator[npt.NDArray[Any], None, None]:
         """Bands as `joint.merge` gives them; raises what it raises, and `LayersMissingError`,
-        `LayersMismatchError` and `ImageReadError` for masks that are missing, of another size, or broken.
+        `LayersMismatchError` and `ImageReadError` for masks that are missing, of another size, or broken,
+        `OutputError` for such as cannot be written.
         """
         numbers = {id(layer): index for index, layer in enumerate(layers)}
         given = self._read(layers, canvas.crop) if self.load else []
@@ -91,6 +92,7 @@ class MaskedMerge:
             raise CommandLineError(f"--save-masks={self.save} names one mask twice; %n gives each a number")
         for target in targets:
             refuse_input(target, [self.output, *(layer.file for layer in layers if layer.file)])
+            check_target(target, None)  # now, not when all else is done
         return targets
 
 
