@@ -25,7 +25,7 @@ from hugin_abflow.pyramid import Level
 # nothing: many such pixels would outweigh the few around them.
 _TOLERANCE = 2.2
 # What one photo shows and a near thing hides in the other has no place there. Flow squeezes it between its
-# neighbours, and leads back all the same. A pixel that this share of its area is left to has no trust.
+# neighbours, and leads back all the same. A pixel has no trust if only this share of its area is left.
 _SQUEEZED = 0.6
 # The level whose mean tells how much is trusted around a pixel, and the mean that is enough: less is found on
 # islands and lines on which wrong flows happen to lead back.
