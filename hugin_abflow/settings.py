@@ -49,7 +49,8 @@ class Settings:
                         1024; 0: chosen by flow_quality.
     border_feather      width of the ramp that brings a layer's weight to 0 at its own border, in working
                         pixels; 0: none, as published.
-    both_flows          where layer k is sampled is told by F_kj(p), too; else by F_jk(p) alone, as published.
+    both_flows          where layer k is sampled is told by F_kj(p), too, by each as far as the flows at the
+                        ends of its way say the same; else by F_jk(p) alone, as published.
     fixed_point_steps   times that x_k <- p - sum_j w_j F_kj(x_k) is iterated from there; 0: flow is read at
                         p alone, as published.
     band_rows           rows of a full-resolution band; 0: chosen from the canvas width and `max_memory`.

@@ -19,7 +19,13 @@ static inline float geometry_share(__global const float *blend_j, int4 box_j, __
 /* Where geometry_add reads flow. */
 #define GEOMETRY_THERE 0   /* F_jk at p: first order, as published */
 #define GEOMETRY_GUESSED 1 /* F_kj at the place where layer k is guessed to be sampled */
-#define GEOMETRY_BOTH 2    /* F_jk and F_kj at p */
+#define GEOMETRY_BOTH 2    /* F_jk and F_kj at p, each as far as the flows at its ends say the same */
+
+/* Squared px of a chart: the two flows' difference up to which there is nothing to choose, and how far the flows at
+   a way's ends lead elsewhere where it is doubted by half of the most, which is: */
+#define GEOMETRY_ALIKE 0.01f
+#define GEOMETRY_OFF 16.0f
+#define GEOMETRY_DOUBT 6.0f
 
 /* Flow at four places of a chart. */
 static inline float4 geometry_read(__global const float2 *flow, float4 u, float4 v, int4 grid, float4 *fy) {
@@ -29,8 +35,19 @@ static inline float4 geometry_read(__global const float2 *flow, float4 u, float4
     return (float4)(a.x, b.x, c.x, d.x);
 }
 
+/* How much a way from what layer j shows at the place p to what layer k shows is doubted, where that is at (u, v) of a
+   chart: by how far the flows at its ends, F_jk where j and F_kj where k is sampled then, lead elsewhere. */
+static inline float4 geometry_doubt(__global const float2 *flow, __global const float2 *back, float4 u, float4 v,
+                                    float4 wx, float4 wy, float4 share, int4 grid) {
+    float4 fy, by;
+    const float4 fx = geometry_read(flow, u - (1.0f - share) * wx, v - (1.0f - share) * wy, grid, &fy);
+    const float4 bx = geometry_read(back, u + share * wx, v + share * wy, grid, &by);
+    const float4 off = (fx - wx) * (fx - wx) + (fy - wy) * (fy - wy) + (bx + wx) * (bx + wx) + (by + wy) * (by + wy);
+    return 1.0f + GEOMETRY_DOUBT * off * off / (off * off + GEOMETRY_OFF * GEOMETRY_OFF);
+}
+
 /* From four points q the ways that flow leads, by its chart; with `back`, a share of it and for the rest `back`,
-   turned round; moves: where it leads anywhere. */
+   turned round, each the less the more it is doubted; moves: where it leads anywhere. */
 static inline points4 geometry_ways(points4 q, __global const float2 *flow, __global const float2 *back, float4 share,
                                     int4 grid, const float16 *chart, int4 *moves) {
     const bool plane = chart->sd == 0.0f;
@@ -49,8 +66,16 @@ static inline points4 geometry_ways(points4 q, __global const float2 *flow, __gl
     if (back) {
         float4 by;
         const float4 bx = geometry_read(back, u, v, grid, &by);
-        fx = share * fx - (1.0f - share) * bx;
-        fy = share * fy - (1.0f - share) * by;
+        const int4 apart = (fx + bx) * (fx + bx) + (fy + by) * (fy + by) > GEOMETRY_ALIKE;
+        float4 part = share;
+        if (any(apart)) {
+            const float4 doubt = geometry_doubt(flow, back, u, v, fx, fy, share, grid);
+            const float4 doubt_back = geometry_doubt(flow, back, u, v, -bx, -by, share, grid);
+            const float4 its = share * doubt_back * doubt_back, rest = (1.0f - share) * doubt * doubt;
+            part = apart ? its / (its + rest) : share;
+        }
+        fx = part * fx - (1.0f - part) * bx;
+        fy = part * fy - (1.0f - part) * by;
     }
     *moves = fx != 0.0f || fy != 0.0f;
     if (plane) /* on one that wraps, u may be of a copy of q */
@@ -63,8 +88,8 @@ static inline points4 geometry_ways(points4 q, __global const float2 *flow, __gl
    so that x_k = p - w_j F_kj(x_k), in which `guess` may say where x_k is. At p one flow alone is too long or too
    short where it changes: with g its gradient along itself, f its length, x_k is missed by g f w_j^2 with F_kj, and
    on the other side by g f w_j (1 - w_j) with F_jk. So of -F_kj a share of 1 - w_j is read, and of F_jk one of w_j:
-   that leaves nothing of these, and beside things that hide others, where flow is no change but a step, each layer
-   goes by its own flow where it shows most. */
+   that leaves nothing of these. Beside things that hide others, where flow is no change but a step, one of the two may
+   be the thing's and the other that of what is behind: the one counts that is the same at both ends. */
 __kernel void geometry_add(__global const float *blend_j,   /* (box_j.w, box_j.z) */
                            int4 box_j,                      /* place on the working grid */
                            __global const float4 *layer_k,  /* (box_k.w, box_k.z) r, g, b, valid */

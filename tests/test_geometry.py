@@ -358,6 +358,28 @@ def test_both_flows_or_the_fixed_point_put_things_where_they_belong(device: Devi
     assert apart[0] > 0.02 and apart[1] < 0.1 and apart[2] < apart[0] / 10
 
 
+@pytest.mark.parametrize("share", [0.5, 0.8])
+def test_a_near_things_outline_goes_with_the_thing(device: Device, share: float) -> None:
+    """It ends at column 50 in a and, 8 px on, at 58 in b. Up to its place between, a flow of b tells of it,
+    but not one of a: their mean would bend it."""
+    grid = plane(120, 31)
+    found = whole_chart(grid)
+    columns, _ = common.pixels(120, 31)
+    forward, backward = (np.zeros((found.height, found.width, 2), np.float32) for _ in range(2))
+    forward[..., 0] = np.where(columns < 50, 8, 0)[:, : found.width]
+    backward[..., 0] = np.where(columns < 58, -8, 0)[:, : found.width]
+    parts = [whole(device, grid, blend) for blend in (1 - share, share)]
+    layers, coefficients = [p[0] for p in parts], [p[1] for p in parts]
+    flows = [pair(device, 0, 1, found, forward, backward)]
+    a, b = (f.get()[..., 0] for f in geometry.fields(device, layers, coefficients, flows, grid, Settings()))
+    between = np.s_[5:-5, 51 : math.floor(50 + 8 * share) - 1]
+    assert np.abs(a[between] + 8 * share).max() < 0.3
+    assert np.abs(b[between] - 8 * (1 - share)).max() < 0.3
+    for far, way in ((np.s_[:, 10:40], 8), (np.s_[:, 70:110], 0)):
+        assert np.allclose(a[far], -way * share)
+        assert np.allclose(b[far], way * (1 - share))
+
+
 def test_displacement_over_the_pole_is_continuous(device: Device) -> None:
     """A constant flow on a chart over the pole: the displacement, as a difference of points, hardly changes
     from pixel to neighbour, also across row 0, half a turn further; and it is the chart's own way."""

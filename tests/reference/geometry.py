@@ -22,6 +22,8 @@ from reference.common import (
 NEGLIGIBLE = 1e-5
 # Where flow is read.
 THERE, GUESSED, BOTH = range(3)
+# Squared difference of two flows up to which none of them is doubted.
+ALIKE = 0.01
 
 
 def flow_at(flow: Array, u: Array, v: Array, grid: Sequence[int]) -> Array:
@@ -29,6 +31,17 @@ def flow_at(flow: Array, u: Array, v: Array, grid: Sequence[int]) -> Array:
     total, share = bilinear(flow, grid, u, v)
     known = share > 1e-6
     return np.where(known[..., None], total / np.where(known, share, 1)[..., None], 0.0)
+
+
+def doubt(
+    flow: Array, back: Array, u: Array, v: Array, way: Array, share: Array, grid: Sequence[int]
+) -> Array:
+    """How far flows at the ends of a way, of which layer k goes `share`, lead elsewhere: 1 to 7."""
+    dx, dy = way[..., 0], way[..., 1]
+    start = flow_at(flow, u - (1 - share) * dx, v - (1 - share) * dy, grid)
+    end = flow_at(back, u + share * dx, v + share * dy, grid)
+    off = ((start - way) ** 2).sum(-1) + ((end + way) ** 2).sum(-1)
+    return 1 + 6 * off**2 / (off**2 + 256)
 
 
 def geometry_add(
@@ -58,7 +71,12 @@ def geometry_add(
     u, v = chart_position(point, chart)
     moved = flow_at(back if start == GUESSED else flow, u, v, grid)
     if start == BOTH:
-        moved = weight[..., None] * moved - (1 - weight[..., None]) * flow_at(back, u, v, grid)
+        other = -flow_at(back, u, v, grid)
+        doubts = [doubt(flow, back, u, v, way, weight, grid) for way in (moved, other)]
+        its, rest = weight * doubts[1] ** 2, (1 - weight) * doubts[0] ** 2
+        apart = ((moved - other) ** 2).sum(-1) > ALIKE
+        part = np.where(apart, its / (its + rest), weight)[..., None]
+        moved = part * moved + (1 - part) * other
     way = chart_point(u + moved[..., 0], v + moved[..., 1], chart) - chart_point(u, v, chart)
     result = field.astype(np.float64)
     result[..., :3] += (-1 if start == GUESSED else 1) * weight[..., None] * way
