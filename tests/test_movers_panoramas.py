@@ -87,12 +87,14 @@ WHOLE = 8
 
 
 def beside_him(result: np.ndarray, one: Shoot, order: slice = slice(None), turned: int = 0) -> int:
-    """Pixels, not of the person, that are clearly other than they would be without him."""
+    """Pixels within his own width of the person that are clearly other than they would be without him.
+    Farther off, at outlines of what is near, the least change of flow shows."""
     (_, down, right), number = best(result, one)
     empty = merged(shoot(None, turned).layers[order], CANVAS)
     assert (result[..., 3] == empty[..., 3]).all()
     his = np.tile(np.roll(one.person[number], (down, right), (0, 1)), 3)
-    beside = ndimage.distance_transform_edt(~his)[:, WIDTH : 2 * WIDTH] > 3
+    away = ndimage.distance_transform_edt(~his)[:, WIDTH : 2 * WIDTH]
+    beside = (away > 3) & (away < 45)
     off = np.abs(result[..., :3].astype(int) - empty[..., :3]).max(-1)[beside]
     return int((off > 20).sum())
 
