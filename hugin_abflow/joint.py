@@ -149,10 +149,12 @@ def prepare(
     numbers = [order[id(one.layer)] for one in reduced]
     overlaps = _overlaps(device, reduced, masks)
     reduced = saturation.with_whites(device, reduced, [pair for pair, _ in overlaps])
-    _check_memory(device, reduced, overlaps, masks, grid, settings)
+    shared = _shared(overlaps, masks, grid)
+    coarse = quality.coarseness(settings.flow_quality, grid.width * grid.height, shared)
+    _check_memory(device, reduced, shared // coarse**2 if settings.flow else 0, settings)
     its_guides = by_pair(guides if settings.guides else ())
     flows, shifts, singles = (
-        _flows(device, reduced, masks, grid, overlaps, progress, settings, its_guides, numbers)
+        _flows(device, reduced, masks, grid, overlaps, coarse, progress, settings, its_guides, numbers)
         if settings.flow
         else ([], [], [])
     )
@@ -355,20 +357,19 @@ def _overlaps(
     return result
 
 
-def _check_memory(
-    device: Device,
-    layers: Sequence[WorkingLayer],
-    overlaps: Sequence[tuple[Pair, npt.NDArray[np.bool_]]],
-    masks: Masks,
-    grid: Grid,
-    settings: Settings,
-) -> None:
-    """Refuse a limit that is too low for the working canvas, which must not depend on it."""
+def _shared(overlaps: Sequence[tuple[Pair, npt.NDArray[np.bool_]]], masks: Masks, grid: Grid) -> int:
+    """Pixels of the working grid in all overlaps, which are masks on a grid of their own."""
+    cells = sum(int(np.count_nonzero(overlap)) for _, overlap in overlaps)
+    return cells * grid.width * grid.height // (masks.grid.width * masks.grid.height)
+
+
+def _check_memory(device: Device, layers: Sequence[WorkingLayer], charts: int, settings: Settings) -> None:
+    """Refuse a limit that is too low for the working canvas, which must not depend on it.
+
+    charts: pixels that two layers share, as flow is solved on them.
+    """
     pixels = sum(layer.box[2] * layer.box[3] for layer in layers)
-    ratio = grid.width * grid.height / (masks.grid.width * masks.grid.height)
-    shared = ratio * sum(int(np.count_nonzero(overlap)) for _, overlap in overlaps) if settings.flow else 0
-    shared /= quality.coarseness(settings.flow_quality, grid.width * grid.height) ** 2
-    needed = memory.resident() + device.own_memory + _STEP_BYTES * pixels + int(_FLOW_BYTES * shared)
+    needed = memory.resident() + device.own_memory + _STEP_BYTES * pixels + int(_FLOW_BYTES * charts)
     limit = memory.limit(settings.max_memory)
     _log.info("memory: about %s of %s at working resolution", memory.size(needed), memory.size(limit))
     if needed <= limit:
@@ -387,6 +388,7 @@ def _flows(
     masks: Masks,
     grid: Grid,
     overlaps: Sequence[tuple[Pair, npt.NDArray[np.bool_]]],
+    coarse: int,
     progress: Progress,
     settings: Settings,
     guides: Mapping[tuple[int, int], Sequence[Guide]],
@@ -396,10 +398,12 @@ def _flows(
     taken from one of them, whole.
 
     overlaps    the pairs, and where they overlap on the grid of `masks`.
+    coarse      pixels of the working grid per pixel of the charts.
     guides      of each two layers, by their numbers; numbers: what guides call each of `layers`.
     """
-    parameters = quality.flow_parameters(settings.flow_quality, settings.large_motion)
-    coarse = quality.coarseness(settings.flow_quality, grid.width * grid.height)
+    pixels = grid.width * grid.height / coarse**2
+    parameters = quality.flow_parameters(settings.flow_quality, settings.large_motion, pixels)
+    tolerated = consistency.tolerance(parameters)
     largest = _REACH * (grid.canvas_width or grid.region.width) * grid.width / grid.region.width
     reach = largest / coarse if settings.large_motion != "off" else 0.0
     result, singles, shifts = list[PairFlow](), list[Whole | None](), list[figures.Parallax]()
@@ -409,7 +413,7 @@ def _flows(
         while waiting:  # one at most: a pair's images are large
             pair, images, job = waiting.pop()
             singles.append(job.result() if job else None)
-            result.append(consistency.mend(device, pair, images, singles[-1]))
+            result.append(consistency.mend(device, pair, images, tolerated, singles[-1]))
 
     with (
         ThreadPoolExecutor(1, "chart") as drawing,
@@ -437,7 +441,7 @@ def _flows(
                 job = looking.submit(single.find, its_chart, arrays, views, vouched, solved.refused, settings)
             waiting.append((its_flow, images, job))
             if _log.isEnabledFor(logging.INFO):
-                shifts.append(figures.parallax(device, its_flow, images, grid))
+                shifts.append(figures.parallax(device, its_flow, images, tolerated, grid))
             advance(1)
         mend()
         device.give_back()  # it waits: else the last pair's time would be told as that of what follows

@@ -23,7 +23,7 @@ static inline float geometry_share(__global const float *blend_j, int4 box_j, __
 
 /* Squared px of a chart: the two flows' difference up to which there is nothing to choose, and how far the flows at
    a way's ends lead elsewhere where it is doubted by half of the most, which is: */
-#define GEOMETRY_ALIKE 0.01f
+#define GEOMETRY_ALIKE 1.0f
 #define GEOMETRY_OFF 16.0f
 #define GEOMETRY_DOUBT 6.0f
 

@@ -198,6 +198,13 @@ def test_what_misses_parallax_by_less_belongs_to_the_thing_beside_it() -> None:
     assert_found(one.found(), one, 0, 1)
 
 
+def test_a_near_thing_with_an_edge_where_flow_errs_is_no_mover() -> None:
+    """By itself the edge would be one."""
+    thing, edge = Thing(AHEAD, 0.25 * UP, 0.35), Thing((0, 1, -0.15), UP, 0.1)
+    assert scene(edge).found() is not None
+    assert scene(thing, edge).found() is None
+
+
 @pytest.mark.parametrize(("strength", "steps"), [(0.5, (0.6, 1, 2)), (2.0, (1, 2)), (3.0, (2,))])
 def test_where_all_flow_misses_parallax_a_thing_has_to_miss_it_by_more(
     strength: float, steps: tuple[float, ...]

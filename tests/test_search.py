@@ -225,7 +225,7 @@ def test_what_makes_images_no_more_alike_is_dropped(
         return device.upload(stacked.get() + np.float32(9))
 
     monkeypatch.setattr(flow, "_choose", nonsense)
-    parameters = quality.flow_parameters("normal", "on" if always else "auto")
+    parameters = quality.flow_parameters("normal", "on" if always else "auto", 300_000)
     flows = flow.pair_flow(device, *images, parameters)
     assert all(np.array_equal(f.get(), w.get()) for f, w in zip(flows, without, strict=True)) != found
 
@@ -243,7 +243,7 @@ def test_a_small_thing_that_moves_far_is_found_if_wanted(device: Device, large_m
 
     (a, in_a), (b, _) = view(0), view(33)
     whole = np.ones(a.shape)
-    parameters = quality.flow_parameters("normal", large_motion)
+    parameters = quality.flow_parameters("normal", large_motion, wall.size)
     forward, _ = flow.pair_flow(device, on_device(device, a, whole), on_device(device, b, whole), parameters)
     error = np.linalg.norm(forward.get() - np.where(in_a[..., None], (33, 0), (0, 0)), axis=-1)
     right = (error[ndimage.binary_erosion(in_a, iterations=6)] < 1).mean()
@@ -272,7 +272,7 @@ def test_rails_before_a_near_surface_follow_the_frame_they_belong_to(device: Dev
 
         (a, rails), (b, _) = view(0, 0, 0), view(3, 20, 30)
         images = [on_device(device, image, np.ones(image.shape)) for image in (a, b)]
-        forward, _ = flow.pair_flow(device, *images, quality.flow_parameters("normal", "on"))
+        forward, _ = flow.pair_flow(device, *images, quality.flow_parameters("normal", "on", 300_000))
         right.append((np.linalg.norm(forward.get()[rails] - (30, 0), axis=-1) < 2).mean())
     assert np.mean(right) > 0.68  # .53 where coarser levels alone take over flow from beside
 

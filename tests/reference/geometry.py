@@ -23,7 +23,7 @@ NEGLIGIBLE = 1e-5
 # Where flow is read.
 THERE, GUESSED, BOTH = range(3)
 # Squared difference of two flows up to which none of them is doubted.
-ALIKE = 0.01
+ALIKE = 1.0
 
 
 def flow_at(flow: Array, u: Array, v: Array, grid: Sequence[int]) -> Array:
