@@ -18,8 +18,9 @@ from hugin_abflow.projection import EQUIRECTANGULAR, Eye
 from hugin_abflow.pyramid import Level
 from hugin_abflow.working import Grid, WorkingLayer
 
-# Chart pixels around the overlap, so that flow is smooth across its border.
-_MARGIN = 16
+# Chart pixels around the overlap, so that flow is smooth across its border, and coarse levels hold enough of
+# what surrounds a near thing.
+_MARGIN = 24
 # Widths of charts that wrap are multiples of this, so that they halve exactly seven times: on every level of
 # the pyramid of a chart whose shorter side is below 1536 px.
 _WRAP_MULTIPLE = 128

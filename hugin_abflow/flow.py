@@ -114,7 +114,8 @@ class Start:
 
 @dataclass(frozen=True)
 class Refused:
-    """Flow that a search found, but that does not explain much and is not known to be of what stands still.
+    """Flow that a search found, and that explains something, but not much, nor is known to be of what stands
+    still.
 
     flows   both ways, float32 (2, height, width, 2), px of `level`.
     """
@@ -257,7 +258,8 @@ def _better(
         known = _seen(bearings, ways[0], common & ~apart & textured, level)
         if epipolar.parallax(known, _seen(bearings, ways[1], apart, level)):
             return kept, []
-    return flows[:1], [Refused(level, ways[1])]
+    explains = found[apart].mean() < plain[apart].mean()
+    return flows[:1], [Refused(level, ways[1])] if explains else []
 
 
 def _seen(

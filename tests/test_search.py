@@ -215,7 +215,8 @@ def test_motion_of_a_tenth_of_the_width_is_found(device: Device, by: tuple[int, 
 def test_what_makes_images_no_more_alike_is_dropped(
     device: Device, monkeypatch: pytest.MonkeyPatch, always: bool, found: bool
 ) -> None:
-    """A search that offers nonsense: only where it is always believed the flow is not what it is without."""
+    """A search that offers nonsense: only where it is always believed the flow is not what it is without. It is
+    no motion that was refused, either, of which somebody who moved might be told."""
     a, whole = texture(36, 371, 217), np.ones((217, 371))
     images = [on_device(device, image, whole) for image in (a, np.roll(a, 2, 1))]
     solved = flow.solve(device, *images, reach=0.0)
@@ -226,8 +227,10 @@ def test_what_makes_images_no_more_alike_is_dropped(
 
     monkeypatch.setattr(flow, "_choose", nonsense)
     parameters = quality.flow_parameters("normal", "on" if always else "auto", 300_000)
-    flows = flow.pair_flow(device, *images, parameters)
+    solution = flow.solve(device, *images, parameters)
+    flows = solution.forward, solution.backward
     assert all(np.array_equal(f.get(), w.get()) for f, w in zip(flows, without, strict=True)) != found
+    assert not solution.refused
 
 
 @pytest.mark.parametrize("large_motion", ["auto", "on"])
