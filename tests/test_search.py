@@ -215,8 +215,8 @@ def test_motion_of_a_tenth_of_the_width_is_found(device: Device, by: tuple[int, 
 def test_what_makes_images_no_more_alike_is_dropped(
     device: Device, monkeypatch: pytest.MonkeyPatch, always: bool, found: bool
 ) -> None:
-    """A search that offers nonsense: only where it is always believed the flow is not what it is without. It is
-    no motion that was refused, either, of which somebody who moved might be told."""
+    """A search that offers nonsense: only where it is always believed the flow is not what it is without. Nor
+    is it motion that was refused, of which somebody who moved might be told."""
     a, whole = texture(36, 371, 217), np.ones((217, 371))
     images = [on_device(device, image, whole) for image in (a, np.roll(a, 2, 1))]
     solved = flow.solve(device, *images, reach=0.0)
