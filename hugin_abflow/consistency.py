@@ -43,7 +43,9 @@ _SWEEPS, _RELAXATION, _LEAST_PIXELS = 4, 1.5, 64
 
 
 def tolerance(parameters: FlowParameters) -> float:
-    """Pixels between start and return that leave a sixteenth of the trust, of flow with these parameters."""
+    """Pixels between start and return that leave a sixteenth of the trust, of flow with these parameters, of
+    which level 1 is by default the one on which large motion is decided.
+    """
     return _TOLERANCE * 2.0 ** (parameters.decide_on - 1)
 
 

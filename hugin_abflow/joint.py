@@ -149,12 +149,10 @@ def prepare(
     numbers = [order[id(one.layer)] for one in reduced]
     overlaps = _overlaps(device, reduced, masks)
     reduced = saturation.with_whites(device, reduced, [pair for pair, _ in overlaps])
-    shared = _shared(overlaps, masks, grid)
-    coarse = quality.coarseness(settings.flow_quality, grid.width * grid.height, shared)
-    _check_memory(device, reduced, shared // coarse**2 if settings.flow else 0, settings)
+    _check_memory(device, reduced, overlaps, masks, grid, settings)
     its_guides = by_pair(guides if settings.guides else ())
     flows, shifts, singles = (
-        _flows(device, reduced, masks, grid, overlaps, coarse, progress, settings, its_guides, numbers)
+        _flows(device, reduced, masks, grid, overlaps, progress, settings, its_guides, numbers)
         if settings.flow
         else ([], [], [])
     )
@@ -357,19 +355,20 @@ def _overlaps(
     return result
 
 
-def _shared(overlaps: Sequence[tuple[Pair, npt.NDArray[np.bool_]]], masks: Masks, grid: Grid) -> int:
-    """Pixels of the working grid in all overlaps, which are masks on a grid of their own."""
-    cells = sum(int(np.count_nonzero(overlap)) for _, overlap in overlaps)
-    return cells * grid.width * grid.height // (masks.grid.width * masks.grid.height)
-
-
-def _check_memory(device: Device, layers: Sequence[WorkingLayer], charts: int, settings: Settings) -> None:
-    """Refuse a limit that is too low for the working canvas, which must not depend on it.
-
-    charts: pixels that two layers share, as flow is solved on them.
-    """
+def _check_memory(
+    device: Device,
+    layers: Sequence[WorkingLayer],
+    overlaps: Sequence[tuple[Pair, npt.NDArray[np.bool_]]],
+    masks: Masks,
+    grid: Grid,
+    settings: Settings,
+) -> None:
+    """Refuse a limit that is too low for the working canvas, which must not depend on it."""
     pixels = sum(layer.box[2] * layer.box[3] for layer in layers)
-    needed = memory.resident() + device.own_memory + _STEP_BYTES * pixels + int(_FLOW_BYTES * charts)
+    ratio = grid.width * grid.height / (masks.grid.width * masks.grid.height)
+    shared = ratio * sum(int(np.count_nonzero(overlap)) for _, overlap in overlaps) if settings.flow else 0
+    shared /= quality.coarseness(settings.flow_quality, grid.width * grid.height) ** 2
+    needed = memory.resident() + device.own_memory + _STEP_BYTES * pixels + int(_FLOW_BYTES * shared)
     limit = memory.limit(settings.max_memory)
     _log.info("memory: about %s of %s at working resolution", memory.size(needed), memory.size(limit))
     if needed <= limit:
@@ -388,7 +387,6 @@ def _flows(
     masks: Masks,
     grid: Grid,
     overlaps: Sequence[tuple[Pair, npt.NDArray[np.bool_]]],
-    coarse: int,
     progress: Progress,
     settings: Settings,
     guides: Mapping[tuple[int, int], Sequence[Guide]],
@@ -398,9 +396,9 @@ def _flows(
     taken from one of them, whole.
 
     overlaps    the pairs, and where they overlap on the grid of `masks`.
-    coarse      pixels of the working grid per pixel of the charts.
     guides      of each two layers, by their numbers; numbers: what guides call each of `layers`.
     """
+    coarse = quality.coarseness(settings.flow_quality, grid.width * grid.height)
     pixels = grid.width * grid.height / coarse**2
     parameters = quality.flow_parameters(settings.flow_quality, settings.large_motion, pixels)
     tolerated = consistency.tolerance(parameters)

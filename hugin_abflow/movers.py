@@ -41,9 +41,11 @@ _APART, _SPREADS = 3.0, 5.0
 # The share of a motion that has to lead elsewhere: a near thing's edge may be matched anywhere along itself,
 # and misses parallax, but goes its way.
 _ELSEWHERE = 0.5
-# The share of the limit that is enough beside what misses parallax so far, and how much of a thing has to be
-# that: of a near thing, an edge may miss it, where flow errs.
-_WEAK, _STRONG = 0.3, 0.125
+# The share of the limit that is enough beside what misses parallax so far.
+_WEAK = 0.3
+# The share of a thing's cells that have to miss it so far, and be shown by both photos: of a near thing an
+# edge may, where flow errs.
+_CLEAR = 0.125
 # Mean difference of log brightness that shows without the thing's own flow, and times that of what is around,
 # as far as so many cells: plain walls and floors are matched with anything.
 _DIFFERS, _MORE, _RING = 0.12, 2.0, 4
@@ -104,8 +106,8 @@ def _seen(eye: Eye, way: Way, index: int) -> tuple[epipolar.Points, epipolar.Poi
 def _things(way: Way, apart: Places, views: tuple[View, View], vouched: tuple[Places, Places]) -> Mask:
     """The cells of what moves by itself; apart: by how much each misses parallax, of the limit."""
     things = connected(apart > _WEAK, way.around > 0)
-    strong = np.bincount(things[(apart > 1) & way.shown], minlength=things.max() + 1)
-    kept = strong >= np.maximum(LEAST, _STRONG * np.bincount(things.ravel()))
+    clear = np.bincount(things[(apart > 1) & way.shown], minlength=things.max() + 1)
+    kept = clear >= np.maximum(LEAST, _CLEAR * np.bincount(things.ravel()))
     kept[way.vouched(things, vouched)] = False
     for thing in np.flatnonzero(kept):
         kept[thing] = _differs(*views, way, things == thing)

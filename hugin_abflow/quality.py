@@ -21,20 +21,17 @@ _CHANGES: dict[FlowQuality, dict[str, Any]] = {
     "best": {},
 }
 
-# Flow is solved on every second pixel of a working canvas, in x and y, if that leaves so many, and if all
-# overlaps have more than this share of its pixels: it is smoother than pictures are, but for thin things.
+# Flow is solved on every second pixel of a working canvas, in x and y, if that leaves so many: it is smoother
+# than pictures are, but for thin things.
 _LEAST_PIXELS: dict[FlowQuality, float] = {"fast": 100_000, "normal": 400_000, "best": math.inf}
-_SHARED = 0.5
-# Large motion is found where a canvas has fewer pixels: finer levels show more that looks alike.
-_SEARCHED_PIXELS = 400_000
+# Large motion is decided on the first level on which a canvas has no more pixels, but never the finest: finer
+# levels show more that looks alike.
+_DECIDED_PIXELS = 400_000
 
 
-def coarseness(quality: FlowQuality, pixels: int, shared: int) -> int:
-    """Pixels of a working canvas of `pixels` per pixel of the charts on which flow is solved.
-
-    shared: the pixels of all overlaps.
-    """
-    return 2 if pixels >= 4 * _LEAST_PIXELS[quality] and shared > _SHARED * pixels else 1
+def coarseness(quality: FlowQuality, pixels: int) -> int:
+    """Pixels of a working canvas of `pixels` per pixel of the charts on which flow is solved."""
+    return 2 if pixels >= 4 * _LEAST_PIXELS[quality] else 1
 
 
 def flow_parameters(quality: FlowQuality, large_motion: LargeMotion, pixels: float) -> flow.FlowParameters:
@@ -43,6 +40,6 @@ def flow_parameters(quality: FlowQuality, large_motion: LargeMotion, pixels: flo
     pixels: of a canvas that is as fine as the charts.
     """
     parameters = replace(flow.FlowParameters(), **_CHANGES[quality])
-    finest = max(parameters.decide_on, math.ceil(math.log(pixels / _SEARCHED_PIXELS, 4)))
+    level = max(parameters.decide_on, math.ceil(math.log(pixels / _DECIDED_PIXELS, 4)))
     search = replace(parameters.search, always=large_motion == "on")
-    return replace(parameters, search=search, decide_on=finest, choose_from=finest)
+    return replace(parameters, search=search, decide_on=level, choose_from=level)

@@ -42,7 +42,7 @@ class SearchParameters:
     # and kept if no more than this remains at last, and it leads elsewhere by so many px (of the level on
     # which that is decided) in so large a share of the pixels that both images show
     hope: float = 0.95
-    gain: float = 0.76
+    gain: float = 0.82
     apart: float = 1.5
     widely: float = 0.25
     # or if no more than this remains where it leads elsewhere, and motion there is that of what stands still,

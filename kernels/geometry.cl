@@ -22,9 +22,10 @@ static inline float geometry_share(__global const float *blend_j, int4 box_j, __
 #define GEOMETRY_BOTH 2    /* F_jk and F_kj at p, each as far as the flows at its ends say the same */
 
 /* Squared px of a chart: the two flows' difference up to which there is nothing to choose, and how far the flows at
-   a way's ends lead elsewhere where it is doubted by half of the most, which is: */
+   a way's ends lead elsewhere where it is doubted by half of the most. */
 #define GEOMETRY_ALIKE 1.0f
 #define GEOMETRY_OFF 16.0f
+/* The most by which a way counts less. */
 #define GEOMETRY_DOUBT 6.0f
 
 /* Flow at four places of a chart. */
