@@ -18,9 +18,9 @@ from hugin_abflow.projection import EQUIRECTANGULAR, Eye
 from hugin_abflow.pyramid import Level
 from hugin_abflow.working import Grid, WorkingLayer
 
-# Pixels of the working grid around the overlap, so that flow is smooth across its border, and coarse levels
-# hold enough of what surrounds a near thing.
-_MARGIN = 32
+# Chart pixels around the overlap, so that flow is smooth across its border, and coarse levels hold enough of
+# what surrounds a near thing; by how many working pixels each stands for.
+_MARGINS = {1: 24, 2: 16}
 # Widths of charts that wrap are multiples of this, so that they halve exactly seven times: on every level of
 # the pyramid of a chart whose shorter side is below 1536 px.
 _WRAP_MULTIPLE = 128
@@ -172,12 +172,12 @@ def pair_chart(overlap: npt.NDArray[np.bool_], mask_grid: Grid, grid: Grid, coar
     It is as fine as the working grid, or half as fine if `coarse` is 2; the mask is not empty.
     """
     if grid.lens[1]:
-        found = _sphere(overlap, mask_grid, 1 / (coarse * grid.lens[1]), _MARGIN // coarse)
+        found = _sphere(overlap, mask_grid, 1 / (coarse * grid.lens[1]), _MARGINS[coarse])
     else:
         height, width = (max(1, round(n / coarse)) for n in grid.shape)
         rows = np.arange(height) * mask_grid.height // height
         columns = np.arange(width) * mask_grid.width // width
-        found = _plane(overlap[rows][:, columns], grid, _MARGIN // coarse)
+        found = _plane(overlap[rows][:, columns], grid, _MARGINS[coarse])
         found = replace(found, eye=_eye(found, grid))
     return replace(found, coarse=coarse)
 
