@@ -18,9 +18,8 @@ from hugin_abflow.projection import EQUIRECTANGULAR, Eye
 from hugin_abflow.pyramid import Level
 from hugin_abflow.working import Grid, WorkingLayer
 
-# Chart pixels around the overlap, so that flow is smooth across its border, and coarse levels hold enough of
-# what surrounds a near thing; by how many working pixels each stands for.
-_MARGINS = {1: 24, 2: 16}
+# Chart pixels around the overlap, so that flow is smooth across its border.
+_MARGIN = 16
 # Widths of charts that wrap are multiples of this, so that they halve exactly seven times: on every level of
 # the pyramid of a chart whose shorter side is below 1536 px.
 _WRAP_MULTIPLE = 128
@@ -73,24 +72,24 @@ def _gap(columns: npt.NDArray[np.bool_]) -> tuple[int, int]:
     return int(used[(widest + 1) % used.size]), int(gaps[widest])
 
 
-def _plane(overlap: npt.NDArray[np.bool_], grid: Grid, margin: int) -> Chart:
-    """overlap: as fine as the chart, over the region of `grid`; margin: px of the chart around it."""
+def _plane(overlap: npt.NDArray[np.bool_], grid: Grid) -> Chart:
+    """overlap: as fine as the chart, over the region of `grid`."""
     height, width = overlap.shape
     rows = np.flatnonzero(overlap.any(1))
-    top, bottom = max(0, rows[0] - margin), min(height, rows[-1] + 1 + margin)
+    top, bottom = max(0, rows[0] - _MARGIN), min(height, rows[-1] + 1 + _MARGIN)
     transform = np.zeros(16, np.float32)
     transform[9:11] = width / grid.width, height / grid.height
     columns = np.logical_or.reduce(overlap, 0)
     if not grid.wraps:
         used = np.flatnonzero(columns)
-        left, right = max(0, used[0] - margin), min(width, used[-1] + 1 + margin)
+        left, right = max(0, used[0] - _MARGIN), min(width, used[-1] + 1 + _MARGIN)
         transform[11:13] = -left, -top
         return Chart(transform, int(right - left), int(bottom - top), False)
     transform[14] = grid.width
     first, gap = _gap(columns)
-    if gap > 2 * margin:
-        transform[11:13] = margin - first, -top
-        return Chart(transform, width - gap + 2 * margin, int(bottom - top), False)
+    if gap > 2 * _MARGIN:
+        transform[11:13] = _MARGIN - first, -top
+        return Chart(transform, width - gap + 2 * _MARGIN, int(bottom - top), False)
     width = max(1, round(width / _WRAP_MULTIPLE)) * _WRAP_MULTIPLE
     transform[9], transform[12] = width / grid.width, -top
     return Chart(transform, width, int(bottom - top), True)
@@ -127,8 +126,7 @@ def _axes(points: npt.NDArray[np.float64], weights: npt.NDArray[np.float64]) -> 
     return np.stack([np.cross(y, z), y, z])
 
 
-def _sphere(overlap: npt.NDArray[np.bool_], mask_grid: Grid, scale: float, pixels: int) -> Chart:
-    """scale: px of the chart per radian; pixels: of it around the overlap."""
+def _sphere(overlap: npt.NDArray[np.bool_], mask_grid: Grid, scale: float) -> Chart:
     lon0, dlon, lat0, dlat = mask_grid.lens
     lon = lon0 + (np.arange(mask_grid.width) + 0.5) * dlon
     lat = lat0 - (np.arange(mask_grid.height) + 0.5) * dlat
@@ -142,7 +140,7 @@ def _sphere(overlap: npt.NDArray[np.bool_], mask_grid: Grid, scale: float, pixel
     chart_lon = np.arctan2(x, y)
     lowest, highest = (math.asin(min(max(end, -1.0), 1.0)) for end in (z.min(), z.max()))
     steps = 720
-    margin = pixels / scale + 2 * math.pi / steps
+    margin = _MARGIN / scale + 2 * math.pi / steps
     used = np.zeros(steps, bool)
     used[((chart_lon / (2 * math.pi) + 0.5) * steps).astype(int) % steps] = True
     south = max(lowest - margin, -math.pi / 2)
@@ -172,12 +170,12 @@ def pair_chart(overlap: npt.NDArray[np.bool_], mask_grid: Grid, grid: Grid, coar
     It is as fine as the working grid, or half as fine if `coarse` is 2; the mask is not empty.
     """
     if grid.lens[1]:
-        found = _sphere(overlap, mask_grid, 1 / (coarse * grid.lens[1]), _MARGINS[coarse])
+        found = _sphere(overlap, mask_grid, 1 / (coarse * grid.lens[1]))
     else:
         height, width = (max(1, round(n / coarse)) for n in grid.shape)
         rows = np.arange(height) * mask_grid.height // height
         columns = np.arange(width) * mask_grid.width // width
-        found = _plane(overlap[rows][:, columns], grid, _MARGINS[coarse])
+        found = _plane(overlap[rows][:, columns], grid)
         found = replace(found, eye=_eye(found, grid))
     return replace(found, coarse=coarse)
 

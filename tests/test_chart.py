@@ -42,8 +42,8 @@ def ring(grid: Grid, rows: slice) -> np.ndarray:
 OVERLAPS = {
     "plane": (plane(), disc(plane(), 30, 20, 8)),
     "plane corner": (plane(), disc(plane(), 76, 1, 8)),
-    "cylinder": (plane(wraps=True), disc(plane(wraps=True), 30, 20, 6)),
-    "cylinder border": (plane(wraps=True), disc(plane(wraps=True), 2, 20, 6)),
+    "cylinder": (plane(wraps=True), disc(plane(wraps=True), 30, 20, 8)),
+    "cylinder border": (plane(wraps=True), disc(plane(wraps=True), 2, 20, 8)),
     "cylinder ring": (plane(wraps=True), ring(plane(wraps=True), slice(10, 30))),
     "sphere": (sphere(), disc(sphere(), 30, 20, 8)),
     "sphere border": (sphere(), disc(sphere(), 77, 15, 8)),

@@ -412,7 +412,7 @@ def test_motion_across_the_border_is_short(device: Device) -> None:
     """On a cylinder the displacement beside the border is the flow, not a turn."""
     grid = plane(wraps=True)
     overlap = np.zeros(grid.shape, bool)
-    overlap[10:40, :6] = overlap[10:40, -6:] = True
+    overlap[10:40, :8] = overlap[10:40, -8:] = True
     found = pair_chart(overlap, grid, grid)
     assert not found.wraps
     flow = np.broadcast_to(np.float32([6, 1]), (found.height, found.width, 2))
