@@ -43,8 +43,8 @@ _SWEEPS, _RELAXATION, _LEAST_PIXELS = 4, 1.5, 64
 
 
 def tolerance(parameters: FlowParameters) -> float:
-    """Pixels between start and return that leave a sixteenth of the trust, of flow with these parameters, of
-    which level 1 is by default the one on which large motion is decided.
+    """Pixels between start and return that leave a sixteenth of the trust in flow with these parameters: more
+    where charts are so fine that large motion is decided on a coarser level than 1.
     """
     return _TOLERANCE * 2.0 ** (parameters.decide_on - 1)
 

@@ -398,9 +398,9 @@ def _flows(
     overlaps    the pairs, and where they overlap on the grid of `masks`.
     guides      of each two layers, by their numbers; numbers: what guides call each of `layers`.
     """
-    coarse = quality.coarseness(settings.flow_quality, grid.width * grid.height)
-    pixels = grid.width * grid.height / coarse**2
-    parameters = quality.flow_parameters(settings.flow_quality, settings.large_motion, pixels)
+    pixels = grid.width * grid.height
+    coarse = quality.coarseness(settings.flow_quality, pixels)
+    parameters = quality.flow_parameters(settings.flow_quality, settings.large_motion, pixels / coarse**2)
     tolerated = consistency.tolerance(parameters)
     largest = _REACH * (grid.canvas_width or grid.region.width) * grid.width / grid.region.width
     reach = largest / coarse if settings.large_motion != "off" else 0.0

@@ -25,7 +25,7 @@ static inline float geometry_share(__global const float *blend_j, int4 box_j, __
    a way's ends lead elsewhere where it is doubted by half of the most. */
 #define GEOMETRY_ALIKE 1.0f
 #define GEOMETRY_OFF 16.0f
-/* The most by which a way counts less. */
+/* Doubt is from 1 to one more than this; a way counts by the other one's squared. */
 #define GEOMETRY_DOUBT 6.0f
 
 /* Flow at four places of a chart. */
