@@ -68,7 +68,7 @@ def ours(device: Device) -> Solver:
             levels.append(
                 Level(device.upload(np.log(grey + np.float32(0.05))), device.empty(grey.shape).fill(1), False)
             )
-        forward, backward = flow.pair_flow(device, *levels, flow_parameters("normal", "on", grey.size))
+        forward, backward = flow.pair_flow(device, *levels, flow_parameters("normal", "on"))
         return forward.get(), backward.get()
 
     return solve

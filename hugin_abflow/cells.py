@@ -60,6 +60,11 @@ class Whole:
     def __or__(self, other: Whole) -> Whole:
         return Whole(self.first | other.first, self.second | other.second)
 
+    def finer(self) -> Whole:
+        """The same by cells of the chart of twice the resolution."""
+        first, second = (one.repeat(2, 0).repeat(2, 1) for one in (self.first, self.second))
+        return Whole(first, second)
+
     def on_canvas(self, chart: Chart, cells: Grid) -> Mask:
         """Cells of a grid over the canvas, (height, width), that show it, in either photo, or lie beside one
         that does.

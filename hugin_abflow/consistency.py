@@ -17,14 +17,12 @@ from dataclasses import replace
 import numpy as np
 
 from hugin_abflow.cells import CELL, Mask, Whole
-from hugin_abflow.flow import FlowParameters
 from hugin_abflow.geometry import PairFlow
 from hugin_abflow.opencl import Buffer, Device
 from hugin_abflow.pyramid import Level
 
-# Pixels between start and return that leave a sixteenth of the trust, where large motion is decided on level
-# 1; on finer charts as large an angle. What is far off must leave next to nothing: many such pixels would
-# outweigh the few around them.
+# Pixels between start and return that leave a sixteenth of the trust. What is far off must leave next to
+# nothing: many such pixels would outweigh the few around them.
 _TOLERANCE = 2.2
 # What one photo shows and a near thing hides in the other has no place there. Flow squeezes it between its
 # neighbours, and leads back all the same. A pixel has no trust if only this share of its area is left.
@@ -42,42 +40,27 @@ _EDGE = 0.08
 _SWEEPS, _RELAXATION, _LEAST_PIXELS = 4, 1.5, 64
 
 
-def tolerance(parameters: FlowParameters) -> float:
-    """Pixels between start and return that leave a sixteenth of the trust in flow with these parameters: more
-    where charts are so fine that large motion is decided on a coarser level than 1.
-    """
-    return _TOLERANCE * 2.0 ** (parameters.decide_on - 1)
-
-
-def mend(
-    device: Device, pair: PairFlow, images: Sequence[Level], tolerated: float, whole: Whole | None = None
-) -> PairFlow:
+def mend(device: Device, pair: PairFlow, images: Sequence[Level], whole: Whole | None = None) -> PairFlow:
     """The pair's flows, filled where they disagree and in the place of what is taken from one photo.
 
-    images: log brightness of both layers on the pair's chart. tolerated: px, see `tolerance`.
+    images: log brightness of both layers on the pair's chart.
     """
     ways = [(pair.forward, pair.backward), (pair.backward, pair.forward)]
     cells = (whole.first, whole.second) if whole else (None, None)
     wraps = pair.chart.wraps
     forward, backward = (
-        _fill(device, trust(device, *way, wraps, tolerated, level.image, its), wraps, bool(whole))
+        _fill(device, trust(device, *way, wraps, level.image, its), wraps, bool(whole))
         for way, level, its in zip(ways, images, cells, strict=True)
     )
     return replace(pair, forward=forward, backward=backward)
 
 
 def trust(
-    device: Device,
-    flow: Buffer,
-    back: Buffer,
-    wraps: bool,
-    tolerated: float,
-    image: Buffer,
-    whole: Mask | None = None,
+    device: Device, flow: Buffer, back: Buffer, wraps: bool, image: Buffer, whole: Mask | None = None
 ) -> Buffer:
     """float32 (height, width, 4): flow in px, trust 0..1, and brightness, which tells where edges are.
 
-    tolerated: as of `mend`. image: log brightness of the layer that the flow starts on, float32 (height,
+    image: log brightness of the layer that the flow starts on, float32 (height,
     width), 0 where it shows nothing. whole: cells that have no trust, and whose brightness tells nothing.
     """
     trusted = device.empty((*flow.shape[:2], 4))
@@ -85,7 +68,7 @@ def trust(
     distrusted = device.upload(np.zeros((1, 1), np.uint8) if whole is None else whole.astype(np.uint8))
     cells = (*distrusted.shape[::-1], CELL, 0)
     device.run(
-        "consistency", "consistency_trust", grid[:2], flow, back, grid, tolerated, _SQUEEZED,
+        "consistency", "consistency_trust", grid[:2], flow, back, grid, _TOLERANCE, _SQUEEZED,
         distrusted, cells, image, trusted,
     )  # fmt: skip
     return trusted

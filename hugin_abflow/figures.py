@@ -33,13 +33,11 @@ class Parallax:
     consistent: float
 
 
-def parallax(
-    device: Device, pair: PairFlow, levels: Sequence[Level], tolerated: float, grid: Grid
-) -> Parallax:
-    """Of a pair's flow as it was found, before it is mended; levels, tolerated: as of `consistency.mend`."""
+def parallax(device: Device, pair: PairFlow, levels: Sequence[Level], grid: Grid) -> Parallax:
+    """Of a pair's flow as it was found, before it is mended; levels: both layers on the pair's chart."""
     both = np.logical_and(*(level.mask.get() > 0 for level in levels))
     ways = pair.forward, pair.backward
-    trusted = trust(device, *ways, pair.chart.wraps, tolerated, levels[0].image).get()
+    trusted = trust(device, *ways, pair.chart.wraps, levels[0].image).get()
     sure = both & (trusted[..., 2] >= _SURE)
     if not sure.any():
         return Parallax(0.0, 0.0, 0.0)

@@ -15,7 +15,8 @@ from dataclasses import dataclass, field
 import numpy as np
 import numpy.typing as npt
 
-from hugin_abflow import epipolar, pyramid, search
+from hugin_abflow import decision, pyramid, search
+from hugin_abflow.decision import Bearings, Candidate, Refused
 from hugin_abflow.opencl import Buffer, Device
 from hugin_abflow.pyramid import Level
 from hugin_abflow.search import Grid, SearchParameters
@@ -96,9 +97,6 @@ class Board:
         return flows
 
 
-# Unit vectors (n, 3) in which places (n, 2) are seen: px of the finest grid, pixels' centres at .5.
-Bearings = Callable[[npt.NDArray[np.float64]], npt.NDArray[np.float64]]
-
 # Changes a level's linear system before it is solved: level, board, which of its ways.
 Pull = Callable[[int, Board, int], None]
 
@@ -110,24 +108,6 @@ class Start:
     level: int
     flows: tuple[Buffer, Buffer]
     pulls: tuple[Pull | None, Pull | None] = (None, None)
-
-
-@dataclass(frozen=True)
-class Refused:
-    """Flow that a search found, and that explains something, but not much, nor is known to be of what stands
-    still.
-
-    flows   both ways, float32 (2, height, width, 2), px of `level`.
-    """
-
-    level: int
-    flows: npt.NDArray[np.float32]
-
-    def finest(self, width: int, height: int) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.float32]]:
-        """Both ways on the finest level's grid, px."""
-        times = 1 << self.level
-        wide = np.repeat(np.repeat(self.flows * np.float32(times), times, 1), times, 2)[:, :height, :width]
-        return wide[0], wide[1]
 
 
 @dataclass(frozen=True)
@@ -239,43 +219,22 @@ def _better(
     level: int,
     bearings: Bearings | None,
     parameters: FlowParameters,
-) -> tuple[list[Buffer], list[Refused]]:
-    """Of flows without and with what was searched, those that are left after a level: in the end one."""
-    how, last = parameters.search, level <= parameters.decide_on
-    plain, found = (_misfit(device, features, one, grid, parameters) for one in flows)
-    common = plain >= 0
-    ways = [one.get() for one in flows]
-    distance = how.apart * 2.0 ** (parameters.decide_on - level)
-    apart = common & (((ways[1] - ways[0]) ** 2).sum(-1) > distance**2)
-    if not apart.any():
-        return flows[:1], []
-    kept = flows[1:] if last else flows
-    gained = found[common].mean() <= (how.gain if last else how.hope) * plain[common].mean()
-    if gained and (not last or apart.sum() >= how.widely * common.sum()):
-        return kept, []
-    if bearings and found[apart].mean() <= how.gain_apart * plain[apart].mean():
-        textured = (features.get()[..., 1:3] ** 2).sum(-1) > how.textured**2
-        known = _seen(bearings, ways[0], common & ~apart & textured, level)
-        if epipolar.parallax(known, _seen(bearings, ways[1], apart, level)):
-            return kept, []
-    explains = found[apart].mean() < plain[apart].mean()
-    return flows[:1], [Refused(level, ways[1])] if explains else []
-
-
-def _seen(
-    bearings: Bearings, flows: npt.NDArray[np.float32], where: npt.NDArray[np.bool_], level: int
-) -> tuple[epipolar.Points, epipolar.Points]:
-    """Where the first and where the second image show what flows both ways match at some pixels of a level:
-    unit vectors (n, 3).
+) -> tuple[list[Buffer], tuple[Refused, ...]]:
+    """Of flows without and with what was searched, those that are left after a level, in the end one; and
+    what was refused.
     """
-    ends: list[list[epipolar.Points]] = [[], []]
-    for way in (0, 1):
-        rows, columns = np.nonzero(where[way])
-        places = np.stack([columns, rows], 1).astype(np.float64) + 0.5
-        ends[way].append(bearings(places * 2.0**level))
-        ends[1 - way].append(bearings((places + flows[way, rows, columns]) * 2.0**level))
-    first, second = (np.concatenate(points) for points in ends)
-    return first, second
+    plain, found = (Candidate(one.get(), _misfit(device, features, one, grid, parameters)) for one in flows)
+    how, last_level = parameters.search, parameters.decide_on
+    textured = (features.get()[..., 1:3] ** 2).sum(-1) > how.textured**2
+    decided = decision.decide(plain, found, level, last_level, textured, bearings, how)
+    if not decided.found:
+        return flows[:1], decided.refused
+    if level > last_level:
+        return flows, ()
+    worse = decision.worse(plain, found, bool(grid[2]))
+    if not worse.any():
+        return flows[1:], ()
+    return [device.upload(np.where(worse[..., None], plain.flows, found.flows))], ()
 
 
 def _misfit(
@@ -331,10 +290,7 @@ def solve(
     where the masks overlap little: in a small corner of a floor of tiles every tile fits. bearings: what
     direction a place on the grid is seen in, if that is known. Raises `DeviceError` if the device fails.
 
-    What is found beyond warping's reach is kept if the images are clearly more alike by it, since where
-    patterns repeat much fits a little, and if it is no thing that moved by itself: somebody who walked would
-    be torn from what is behind. It is none if it is a large part of what they show, or if it moves as what
-    stands still does, seen by a camera that moved (epipolar.py).
+    decision.py tells what of motion beyond warping's reach is kept.
     """
     parameters = parameters or FlowParameters()
     count = start.level + 1 if start else levels(a, parameters)
@@ -367,6 +323,18 @@ def solve(
             refused += dropped
     forward, backward = _apart(device, flows[0])
     return Solution(forward, backward, tuple(refused))
+
+
+def refine(
+    device: Device, a: Level, b: Level, forward: Buffer, backward: Buffer, parameters: FlowParameters
+) -> tuple[Buffer, Buffer]:
+    """Flow from a to b and back, of which `forward` and `backward` are known on a grid of half the
+    resolution, px of that.
+    """
+    features = _features(device, [(image, pyramid.reduce(device, image)) for image in (a, b)], parameters)
+    start = _expand(device, _together(device, (forward, backward)), a.grid)
+    flows = _apart(device, _refine(device, features, start, a.grid, 0, parameters, (None, None)))
+    return flows[0], flows[1]
 
 
 def _expand(device: Device, flows: Buffer, grid: Grid) -> Buffer:

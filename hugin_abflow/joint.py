@@ -6,8 +6,8 @@ import importlib
 import logging
 import threading
 from collections import Counter
-from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
+from collections.abc import Callable, Generator, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from functools import partial
@@ -19,18 +19,14 @@ import numpy.typing as npt
 
 from hugin_abflow import (
     blend,
-    chart,
     coefficient,
     colour,
-    consistency,
     figures,
-    flow,
     geometry,
-    guidance,
     highlights,
     memory,
     multiband,
-    quality,
+    pairflow,
     saturation,
     seam,
     single,
@@ -38,7 +34,7 @@ from hugin_abflow import (
     working,
 )
 from hugin_abflow.blend import BlendLayer
-from hugin_abflow.cells import View, Whole
+from hugin_abflow.chart import Chart
 from hugin_abflow.coefficient import Masks
 from hugin_abflow.colour import Correction
 from hugin_abflow.errors import DeviceError, SettingsError
@@ -47,7 +43,6 @@ from hugin_abflow.guides import Guide, by_pair
 from hugin_abflow.layer import Canvas, Layer
 from hugin_abflow.opencl import Buffer, Device, DeviceMemoryError
 from hugin_abflow.progress import Progress
-from hugin_abflow.pyramid import Level
 from hugin_abflow.settings import Settings
 from hugin_abflow.working import Grid, WorkingLayer
 
@@ -59,11 +54,9 @@ _unused_log = logging.getLogger("hugin_abflow.unused")
 _LEAST_OVERLAP = 64
 # What only one layer shows first passes for exposure in part: its region grows to its size in a few rounds.
 _SEAM_ROUNDS = 2
-# Motion that is looked for, as a share of the canvas's width.
-_REACH = 0.1
 # Bytes that are to come for each working pixel of a layer: a field, an array of coefficients, a rim, offsets
-# and what they are made from; for each that two layers share: flow both ways, on a chart half as large again.
-_STEP_BYTES, _FLOW_BYTES = 16 + 4 + 1 + 9, 1.5 * 16
+# and what they are made from; for each pixel of charts: flow both ways; and of the largest, to solve it.
+_STEP_BYTES, _FLOW_BYTES, _SOLVER_BYTES = 16 + 4 + 1 + 9, 16, 250
 # Below this a working canvas is too small to be worth another attempt.
 _LEAST_WORKING_PIXELS = 20_000
 
@@ -148,23 +141,25 @@ def prepare(
     order = {id(layer): index for index, layer in enumerate(layers)}
     numbers = [order[id(one.layer)] for one in reduced]
     overlaps = _overlaps(device, reduced, masks)
-    reduced = saturation.with_whites(device, reduced, [pair for pair, _ in overlaps])
-    _check_memory(device, reduced, overlaps, masks, grid, settings)
+    overlapping = [pair for pair, _ in overlaps]
+    reduced = saturation.with_whites(device, reduced, overlapping)
+    shared = [overlap for _, overlap in overlaps] if settings.flow else []
+    charts = pairflow.charts(shared, masks.grid, grid, settings)
+    _check_memory(device, reduced, charts, grid, settings)
     its_guides = by_pair(guides if settings.guides else ())
     flows, shifts, singles = (
-        _flows(device, reduced, masks, grid, overlaps, progress, settings, its_guides, numbers)
+        pairflow.solve(device, reduced, overlapping, charts, grid, progress, settings, its_guides, numbers)
         if settings.flow
         else ([], [], [])
     )
     with progress("align", 1) as advance:
         once = single.on_canvas(singles, [flow.chart for flow in flows], seam.seam_grid(grid))
-        pairs = [pair for pair, _ in overlaps]
-        fields, correction, whole = _align(device, reduced, pairs, flows, once, masks, grid, settings)
+        fields, correction, whole = _align(device, reduced, overlapping, flows, once, masks, grid, settings)
         if _log.isEnabledFor(logging.INFO):
             _tell_overlaps(reduced, overlaps, shifts, grid, whole)
         del masks, overlaps  # what comes takes the most memory
         offsets = multiband.none(grid, len(reduced))
-        if settings.exposure and pairs:
+        if settings.exposure and overlapping:
             offsets = multiband.offsets(device, reduced, fields, correction, grid, once)
         final = [
             BlendLayer(
@@ -356,19 +351,17 @@ def _overlaps(
 
 
 def _check_memory(
-    device: Device,
-    layers: Sequence[WorkingLayer],
-    overlaps: Sequence[tuple[Pair, npt.NDArray[np.bool_]]],
-    masks: Masks,
-    grid: Grid,
-    settings: Settings,
+    device: Device, layers: Sequence[WorkingLayer], charts: Sequence[Chart], grid: Grid, settings: Settings
 ) -> None:
-    """Refuse a limit that is too low for the working canvas, which must not depend on it."""
+    """Refuse a limit that is too low for the working canvas, which must not depend on it.
+
+    charts: on which flow is found; none if there is no flow.
+    """
     pixels = sum(layer.box[2] * layer.box[3] for layer in layers)
-    ratio = grid.width * grid.height / (masks.grid.width * masks.grid.height)
-    shared = ratio * sum(int(np.count_nonzero(overlap)) for _, overlap in overlaps) if settings.flow else 0
-    shared /= quality.coarseness(settings.flow_quality, grid.width * grid.height) ** 2
-    needed = memory.resident() + device.own_memory + _STEP_BYTES * pixels + int(_FLOW_BYTES * shared)
+    fineness = 4 if pairflow.refined(charts, grid, settings) else 1
+    sizes = [fineness * chart.width * chart.height for chart in charts]
+    steps = _STEP_BYTES * pixels + _FLOW_BYTES * sum(sizes) + _SOLVER_BYTES * max(sizes, default=0)
+    needed = memory.resident() + device.own_memory + steps
     limit = memory.limit(settings.max_memory)
     _log.info("memory: about %s of %s at working resolution", memory.size(needed), memory.size(limit))
     if needed <= limit:
@@ -379,68 +372,3 @@ def _check_memory(
     if settings.max_memory:
         raise SettingsError(f"{said}; {remedy}, or choose --flow-quality fast")
     _log.warning("%s; going on with that", said)
-
-
-def _flows(
-    device: Device,
-    layers: Sequence[WorkingLayer],
-    masks: Masks,
-    grid: Grid,
-    overlaps: Sequence[tuple[Pair, npt.NDArray[np.bool_]]],
-    progress: Progress,
-    settings: Settings,
-    guides: Mapping[tuple[int, int], Sequence[Guide]],
-    numbers: Sequence[int],
-) -> tuple[list[PairFlow], list[figures.Parallax], list[Whole | None]]:
-    """Flow of every pair of layers, on its own chart, mended; figures of it, if somebody listens; and what is
-    taken from one of them, whole.
-
-    overlaps    the pairs, and where they overlap on the grid of `masks`.
-    guides      of each two layers, by their numbers; numbers: what guides call each of `layers`.
-    """
-    pixels = grid.width * grid.height
-    coarse = quality.coarseness(settings.flow_quality, pixels)
-    parameters = quality.flow_parameters(settings.flow_quality, settings.large_motion, pixels / coarse**2)
-    tolerated = consistency.tolerance(parameters)
-    largest = _REACH * (grid.canvas_width or grid.region.width) * grid.width / grid.region.width
-    reach = largest / coarse if settings.large_motion != "off" else 0.0
-    result, singles, shifts = list[PairFlow](), list[Whole | None](), list[figures.Parallax]()
-    waiting: list[tuple[PairFlow, tuple[Level, Level], Future[Whole | None] | None]] = []
-
-    def mend() -> None:
-        while waiting:  # one at most: a pair's images are large
-            pair, images, job = waiting.pop()
-            singles.append(job.result() if job else None)
-            result.append(consistency.mend(device, pair, images, tolerated, singles[-1]))
-
-    with (
-        ThreadPoolExecutor(1, "chart") as drawing,
-        ThreadPoolExecutor(1, "single") as looking,
-        progress("flow", len(overlaps)) as advance,
-    ):
-        charts = drawing.map(lambda overlap: chart.pair_chart(overlap[1], masks.grid, grid, coarse), overlaps)
-        for (pair, _), its_chart in zip(overlaps, charts, strict=True):
-            sample = partial(chart.sample, device, grid=grid, chart=its_chart)
-            images = sample(layers[pair.a]), sample(layers[pair.b])
-            bearings = its_chart.eye.bearings if its_chart.eye else None
-            solved = flow.solve(device, *images, parameters, reach=reach, bearings=bearings)
-            found = (solved.forward, solved.backward)
-            first, second = numbers[pair.a], numbers[pair.b]
-            its_guides = guides.get((min(first, second), max(first, second)), ())
-            placed = guidance.on_chart(its_guides, first, its_chart, grid)
-            if its_guides:
-                found = guidance.lead(device, images, found, placed, its_chart.around(grid))
-            its_flow = PairFlow(pair.a, pair.b, its_chart, *found)
-            mend()
-            job = None
-            if settings.seam and (settings.foreground or (settings.movers and its_chart.eye)):
-                views = (View.of(images[0]), View.of(images[1]))
-                arrays, vouched = (found[0].get(), found[1].get()), (placed.at_a, placed.at_b)
-                job = looking.submit(single.find, its_chart, arrays, views, vouched, solved.refused, settings)
-            waiting.append((its_flow, images, job))
-            if _log.isEnabledFor(logging.INFO):
-                shifts.append(figures.parallax(device, its_flow, images, tolerated, grid))
-            advance(1)
-        mend()
-        device.give_back()  # it waits: else the last pair's time would be told as that of what follows
-    return result, shifts, singles

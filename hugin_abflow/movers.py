@@ -31,7 +31,7 @@ from hugin_abflow.cells import (
     reached,
 )
 from hugin_abflow.chart import Chart
-from hugin_abflow.flow import Refused
+from hugin_abflow.decision import Refused
 from hugin_abflow.projection import Eye
 from hugin_abflow.working import connected
 

@@ -21,25 +21,27 @@ _CHANGES: dict[FlowQuality, dict[str, Any]] = {
     "best": {},
 }
 
-# Flow is solved on every second pixel of a working canvas, in x and y, if that leaves so many: it is smoother
+# Flow is found on every second pixel of a working canvas, in x and y, if that leaves so many: it is smoother
 # than pictures are, but for thin things.
-_LEAST_PIXELS: dict[FlowQuality, float] = {"fast": 100_000, "normal": 400_000, "best": math.inf}
-# Large motion is decided on the first level on which a canvas has no more pixels, but never the finest: finer
-# levels show more that looks alike.
-_DECIDED_PIXELS = 400_000
+_LEAST_PIXELS: dict[FlowQuality, float] = {"fast": 100_000, "normal": 400_000, "best": 400_000}
+# And then it is refined on all of them, if all overlaps' charts have at most this share of the canvas's.
+_REFINED: dict[FlowQuality, float] = {"fast": 0.0, "normal": 0.5, "best": math.inf}
 
 
 def coarseness(quality: FlowQuality, pixels: int) -> int:
-    """Pixels of a working canvas of `pixels` per pixel of the charts on which flow is solved."""
+    """Pixels of a working canvas of `pixels` per pixel of the charts on which flow is found."""
     return 2 if pixels >= 4 * _LEAST_PIXELS[quality] else 1
 
 
-def flow_parameters(quality: FlowQuality, large_motion: LargeMotion, pixels: float) -> flow.FlowParameters:
-    """The solver's parameters for `Settings.flow_quality` and `Settings.large_motion`.
+def refined(quality: FlowQuality, pixels: int, charts: int) -> bool:
+    """Whether flow is refined on all pixels of a working canvas of `pixels`.
 
-    pixels: of a canvas that is as fine as the charts.
+    charts: the pixels that this is about, those of charts twice as fine as those on which it was found.
     """
+    return 0 < charts <= _REFINED[quality] * pixels
+
+
+def flow_parameters(quality: FlowQuality, large_motion: LargeMotion) -> flow.FlowParameters:
+    """The solver's parameters for `Settings.flow_quality` and `Settings.large_motion`."""
     parameters = replace(flow.FlowParameters(), **_CHANGES[quality])
-    level = max(parameters.decide_on, math.ceil(math.log(pixels / _DECIDED_PIXELS, 4)))
-    search = replace(parameters.search, always=large_motion == "on")
-    return replace(parameters, search=search, decide_on=level, choose_from=level)
+    return replace(parameters, search=replace(parameters.search, always=large_motion == "on"))

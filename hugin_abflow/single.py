@@ -13,7 +13,7 @@ import numpy as np
 from hugin_abflow import foreground, movers
 from hugin_abflow.cells import Flows, Mask, Places, View, Whole
 from hugin_abflow.chart import Chart
-from hugin_abflow.flow import Refused
+from hugin_abflow.decision import Refused
 from hugin_abflow.settings import Settings
 from hugin_abflow.working import Grid
 

@@ -11,7 +11,7 @@ from rooms import ROOM, Thing, hit, pattern, unit
 from hugin_abflow import movers
 from hugin_abflow.cells import View, Whole
 from hugin_abflow.chart import Chart, pair_chart
-from hugin_abflow.flow import Refused
+from hugin_abflow.decision import Refused
 
 Array = np.ndarray
 

@@ -40,6 +40,7 @@ def check_on_canvas(grid: Grid, at: int) -> None:
     expected = ndimage.binary_dilation(expected, np.ones((3, 3)))[:, 1:-1]
     assert 20 < expected.sum() < 200
     assert np.array_equal(found, expected)
+    assert np.array_equal(Whole(first, second).finer().on_canvas(chart.finer(), cells), expected)
     assert not Whole(empty, empty).on_canvas(chart, cells).any()
 
 

@@ -147,6 +147,23 @@ def test_bearings_are_what_positions_are_of(name: str) -> None:
     assert np.allclose(found.positions(points), places, atol=1e-3)
 
 
+@pytest.mark.parametrize("name", OVERLAPS)
+def test_a_finer_chart_shows_the_same_places(name: str) -> None:
+    """In twice as many pixels each way; what is seen in a direction, too."""
+    grid, mask = OVERLAPS[name]
+    coarse = pair_chart(mask, grid, grid, 2)
+    fine = coarse.finer()
+    assert (fine.width, fine.height, fine.wraps) == (2 * coarse.width, 2 * coarse.height, coarse.wraps)
+    assert (coarse.coarse, fine.coarse) == (2, 1)
+    columns, rows = common.pixels(grid.width, grid.height)
+    points = common.canvas_point(columns + 0.5, rows + 0.5, grid.lens)[mask]
+    assert np.allclose(fine.positions(points), 2 * coarse.positions(points), atol=1e-4)
+    assert fine.around(grid) == pytest.approx(2 * coarse.around(grid))
+    if coarse.eye:
+        places = np.random.default_rng(1).uniform(0, coarse.height, (50, 2))
+        assert np.allclose(fine.eye.bearings(2 * places), coarse.eye.bearings(places))
+
+
 def test_a_wrapped_plane_has_one_copy_of_each_point() -> None:
     """On a cylinder positions one turn apart are the same chart position, and within the first period."""
     grid, mask = OVERLAPS["cylinder border"]

@@ -15,7 +15,6 @@ from tolerances import SUM, assert_close
 from hugin_abflow import consistency
 from hugin_abflow.cells import CELL, Whole
 from hugin_abflow.chart import Chart, pair_chart
-from hugin_abflow.flow import FlowParameters
 from hugin_abflow.geometry import PairFlow
 from hugin_abflow.opencl import Device
 from hugin_abflow.pyramid import Level
@@ -206,7 +205,7 @@ def mended(
     nothing = np.zeros(forward.shape[:2])
     shown = [device.upload((nothing if one is None else one).astype(np.float32)) for one in images]
     levels = [Level(one, device.zeros(nothing.shape), pair.chart.wraps) for one in shown]
-    result = consistency.mend(device, pair, levels, consistency.tolerance(FlowParameters()), moved)
+    result = consistency.mend(device, pair, levels, moved)
     assert (result.a, result.b, result.chart) == (0, 1, pair.chart)
     return result.forward.get(), result.backward.get()
 

@@ -196,3 +196,23 @@ def test_what_moved_alone_has_its_own_motion(device: Device) -> None:
     core, rest = ndimage.binary_erosion(patch, iterations=6), ndimage.binary_erosion(~patch, iterations=10)
     assert (np.linalg.norm(forward - (4, 0), axis=-1)[core] < 0.5).mean() > 0.9
     assert (np.linalg.norm(forward - (-2, 0), axis=-1)[rest] < 0.5).mean() > 0.9
+
+
+@pytest.mark.parametrize("wraps", [False, True])
+def test_flow_of_half_the_resolution_is_refined(device: Device, wraps: bool) -> None:
+    """Known to a few tenths of a pixel, it is found to a few hundredths of one half as large."""
+    by, width = (1.6, -0.7), 202
+    images = [level(device, log(one), wraps=wraps) for one in shifted(13, by, width, wraps)]
+    random = np.random.default_rng(14)
+    mode = "nearest", "wrap" if wraps else "nearest"
+    coarse = []
+    for way in (1, -1):
+        off = np.stack([ndimage.gaussian_filter(random.normal(size=(59, 101)), 4, mode=mode) for _ in by], 2)
+        off *= 0.3 / np.abs(off).max()
+        coarse.append(device.upload((way * np.array(by) / 2 + off).astype(np.float32)))
+    ways = flow.refine(device, *images, *coarse, flow.FlowParameters())
+    for way, one in zip((1, -1), ways, strict=True):
+        error = np.linalg.norm(one.get() - way * np.array(by), axis=-1)
+        inside = error if wraps else error[:, 6:-6]
+        assert np.median(inside[6:-6]) < 0.03
+        assert (inside[6:-6] < 0.1).mean() > 0.97

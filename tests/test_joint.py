@@ -336,8 +336,8 @@ def test_every_pair_is_mended_with_its_own_images(monkeypatch, looked_for):
         sampled.append((layer, chart, sample(device, layer, grid, chart)))
         return sampled[-1][2]
 
-    def spy_mend(device, pair, images, tolerated, whole=None):
-        mended.append((pair, images, whole, mend(device, pair, images, tolerated, whole)))
+    def spy_mend(device, pair, images, whole=None):
+        mended.append((pair, images, whole, mend(device, pair, images, whole)))
         return mended[-1][3]
 
     def spy_align(device, layers, pairs, flows, *rest):

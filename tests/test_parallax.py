@@ -79,7 +79,7 @@ def test_without_flow_the_picture_would_double(monkeypatch):
     """The checks above can fail: the same layers merely averaged."""
     from hugin_abflow import joint
 
-    monkeypatch.setattr(joint, "_flows", lambda *arguments: ([], [], []))
+    monkeypatch.setattr(joint.pairflow, "solve", lambda *arguments: ([], [], []))
     with pytest.raises(AssertionError):
         check(merged(pair(6.0, -2.0), PLANE), blended(6.0, -2.0))
 

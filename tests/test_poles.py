@@ -120,7 +120,7 @@ def test_a_wedge_that_is_off_would_be_seen(whole: np.ndarray) -> None:
 
 
 def test_without_flow_it_would_double(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(joint, "_flows", lambda *arguments: ([], [], []))
+    monkeypatch.setattr(joint.pairflow, "solve", lambda *arguments: ([], [], []))
     faults = polar_faults(merged(four()[0], CANVAS, seam=False), four()[1])
     assert faults.max() > 1.3 * WORST
 

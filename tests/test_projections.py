@@ -204,7 +204,7 @@ def test_photos_that_do_not_fit_become_one_scene(tmp_path, name):
 
 def test_without_flow_they_would_fit_nowhere(tmp_path, monkeypatch):
     """The test above can fail: what the layers show at each place, mixed."""
-    monkeypatch.setattr(joint, "_flows", lambda *arguments: ([], [], []))
+    monkeypatch.setattr(joint.pairflow, "solve", lambda *arguments: ([], [], []))
     name = SHARP[1]
     colours, _, count, _ = run(tmp_path, name, turned=TURNED)
     assert mismatch(colours, name, count, TURNED) > 1.5 * FITS

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
-from hugin_abflow import consistency, flow, joint, quality, working
+from hugin_abflow import flow, joint, quality, working
 from hugin_abflow.layer import Canvas, Layer
 from hugin_abflow.opencl import Device, DeviceMemoryError
 from hugin_abflow.progress import silent
@@ -29,8 +29,7 @@ def layers(canvas: Canvas) -> list[Layer]:
 def test_normal_is_what_the_solver_does_by_itself() -> None:
     assert Settings().flow_quality == "normal"
     assert Settings().large_motion == "auto"
-    for pixels in (1, 100_000, 1_600_000):
-        assert quality.flow_parameters("normal", "auto", pixels) == flow.FlowParameters()
+    assert quality.flow_parameters("normal", "auto") == flow.FlowParameters()
 
 
 def test_quality_chooses_the_working_canvas() -> None:
@@ -46,20 +45,14 @@ def test_quality_chooses_the_working_canvas() -> None:
 
 
 def test_flow_is_solved_on_every_second_pixel_where_many_are_left() -> None:
-    """Never on few pixels, and for "best" on all."""
+    """Never on few pixels; then it is refined on all, if there are few of them, or for "best"."""
     assert quality.coarseness("normal", 2_100_000) == quality.coarseness("fast", 500_000) == 2
     assert quality.coarseness("normal", 1_500_000) == quality.coarseness("fast", 300_000) == 1
-    assert quality.coarseness("best", 6_300_000) == 1
-
-
-@pytest.mark.parametrize("pixels", [400_000, 1_600_000, 1_601_000, 6_300_000, 30_000_000])
-def test_large_motion_is_decided_on_a_level_as_coarse_however_fine_the_charts_are(pixels: int) -> None:
-    """And as large an angle between start and return is trusted."""
-    parameters = quality.flow_parameters("best", "auto", pixels)
-    assert parameters.decide_on == parameters.choose_from >= 1
-    assert 100_000 <= pixels / 4**parameters.decide_on <= 400_000
-    tolerated = consistency.tolerance(parameters) / 2**parameters.decide_on
-    assert tolerated == consistency.tolerance(flow.FlowParameters()) / 2
+    assert quality.coarseness("best", 6_300_000) == 2
+    assert quality.coarseness("best", 1_500_000) == 1
+    assert quality.refined("normal", 2_100_000, 1_000_000) and not quality.refined("fast", 500_000, 1)
+    assert not quality.refined("normal", 2_100_000, 1_100_000)
+    assert quality.refined("best", 6_300_000, 60_000_000) and not quality.refined("best", 6_300_000, 0)
 
 
 @pytest.mark.parametrize("name", QUALITIES)

@@ -350,6 +350,6 @@ def test_without_flow_what_only_one_layer_clips_meets_at_the_cut(light: float) -
 
 @pytest.mark.usefixtures(one_device.__name__)
 def test_without_flow_none_is_looked_for(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(joint, "_flows", None)
+    monkeypatch.setattr(joint.pairflow, "solve", None)
     layers, canvas, *_ = scene("plane", None, dx=5)
     assert (merged(layers, canvas, flow=False)[..., 3] == 255).all()

@@ -7,7 +7,7 @@ import pytest
 from pictures import expected_picture, masked, masks_of, merged, noise, one_device, pixel_places, texture
 from scipy import ndimage
 
-from hugin_abflow import joint
+from hugin_abflow import pairflow
 from hugin_abflow.layer import Box, Canvas, Layer
 from hugin_abflow.settings import Settings
 
@@ -53,16 +53,16 @@ def layers_of(canvas: Canvas, masks: list[np.ndarray]) -> list[Layer]:
 def flows(monkeypatch):
     """Each merge's two layers, in the engine's order, their flow and the working grid."""
     seen = []
-    original = joint._flows
+    original = pairflow.solve
 
-    def remember(device, layers, masks, grid, *rest):
-        found = original(device, layers, masks, grid, *rest)
+    def remember(device, layers, pairs, charts, grid, *rest):
+        found = original(device, layers, pairs, charts, grid, *rest)
         ((pair,), *_) = found
         assert (pair.a, pair.b) == (0, 1)
         seen.append((layers[0].layer, layers[1].layer, pair, grid))
         return found
 
-    monkeypatch.setattr(joint, "_flows", remember)
+    monkeypatch.setattr(pairflow, "solve", remember)
     return seen
 
 
@@ -228,13 +228,13 @@ def test_three_layers_are_code_1_twice(flows):
 @pytest.mark.parametrize("count", [2, 3])
 def test_a_mosaic_of_several_places_has_no_movers(monkeypatch, count):
     """What stands still moves otherwise for each of them."""
-    seen, original = [], joint._flows
+    seen, original = [], pairflow.solve
 
     def remember(*given):
         seen.append(next(one for one in given if isinstance(one, Settings)).movers)
         return original(*given)
 
-    monkeypatch.setattr(joint, "_flows", remember)
+    monkeypatch.setattr(pairflow, "solve", remember)
     merged(layers_of(PLANE, three_masks()[:count]), PLANE, merge="sequential")
     assert seen == [count == 2] * (count - 1)
 

@@ -1,0 +1,129 @@
+"""Which flow is kept: the one without, or the one with what a search found, on the host.
+
+What was found is kept if the images are clearly more alike by it, since where patterns repeat much fits a
+little, and if it is no thing that moved by itself: somebody who walked would be torn from what is behind. It
+is none if it is a large part of what they show, or if it moves as what stands still does, seen by a camera
+that moved (epipolar.py). Of what is kept, a part that explains less than no search did is dropped: a chair is
+found, and beside it bars of a banister are taken for the next ones.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from hugin_abflow import epipolar
+from hugin_abflow.search import SearchParameters
+from hugin_abflow.working import connected
+
+Mask = npt.NDArray[np.bool_]
+# Unit vectors (n, 3) in which places (n, 2) are seen: px of the finest grid, pixels' centres at .5.
+Bearings = Callable[[npt.NDArray[np.float64]], npt.NDArray[np.float64]]
+
+# Px by which two flows differ within a part, at least; a part has to be apart somewhere.
+_DIFFERS = 0.5
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """One of two flows between a pair of images on a level, both ways.
+
+    flows   float32 (2, height, width, 2), px of the level.
+    misfit  float32 (2, height, width): what it leaves unexplained, where both images show something; else -1.
+    """
+
+    flows: npt.NDArray[np.float32]
+    misfit: npt.NDArray[np.float32]
+
+
+@dataclass(frozen=True)
+class Refused:
+    """Flow that a search found, and that explains something, but not much, nor is known to be of what stands
+    still.
+
+    flows   both ways, float32 (2, height, width, 2), px of `level`.
+    """
+
+    level: int
+    flows: npt.NDArray[np.float32]
+
+    def finest(self, width: int, height: int) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.float32]]:
+        """Both ways on the finest level's grid, px."""
+        times = 1 << self.level
+        wide = np.repeat(np.repeat(self.flows * np.float32(times), times, 1), times, 2)[:, :height, :width]
+        return wide[0], wide[1]
+
+
+@dataclass(frozen=True)
+class Decision:
+    """found: whether the one that was found may be taken. refused: what was found and may not."""
+
+    found: bool
+    refused: tuple[Refused, ...] = ()
+
+
+def decide(
+    plain: Candidate,
+    found: Candidate,
+    level: int,
+    last_level: int,
+    textured: Mask,
+    bearings: Bearings | None,
+    parameters: SearchParameters,
+) -> Decision:
+    """Whether flow as `found` may be taken for `plain`, without a search, after a level.
+
+    last_level  the level on which that is decided at last; on coarser ones there is only little to hope for.
+    textured    (2, height, width): where the images tell motion.
+    """
+    common, last = plain.misfit >= 0, level <= last_level
+    distance = parameters.apart * 2.0 ** (last_level - level)
+    apart = common & (_difference(plain, found) > distance)
+    if not apart.any():
+        return Decision(False)
+    gain = parameters.gain if last else parameters.hope
+    gained = found.misfit[common].mean() <= gain * plain.misfit[common].mean()
+    if gained and (not last or apart.sum() >= parameters.widely * common.sum()):
+        return Decision(True)
+    remains, before = found.misfit[apart].mean(), plain.misfit[apart].mean()
+    if bearings and remains <= parameters.gain_apart * before:
+        known = _seen(bearings, plain.flows, common & ~apart & textured, level)
+        if epipolar.parallax(known, _seen(bearings, found.flows, apart, level)):
+            return Decision(True)
+    return Decision(False, (Refused(level, found.flows),) if remains < before else ())
+
+
+def worse(plain: Candidate, found: Candidate, wraps: bool) -> Mask:
+    """(2, height, width): the parts of `found` that explain less than `plain` does there."""
+    parts = [connected(its, wraps) for its in _difference(plain, found) > _DIFFERS]
+    dropped = []
+    for part, before, after in zip(parts, plain.misfit, found.misfit, strict=True):
+        gain = np.bincount(part.ravel(), np.where(before >= 0, before - after, 0).ravel())
+        gain[0] = 0
+        dropped.append((gain < 0)[part])
+    return np.stack(dropped)
+
+
+def _difference(plain: Candidate, found: Candidate) -> npt.NDArray[np.float32]:
+    """(2, height, width): by how many px two flows differ."""
+    difference: npt.NDArray[np.float32] = np.hypot(*np.moveaxis(found.flows - plain.flows, -1, 0))
+    return difference
+
+
+def _seen(
+    bearings: Bearings, flows: npt.NDArray[np.float32], where: Mask, level: int
+) -> tuple[epipolar.Points, epipolar.Points]:
+    """Where the first and where the second image show what flows both ways match at some pixels of a level:
+    unit vectors (n, 3).
+    """
+    ends: list[list[epipolar.Points]] = [[], []]
+    for way in (0, 1):
+        rows, columns = np.nonzero(where[way])
+        places = np.stack([columns, rows], 1).astype(np.float64) + 0.5
+        ends[way].append(bearings(places * 2.0**level))
+        ends[1 - way].append(bearings((places + flows[way, rows, columns]) * 2.0**level))
+    first, second = (np.concatenate(points) for points in ends)
+    return first, second

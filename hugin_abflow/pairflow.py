@@ -1,0 +1,123 @@
+"""Flow of every pair of layers: the steps in their order.
+
+All that tells of what a pair shows (search, guides, movers, foreground) is found on its chart. Where that is
+coarse and there is time for it, its flow is then refined on one of twice the resolution, on which rails and
+bars are as wide as on the working canvas.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Mapping, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from functools import partial
+
+import numpy as np
+import numpy.typing as npt
+
+from hugin_abflow import chart, consistency, figures, flow, guidance, quality, single
+from hugin_abflow.cells import View, Whole
+from hugin_abflow.chart import Chart
+from hugin_abflow.geometry import Pair, PairFlow
+from hugin_abflow.guides import Guide
+from hugin_abflow.opencl import Device
+from hugin_abflow.progress import Progress
+from hugin_abflow.pyramid import Level
+from hugin_abflow.settings import Settings
+from hugin_abflow.working import Grid, WorkingLayer
+
+_log = logging.getLogger(__name__)
+
+# Motion that is looked for, as a share of the canvas's width.
+_REACH = 0.1
+
+
+def charts(
+    overlaps: Sequence[npt.NDArray[np.bool_]], masks: Grid, grid: Grid, settings: Settings
+) -> list[Chart]:
+    """The charts on which flow of all pairs is found.
+
+    overlaps    where they overlap, on the grid `masks`; grid: the working grid.
+    """
+    coarse = quality.coarseness(settings.flow_quality, grid.width * grid.height)
+    draw = partial(chart.pair_chart, mask_grid=masks, grid=grid, coarse=coarse)
+    with ThreadPoolExecutor(settings.cores, "chart") as drawing:
+        return list(drawing.map(draw, overlaps))
+
+
+def refined(drawn: Sequence[Chart], grid: Grid, settings: Settings) -> bool:
+    """Whether their flow is refined on charts of twice the resolution."""
+    pixels = sum(4 * one.width * one.height for one in drawn if one.coarse > 1)
+    return quality.refined(settings.flow_quality, grid.width * grid.height, pixels)
+
+
+def solve(
+    device: Device,
+    layers: Sequence[WorkingLayer],
+    pairs: Sequence[Pair],
+    drawn: Sequence[Chart],
+    grid: Grid,
+    progress: Progress,
+    settings: Settings,
+    guides: Mapping[tuple[int, int], Sequence[Guide]],
+    numbers: Sequence[int],
+) -> tuple[list[PairFlow], list[figures.Parallax], list[Whole | None]]:
+    """Flow of every pair of layers, mended; figures of it, if somebody listens; and what is taken from one of
+    them, whole, by cells of the flow's chart.
+
+    drawn       the charts of `pairs`, on which flow is found.
+    guides      of each two layers, by their numbers; numbers: what guides call each of `layers`.
+    """
+    parameters = quality.flow_parameters(settings.flow_quality, settings.large_motion)
+    largest = _REACH * (grid.canvas_width or grid.region.width) * grid.width / grid.region.width
+    finer = refined(drawn, grid, settings)
+    result, singles, shifts = list[PairFlow](), list[Whole | None](), list[figures.Parallax]()
+    waiting: list[tuple[PairFlow, tuple[Level, Level], Future[Whole | None] | None]] = []
+
+    def mend() -> None:
+        while waiting:  # one at most: a pair's images are large
+            pair, images, job = waiting.pop()
+            found = job.result() if job else None
+            singles.append(found.finer() if found and finer else found)
+            result.append(consistency.mend(device, pair, images, singles[-1]))
+
+    with ThreadPoolExecutor(1, "single") as looking, progress("flow", len(pairs)) as advance:
+        for pair, its_chart in zip(pairs, drawn, strict=True):
+            images = _images(device, layers, pair, its_chart, grid)
+            bearings = its_chart.eye.bearings if its_chart.eye else None
+            reach = largest / its_chart.coarse if settings.large_motion != "off" else 0.0
+            solved = flow.solve(device, *images, parameters, reach=reach, bearings=bearings)
+            found = (solved.forward, solved.backward)
+            first, second = numbers[pair.a], numbers[pair.b]
+            its_guides = guides.get((min(first, second), max(first, second)), ())
+            placed = guidance.on_chart(its_guides, first, its_chart, grid)
+            if its_guides:
+                found = guidance.lead(device, images, found, placed, its_chart.around(grid))
+            mend()
+            job = None
+            if settings.seam and (settings.foreground or (settings.movers and its_chart.eye)):
+                views = (View.of(images[0]), View.of(images[1]))
+                arrays, vouched = (found[0].get(), found[1].get()), (placed.at_a, placed.at_b)
+                job = looking.submit(single.find, its_chart, arrays, views, vouched, solved.refused, settings)
+            its_flow = PairFlow(pair.a, pair.b, its_chart, *found)
+            if _log.isEnabledFor(logging.INFO):
+                shifts.append(figures.parallax(device, its_flow, images, grid))
+            if finer:
+                its_chart = its_chart.finer()
+                images = _images(device, layers, pair, its_chart, grid)
+                its_flow = PairFlow(
+                    pair.a, pair.b, its_chart, *flow.refine(device, *images, *found, parameters)
+                )
+            waiting.append((its_flow, images, job))
+            advance(1)
+        mend()
+        device.give_back()  # it waits: else the last pair's time would be told as that of what follows
+    return result, shifts, singles
+
+
+def _images(
+    device: Device, layers: Sequence[WorkingLayer], pair: Pair, its_chart: Chart, grid: Grid
+) -> tuple[Level, Level]:
+    """What both layers of a pair show on its chart."""
+    a, b = (chart.sample(device, layers[index], grid, its_chart) for index in (pair.a, pair.b))
+    return a, b

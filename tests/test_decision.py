@@ -1,0 +1,97 @@
+"""Which flow is kept, that with or that without what a search found, and which parts of it."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from hugin_abflow import decision
+from hugin_abflow.decision import Candidate
+from hugin_abflow.search import SearchParameters
+
+HEIGHT, WIDTH = 43, 71
+HOW = SearchParameters()
+TEXTURED = np.ones((2, HEIGHT, WIDTH), bool)
+
+
+# Rows and columns, by how many px what was found leads farther to the right there, and what it leaves
+# unexplained.
+Part = tuple[tuple[slice, slice], float, float]
+
+
+def candidates(*parts: Part) -> tuple[Candidate, Candidate]:
+    """Flow without and with a search, alike but for parts; .1 is left unexplained elsewhere and without."""
+    flows, misfit = np.zeros((2, HEIGHT, WIDTH, 2), np.float32), np.full((2, HEIGHT, WIDTH), 0.1, np.float32)
+    plain = Candidate(flows.copy(), misfit.copy())
+    for place, far, left in parts:
+        flows[(slice(None), *place, 0)] = far
+        misfit[(slice(None), *place)] = left
+    return plain, Candidate(flows, misfit)
+
+
+LARGE, SMALL = (slice(5, 38), slice(10, 50)), (slice(10, 20), slice(60, 66))
+
+
+def decided(*parts: Part, level: int = 1) -> decision.Decision:
+    return decision.decide(*candidates(*parts), level, 1, TEXTURED, None, HOW)
+
+
+def test_a_large_part_that_explains_much_is_kept() -> None:
+    assert decided((LARGE, 6, 0.02)) == decision.Decision(True)
+    assert not decided((LARGE, 6, 0.08)).found
+    assert not decided((LARGE, 1.2, 0.02)).found  # the same as without a search
+    assert decided((LARGE, 6, 0.08), level=2).found  # there is hope
+    assert decided((LARGE, 1.2, 0.02), level=2).found  # twice as much on the level on which it is decided
+
+
+def test_what_is_refused_is_told_if_it_explains_something() -> None:
+    """Somebody who walked may be told from it."""
+    kept = decided((SMALL, 6, 0.02))
+    assert not kept.found
+    (refused,) = kept.refused
+    assert refused.level == 1 and refused.flows[0, 15, 62, 0] == 6
+    assert not decided((SMALL, 6, 0.2)).refused
+
+
+def test_small_parts_are_kept_if_they_move_as_what_stands_still() -> None:
+    """A camera that moved to the left: all goes to the right, what is near farther."""
+
+    def bearings(places: np.ndarray) -> np.ndarray:
+        lon, lat = (places[:, 0] - WIDTH) / 300, (HEIGHT - places[:, 1]) / 300
+        return np.stack([np.cos(lat) * np.sin(lon), np.cos(lat) * np.cos(lon), np.sin(lat)], 1)
+
+    for far, found in ((6, True), (-6, False)):
+        plain, searched = candidates((SMALL, far, 0.02))
+        for one in (plain, searched):
+            one.flows[..., 0] += 3
+            one.flows[1] *= -1
+        assert decision.decide(plain, searched, 1, 1, TEXTURED, bearings, HOW).found == found
+        assert not decision.decide(plain, searched, 1, 1, ~TEXTURED, bearings, HOW).found  # nothing is known
+
+
+@pytest.mark.parametrize("wraps", [False, True])
+def test_a_part_that_explains_less_is_dropped(wraps: bool) -> None:
+    """As one: also where it happens to fit, and what only one image shows of it; the rest is not."""
+    beside = slice(10, 20), slice(66, WIDTH)
+    around = slice(12, 20), slice(0, 4)
+    plain, found = candidates((LARGE, 6, 0.02), (SMALL, -3, 0.3), (beside, -3, 0.05), (around, 0.7, 0.05))
+    for one in (plain, found):
+        one.misfit[:, 11, 61:64] = -1
+    expected = np.zeros((2, HEIGHT, WIDTH), bool)
+    for place in (SMALL, beside, *((around,) if wraps else ())):
+        expected[(slice(None), *place)] = True
+    assert np.array_equal(decision.worse(plain, found, wraps), expected)
+
+
+def test_each_way_has_its_own_parts() -> None:
+    plain, found = candidates((SMALL, -3, 0.3))
+    found.flows[1] = 0
+    worse = decision.worse(plain, found, False)
+    assert worse[0].sum() == 60 and not worse[1].any()
+
+
+def test_what_no_image_shares_with_the_other_is_left() -> None:
+    plain, found = candidates((SMALL, -3, 0.3))
+    for one in (plain, found):
+        one.misfit[:] = -1
+    assert not decision.worse(plain, found, False).any()

@@ -1,0 +1,110 @@
+"""Flow of all pairs: charts of half the working resolution, and flow refined on those of all of it."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from pictures import merged, one_device
+from scipy import ndimage
+
+from hugin_abflow import chart, consistency, pairflow, quality, single
+from hugin_abflow.cells import Whole
+from hugin_abflow.layer import Canvas, Layer
+from hugin_abflow.settings import FlowQuality, Settings
+from hugin_abflow.working import Grid, full_grid
+
+CANVAS = Canvas.plane(301, 151)
+
+pytestmark = pytest.mark.usefixtures(one_device.__name__)
+
+
+def layers(shared: int) -> list[Layer]:
+    """Two that share so many columns, in which what the second one shows is moved by 3 px."""
+    noise = np.random.default_rng(3).normal(size=(CANVAS.height, CANVAS.width + 3))
+    grey = ndimage.gaussian_filter(noise, 1.5)
+    grey = np.rint(128 + 90 * grey / np.abs(grey).max()).astype(np.uint8)
+    middle, result = CANVAS.width // 2, []
+    for name, first, end, by in (("a", 0, middle + shared // 2, 3), ("b", middle - shared // 2, 301, 0)):
+        pixels = np.repeat(grey[:, first + by : end + by, None], 4, 2)
+        pixels[..., 3] = 255
+        result.append(Layer.from_array(name, pixels, first))
+    return result
+
+
+@pytest.fixture
+def small(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Canvases as small as ours are large enough for coarse charts."""
+    monkeypatch.setattr(quality, "_LEAST_PIXELS", dict.fromkeys(quality._LEAST_PIXELS, 10_000))
+
+
+@pytest.fixture
+def mended(monkeypatch: pytest.MonkeyPatch) -> list[tuple[Any, ...]]:
+    """What `consistency.mend` is given, and what it gives."""
+    given, mend = list[tuple[Any, ...]](), consistency.mend
+
+    def spy(device: Any, pair: Any, images: Any, whole: Any) -> Any:
+        given.append((pair, images, whole, mend(device, pair, images, whole)))
+        return given[-1][3]
+
+    monkeypatch.setattr(consistency, "mend", spy)
+    return given
+
+
+@pytest.mark.usefixtures(small.__name__)
+@pytest.mark.parametrize(
+    ("name", "shared", "fine"),
+    [("normal", 31, True), ("normal", 201, False), ("best", 201, True), ("fast", 61, False)],
+)
+def test_flow_is_refined_where_overlaps_are_small(
+    mended: list[tuple[Any, ...]], name: FlowQuality, shared: int, fine: bool
+) -> None:
+    """Else it stays on charts of half the resolution. It is told in px of its chart."""
+    merged(layers(shared), CANVAS, flow_quality=name, working_pixels=CANVAS.width * CANVAS.height)
+    ((pair, images, _, _),) = mended
+    assert pair.chart.coarse == (1 if fine else 2)
+    assert pair.forward.shape[:2] == images[0].image.shape == (pair.chart.height, pair.chart.width)
+    both = ndimage.binary_erosion(images[0].mask.get() * images[1].mask.get() > 0, iterations=5)
+    length = np.median(np.linalg.norm(pair.forward.get(), axis=-1)[both]) * pair.chart.coarse
+    assert both.sum() > 100 and length == pytest.approx(3, abs=0.1 if fine else 0.5)
+
+
+@pytest.mark.usefixtures(small.__name__)
+def test_what_is_taken_whole_is_told_on_the_chart_that_its_flow_has(
+    mended: list[tuple[Any, ...]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It is looked for on the coarse one."""
+    seen, places = [], []
+
+    def find(its_chart: chart.Chart, *_: Any) -> Whole:
+        first = np.zeros((its_chart.height // 4, its_chart.width // 4), bool)
+        first[5:8, 3:6] = True
+        seen.append((its_chart, Whole(first, ~first)))
+        return seen[-1][1]
+
+    def on_canvas(found: list[Whole], charts: list[chart.Chart], cells: Grid) -> None:
+        places.append([one.on_canvas(its_chart, cells) for one, its_chart in zip(found, charts, strict=True)])
+
+    monkeypatch.setattr(single, "find", find)
+    monkeypatch.setattr(single, "on_canvas", on_canvas)
+    merged(layers(31), CANVAS, working_pixels=CANVAS.width * CANVAS.height)
+    ((coarse, found),), ((pair, _, whole, _),) = seen, mended
+    assert (coarse.coarse, pair.chart.coarse) == (2, 1)
+    assert np.array_equal(whole.first, np.kron(found.first, np.ones((2, 2), bool)))
+    grid = full_grid(CANVAS, layers(31))
+    cells = grid.resized(75, 37)
+    assert np.array_equal(whole.on_canvas(pair.chart, cells), found.on_canvas(coarse, cells))
+    assert len(places) == 1
+
+
+@pytest.mark.usefixtures(small.__name__)
+def test_what_is_small_is_told_by_the_pixels_of_all_charts() -> None:
+    """Not of the overlaps: around what is thin and lies askew a chart is large."""
+    grid = full_grid(CANVAS, layers(31))
+    columns, rows = np.arange(grid.width), np.arange(grid.height)[:, None]
+    upright, askew = (np.abs(columns - 2 * slope * rows - 5) < 5 for slope in (0, 1))
+    upright = np.broadcast_to(upright, grid.shape)
+    for overlaps, fine in (([upright], True), ([askew], False), ([upright] * 4, False), ([], False)):
+        drawn = pairflow.charts(overlaps, grid, grid, Settings())
+        assert len(drawn) == len(overlaps) and pairflow.refined(drawn, grid, Settings()) == fine
