@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -329,11 +329,13 @@ def refine(
     device: Device, a: Level, b: Level, forward: Buffer, backward: Buffer, parameters: FlowParameters
 ) -> tuple[Buffer, Buffer]:
     """Flow from a to b and back, of which `forward` and `backward` are known on a grid of half the
-    resolution, px of that.
+    resolution, px of that. Each pixel may take over a flow from beside it.
     """
+    how = replace(parameters.search, steps=(parameters.search.refined_steps,))
     features = _features(device, [(image, pyramid.reduce(device, image)) for image in (a, b)], parameters)
     start = _expand(device, _together(device, (forward, backward)), a.grid)
-    flows = _apart(device, _refine(device, features, start, a.grid, 0, parameters, (None, None)))
+    chosen = _choose(device, features, start, a.grid, 0, 0, replace(parameters, search=how))
+    flows = _apart(device, _refine(device, features, chosen, a.grid, 0, parameters, (None, None)))
     return flows[0], flows[1]
 
 

@@ -53,6 +53,7 @@ class SearchParameters:
     # px from which flow is taken over, in turns, likewise: short on finer levels, where the rails of a chair
     # in the sample room took over what fits them by chance (benchmarks/RESULTS.md, Parts)
     steps: tuple[tuple[int, ...], ...] = ((6, 3, 1), (6, 3, 1), (16, 8, 4, 2, 1))
+    refined_steps: tuple[int, ...] = (12, 6, 3, 1)  # and where found flow is refined: thin things are wider
 
     def __post_init__(self) -> None:
         if max(self.radius) > 4:  # SEARCH_WINDOW of kernels/search.cl
