@@ -238,14 +238,37 @@ static inline float search_weights(__global const float4 *a, int2 at, int4 grid,
     return sum;
 }
 
+/* Weighted sum of the misfits of a window's row; between pixels of `b`, by fraction t from there on. */
+static inline float search_row_misfit(__global const float4 *a, __global const float4 *b, float2 t, int pitch, int count,
+                                      const float *weights, float outside) {
+    float4 left = (1.0f - t.y) * b[0] + t.y * b[pitch];
+    float sum = 0.0f;
+    for (int i = 0; i < count; ++i) {
+        const float4 right = (1.0f - t.y) * b[i + 1] + t.y * b[pitch + i + 1];
+        const float4 there = (1.0f - t.x) * left + t.x * right;
+        left = right;
+        if (weights[i] != 0.0f)
+            sum += weights[i] * (there.w > 0.999f ? search_misfit(a[i], there, outside) : outside);
+    }
+    return sum;
+}
+
 /* Mean misfit of a window under one flow, or something above `least` if it is more than that. */
 static inline float search_window(__global const float4 *a, __global const float4 *b, int2 at, float2 f, int4 grid,
                                   int radius, const float *weights, float total, float outside, float least) {
     const float2 base = floor(f), t = f - base;
-    const int2 shift = convert_int2(base);
+    const int2 shift = convert_int2(base), first = at - radius, last = at + radius;
+    /* nearly all windows, and where they are looked for: no border rule is needed */
+    const bool inner = min(first.x, first.x + shift.x) >= 0 && max(last.x, last.x + shift.x + 1) < grid.x &&
+                       min(first.y, first.y + shift.y) >= 0 && max(last.y, last.y + shift.y + 1) < grid.y;
     float sum = 0.0f;
     for (int j = -radius; j <= radius; ++j) {
-        for (int i = -radius; i <= radius; ++i) {
+        if (inner) {
+            const int row = (at.y + j) * grid.x + first.x;
+            sum += search_row_misfit(a + row, b + row + shift.y * grid.x + shift.x, t, grid.x, 2 * radius + 1, weights,
+                                     outside);
+            weights += 2 * radius + 1;
+        } else for (int i = -radius; i <= radius; ++i) {
             const float weight = *weights++;
             int2 p = at + (int2)(i, j);
             const int2 to = p + shift;
@@ -283,7 +306,8 @@ __kernel void search_choose(__global const float4 *a,     /* (grid.y, grid.x) de
     if (a[at].w > 0.0f) {
         float weights[SEARCH_WINDOW], total = 0.0f, least = INFINITY;
         const int2 beside[5] = {(int2)(0, 0), (int2)(-1, 0), (int2)(1, 0), (int2)(0, -1), (int2)(0, 1)};
-        for (int k = 0; k < 10; ++k) {
+        const int count = other == flow ? 5 : 10;
+        for (int k = 0; k < count; ++k) {
             int2 p = (int2)(x, y) + step * beside[k % 5];
             if (!grid_border(&p, grid))
                 continue;

@@ -128,7 +128,7 @@ def search_choose(
     x, y = pixels(grid[0], grid[1])
     own, best = flow.astype(np.float64), flow.astype(np.float64)
     least = window_misfit(a, b, own, grid, radius, focus, outside[0]) - patience
-    for field in (flow, other):
+    for field in (flow,) if other is flow else (flow, other):
         for dx, dy in ((0, 0), (-1, 0), (1, 0), (0, -1), (0, 1)):
             there, inside = on_grid(field, grid, x + step * dx, y + step * dy)
             differs = (((there - own) ** 2).sum(-1) >= 0.25) & (((there - best) ** 2).sum(-1) >= 0.25)
