@@ -190,7 +190,7 @@ _information = partial(click.option, cls=Option, group="Information")
     type=click.Choice(get_args(FlowQuality)),
     default=_DEFAULTS.flow_quality,
     help="Time against quality of the optical flow. fast: coarser, in three quarters of the flow's time or "
-    "less. best: much finer on panoramas above 2 megapixels, in up to eight times of it.",
+    "less. best: much finer on panoramas above 1.6 megapixels, in up to 15 times of it.",
 )
 @_blending(
     "--device",

@@ -21,8 +21,9 @@ from hugin_abflow.geometry import PairFlow
 from hugin_abflow.opencl import Buffer, Device
 from hugin_abflow.pyramid import Level
 
-# Pixels between start and return that leave a sixteenth of the trust. What is far off must leave next to
-# nothing: many such pixels would outweigh the few around them.
+# Pixels between start and return that leave a sixteenth of the trust, whatever the chart's resolution:
+# refined flow is that much more exact. What is far off must leave next to nothing: many such pixels would
+# outweigh the few around them.
 _TOLERANCE = 2.2
 # What one photo shows and a near thing hides in the other has no place there. Flow squeezes it between its
 # neighbours, and leads back all the same. A pixel has no trust if only this share of its area is left.

@@ -70,14 +70,14 @@ def decide(
     found: Candidate,
     level: int,
     last_level: int,
-    textured: Mask,
+    textured: Callable[[], Mask],
     bearings: Bearings | None,
     parameters: SearchParameters,
 ) -> Decision:
     """Whether flow as `found` may be taken for `plain`, without a search, after a level.
 
     last_level  the level on which that is decided at last; on coarser ones there is only little to hope for.
-    textured    (2, height, width): where the images tell motion.
+    textured    gives (2, height, width): where the images tell motion.
     """
     common, last = plain.misfit >= 0, level <= last_level
     distance = parameters.apart * 2.0 ** (last_level - level)
@@ -90,7 +90,7 @@ def decide(
         return Decision(True)
     remains, before = found.misfit[apart].mean(), plain.misfit[apart].mean()
     if bearings and remains <= parameters.gain_apart * before:
-        known = _seen(bearings, plain.flows, common & ~apart & textured, level)
+        known = _seen(bearings, plain.flows, common & ~apart & textured(), level)
         if epipolar.parallax(known, _seen(bearings, found.flows, apart, level)):
             return Decision(True)
     return Decision(False, (Refused(level, found.flows),) if remains < before else ())

@@ -225,7 +225,12 @@ def _better(
     """
     plain, found = (Candidate(one.get(), _misfit(device, features, one, grid, parameters)) for one in flows)
     how, last_level = parameters.search, parameters.decide_on
-    textured = (features.get()[..., 1:3] ** 2).sum(-1) > how.textured**2
+
+    def textured() -> decision.Mask:
+        slopes: npt.NDArray[np.float32] = features.get()[..., 1:3]
+        told: decision.Mask = (slopes**2).sum(-1) > how.textured**2
+        return told
+
     decided = decision.decide(plain, found, level, last_level, textured, bearings, how)
     if not decided.found:
         return flows[:1], decided.refused
@@ -331,7 +336,8 @@ def refine(
     """Flow from a to b and back, of which `forward` and `backward` are known on a grid of half the
     resolution, px of that. Each pixel may take over a flow from beside it.
     """
-    how = replace(parameters.search, steps=(parameters.search.refined_steps,))
+    how = parameters.search
+    how = replace(how, steps=(how.refined_steps,), patience=how.refined_patience)
     features = _features(device, [(image, pyramid.reduce(device, image)) for image in (a, b)], parameters)
     start = _expand(device, _together(device, (forward, backward)), a.grid)
     chosen = _choose(device, features, start, a.grid, 0, 0, replace(parameters, search=how))

@@ -57,6 +57,8 @@ _SEAM_ROUNDS = 2
 # Bytes that are to come for each working pixel of a layer: a field, an array of coefficients, a rim, offsets
 # and what they are made from; for each pixel of charts: flow both ways; and of the largest, to solve it.
 _STEP_BYTES, _FLOW_BYTES, _SOLVER_BYTES = 16 + 4 + 1 + 9, 16, 250
+# What libraries take that are still being loaded (`_making_ready`).
+_LIBRARY_BYTES = 50 << 20
 # Below this a working canvas is too small to be worth another attempt.
 _LEAST_WORKING_PIXELS = 20_000
 
@@ -360,8 +362,9 @@ def _check_memory(
     pixels = sum(layer.box[2] * layer.box[3] for layer in layers)
     fineness = 4 if pairflow.refined(charts, grid, settings) else 1
     sizes = [fineness * chart.width * chart.height for chart in charts]
-    steps = _STEP_BYTES * pixels + _FLOW_BYTES * sum(sizes) + _SOLVER_BYTES * max(sizes, default=0)
-    needed = memory.resident() + device.own_memory + steps
+    at_last, meanwhile = _STEP_BYTES * pixels, _SOLVER_BYTES * max(sizes, default=0)
+    there = memory.resident() + device.own_memory + _LIBRARY_BYTES
+    needed = there + _FLOW_BYTES * sum(sizes) + max(at_last, meanwhile)
     limit = memory.limit(settings.max_memory)
     _log.info("memory: about %s of %s at working resolution", memory.size(needed), memory.size(limit))
     if needed <= limit:
@@ -370,5 +373,6 @@ def _check_memory(
     what = "whose flow takes" if settings.flow else "which take"
     said = f"{given} is too little for these layers, {what} about {memory.size(needed)}"
     if settings.max_memory:
-        raise SettingsError(f"{said}; {remedy}, or choose --flow-quality fast")
+        less = ", or choose --flow-quality fast" if settings.flow and settings.flow_quality != "fast" else ""
+        raise SettingsError(f"{said}; {remedy}{less}")
     _log.warning("%s; going on with that", said)

@@ -46,7 +46,7 @@ def charts(
 
 
 def refined(drawn: Sequence[Chart], grid: Grid, settings: Settings) -> bool:
-    """Whether their flow is refined on charts of twice the resolution."""
+    """Whether the flow of all of one merge is refined on charts of twice the resolution."""
     pixels = sum(4 * one.width * one.height for one in drawn if one.coarse > 1)
     return quality.refined(settings.flow_quality, grid.width * grid.height, pixels)
 

@@ -53,7 +53,10 @@ class SearchParameters:
     # px from which flow is taken over, in turns, likewise: short on finer levels, where the rails of a chair
     # in the sample room took over what fits them by chance (benchmarks/RESULTS.md, Parts)
     steps: tuple[tuple[int, ...], ...] = ((6, 3, 1), (6, 3, 1), (16, 8, 4, 2, 1))
-    refined_steps: tuple[int, ...] = (12, 6, 3, 1)  # and where found flow is refined: thin things are wider
+    # and where found flow is refined, and thin things are wider; by how much another has to fit better there:
+    # with less, outlines of what moves far get ragged
+    refined_steps: tuple[int, ...] = (12, 6, 3, 1)
+    refined_patience: float = 0.2
 
     def __post_init__(self) -> None:
         if max(self.radius) > 4:  # SEARCH_WINDOW of kernels/search.cl

@@ -319,6 +319,8 @@ __kernel void search_choose(__global const float4 *a,     /* (grid.y, grid.x) de
                 total = search_weights(a, (int2)(x, y), grid, radius, focus, weights);
                 least = search_window(a, b, (int2)(x, y), own, grid, radius, weights, total, outside.x, INFINITY);
                 least -= patience;
+                if (least <= 0.0f)
+                    break; /* nothing fits so much better */
             }
             const float cost = search_window(a, b, (int2)(x, y), f, grid, radius, weights, total, outside.y, least);
             if (cost < least) {

@@ -11,7 +11,14 @@ from hugin_abflow.search import SearchParameters
 
 HEIGHT, WIDTH = 43, 71
 HOW = SearchParameters()
-TEXTURED = np.ones((2, HEIGHT, WIDTH), bool)
+
+
+def textured() -> np.ndarray:
+    return np.ones((2, HEIGHT, WIDTH), bool)
+
+
+def untextured() -> np.ndarray:
+    return ~textured()
 
 
 # Rows and columns, by how many px what was found leads farther to the right there, and what it leaves
@@ -33,7 +40,7 @@ LARGE, SMALL = (slice(5, 38), slice(10, 50)), (slice(10, 20), slice(60, 66))
 
 
 def decided(*parts: Part, level: int = 1) -> decision.Decision:
-    return decision.decide(*candidates(*parts), level, 1, TEXTURED, None, HOW)
+    return decision.decide(*candidates(*parts), level, 1, textured, None, HOW)
 
 
 def test_a_large_part_that_explains_much_is_kept() -> None:
@@ -65,8 +72,8 @@ def test_small_parts_are_kept_if_they_move_as_what_stands_still() -> None:
         for one in (plain, searched):
             one.flows[..., 0] += 3
             one.flows[1] *= -1
-        assert decision.decide(plain, searched, 1, 1, TEXTURED, bearings, HOW).found == found
-        assert not decision.decide(plain, searched, 1, 1, ~TEXTURED, bearings, HOW).found  # nothing is known
+        assert decision.decide(plain, searched, 1, 1, textured, bearings, HOW).found == found
+        assert not decision.decide(plain, searched, 1, 1, untextured, bearings, HOW).found  # nothing is known
 
 
 @pytest.mark.parametrize("wraps", [False, True])

@@ -216,3 +216,24 @@ def test_flow_of_half_the_resolution_is_refined(device: Device, wraps: bool) -> 
         inside = error if wraps else error[:, 6:-6]
         assert np.median(inside[6:-6]) < 0.03
         assert (inside[6:-6] < 0.1).mean() > 0.97
+
+
+def test_refined_flow_is_taken_over_from_beside(device: Device) -> None:
+    """A strip of a board that moves by 14 px was given the flow of the wall behind: too far for warping."""
+    back, front = scene(15, 211.0), scene(16, 211.0)
+    x, y = common.pixels(WIDTH - 1, HEIGHT - 1)
+    x, y = x + 0.5, y + 0.5
+
+    def inside(u: np.ndarray) -> np.ndarray:
+        return (np.abs(u - 90) < 50) & (np.abs(y - 58) < 45)
+
+    images = [np.where(inside(x - by), front(x - by, y), back(x, y)) for by in (0, 14)]
+    levels = [level(device, log(image)) for image in images]
+    coarse = []
+    for by, way in ((0, 1), (14, -1)):
+        known = np.where(inside(x - by)[..., None], (14.0 * way, 0.0), (0.0, 0.0))
+        known[:, 84 + by : 100 + by] = 0
+        coarse.append(device.upload((known[::2, ::2] / 2).astype(np.float32)))
+    forward, _ = flow.refine(device, *levels, *coarse, flow.FlowParameters())
+    strip = ndimage.binary_erosion(inside(x), iterations=6) & (np.abs(x - 92) < 8)
+    assert (np.linalg.norm(forward.get() - (14, 0), axis=-1)[strip] < 1).mean() > 0.9

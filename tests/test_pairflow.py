@@ -9,8 +9,9 @@ import pytest
 from pictures import merged, one_device
 from scipy import ndimage
 
-from hugin_abflow import chart, consistency, pairflow, quality, single
+from hugin_abflow import chart, consistency, flow, joint, pairflow, quality, single
 from hugin_abflow.cells import Whole
+from hugin_abflow.errors import SettingsError
 from hugin_abflow.layer import Canvas, Layer
 from hugin_abflow.settings import FlowQuality, Settings
 from hugin_abflow.working import Grid, full_grid
@@ -68,6 +69,37 @@ def test_flow_is_refined_where_overlaps_are_small(
     both = ndimage.binary_erosion(images[0].mask.get() * images[1].mask.get() > 0, iterations=5)
     length = np.median(np.linalg.norm(pair.forward.get(), axis=-1)[both]) * pair.chart.coarse
     assert both.sum() > 100 and length == pytest.approx(3, abs=0.1 if fine else 0.5)
+
+
+@pytest.mark.parametrize("coarse", [True, False])
+def test_motion_of_a_tenth_of_the_canvas_is_searched(
+    request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch, coarse: bool
+) -> None:
+    """In px of the chart."""
+    if coarse:
+        request.getfixturevalue(small.__name__)
+    asked, solve = [], flow.solve
+    monkeypatch.setattr(
+        flow, "solve", lambda *given, **more: asked.append(more["reach"]) or solve(*given, **more)
+    )
+    merged(layers(61), CANVAS, working_pixels=CANVAS.width * CANVAS.height)
+    assert asked == [pytest.approx(CANVAS.width / (20 if coarse else 10), rel=0.01)]
+
+
+@pytest.mark.usefixtures(small.__name__)
+def test_memory_is_reckoned_for_charts_as_fine_as_they_get(monkeypatch: pytest.MonkeyPatch) -> None:
+    """For the solver by the largest of them."""
+    reckoned = []
+    monkeypatch.setattr(joint.memory, "resident", lambda: 0)
+    for name, bytes_ in (("fast", 0), ("fast", 10_000), ("best", 0), ("best", 10_000)):
+        monkeypatch.setattr(joint, "_SOLVER_BYTES", bytes_)
+        with pytest.raises(SettingsError, match=r"take?s? about \S+ MiB") as told:
+            merged(layers(61), CANVAS, flow_quality=name, working_pixels=45_451, max_memory=1 << 20)
+        reckoned.append(float(str(told.value).split("about ")[1].split()[0]))
+        assert ("choose --flow-quality fast" in str(told.value)) == (name != "fast")
+    few, fast, same, best = reckoned
+    assert 0 <= same - few < 2 and best - same == pytest.approx(4 * (fast - few), abs=8)
+    assert fast - few > 20
 
 
 @pytest.mark.usefixtures(small.__name__)

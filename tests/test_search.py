@@ -166,6 +166,22 @@ def test_choose_equals_its_twin(device: Device, name: str, step: int, radius: in
     assert_close(run(device, "search_choose", grid, *arguments), expected, 1e-6, 5 * DECISIONS)
 
 
+@pytest.mark.parametrize("by", [(0.5, 0.0), (0.0, 0.5), (-0.5, -0.5)])
+def test_windows_end_where_the_images_do(device: Device, by: tuple[float, float]) -> None:
+    """What lies beyond is not known, and no pixel of the next row."""
+    grid = (37, 23, 0, 0)
+    a, b = descriptors(125, grid)
+    a[..., 3] = b[..., 3] = 1
+    b[:, :3], b[:3] = 9, -9  # what would be read for it
+    for radius in (2, 4):
+        own = np.full((23, 37, 2), 1.5)
+        own[::2] = by  # offered to the rows beside
+        arguments = (a, b, own, own, grid, 1, radius, 0.0, (0.25, 0.25), 0.0)
+        expected = twin.search_choose(*arguments)
+        assert 0.1 < (expected != own).any(-1).mean() < 0.9
+        assert np.array_equal(run(device, "search_choose", grid, *arguments), expected)
+
+
 def test_twin_of_window_by_hand() -> None:
     """One pixel's window under a whole displacement, and under half a pixel."""
     grid = GRIDS["plane"]
