@@ -61,8 +61,8 @@ def trust(
 ) -> Buffer:
     """float32 (height, width, 4): flow in px, trust 0..1, and brightness, which tells where edges are.
 
-    image: log brightness of the layer that the flow starts on, float32 (height,
-    width), 0 where it shows nothing. whole: cells that have no trust, and whose brightness tells nothing.
+    image: log brightness of the layer that the flow starts on, float32 (height, width), 0 where it shows
+    nothing. whole: cells that have no trust, and whose brightness tells nothing.
     """
     trusted = device.empty((*flow.shape[:2], 4))
     grid = _grid(flow, wraps)

@@ -23,7 +23,7 @@ Mask = npt.NDArray[np.bool_]
 # Unit vectors (n, 3) in which places (n, 2) are seen: px of the finest grid, pixels' centres at .5.
 Bearings = Callable[[npt.NDArray[np.float64]], npt.NDArray[np.float64]]
 
-# Px by which two flows differ within a part, at least; a part has to be apart somewhere.
+# Px by which two flows differ within a part, at least.
 _DIFFERS = 0.5
 
 

@@ -159,7 +159,7 @@ def prepare(
         fields, correction, whole = _align(device, reduced, overlapping, flows, once, masks, grid, settings)
         if _log.isEnabledFor(logging.INFO):
             _tell_overlaps(reduced, overlaps, shifts, grid, whole)
-        del masks, overlaps  # what comes takes the most memory
+        del masks, overlaps, shared  # what comes takes the most memory
         offsets = multiband.none(grid, len(reduced))
         if settings.exposure and overlapping:
             offsets = multiband.offsets(device, reduced, fields, correction, grid, once)
@@ -360,8 +360,7 @@ def _check_memory(
     charts: on which flow is found; none if there is no flow.
     """
     pixels = sum(layer.box[2] * layer.box[3] for layer in layers)
-    fineness = 4 if pairflow.refined(charts, grid, settings) else 1
-    sizes = [fineness * chart.width * chart.height for chart in charts]
+    sizes = [chart.width * chart.height for chart in pairflow.finest(charts, grid, settings)]
     at_last, meanwhile = _STEP_BYTES * pixels, _SOLVER_BYTES * max(sizes, default=0)
     there = memory.resident() + device.own_memory + _LIBRARY_BYTES
     needed = there + _FLOW_BYTES * sum(sizes) + max(at_last, meanwhile)

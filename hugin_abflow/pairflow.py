@@ -45,10 +45,13 @@ def charts(
         return list(drawing.map(draw, overlaps))
 
 
-def refined(drawn: Sequence[Chart], grid: Grid, settings: Settings) -> bool:
-    """Whether the flow of all of one merge is refined on charts of twice the resolution."""
-    pixels = sum(4 * one.width * one.height for one in drawn if one.coarse > 1)
-    return quality.refined(settings.flow_quality, grid.width * grid.height, pixels)
+def finest(drawn: Sequence[Chart], grid: Grid, settings: Settings) -> Sequence[Chart]:
+    """The charts on which the flow of a merge ends up: `drawn`, or, if all of it is refined, those of twice
+    the resolution.
+    """
+    fine = [one.finer() for one in drawn if one.coarse > 1]
+    pixels = sum(one.width * one.height for one in fine)
+    return fine if quality.refined(settings.flow_quality, grid.width * grid.height, pixels) else drawn
 
 
 def solve(
@@ -70,7 +73,7 @@ def solve(
     """
     parameters = quality.flow_parameters(settings.flow_quality, settings.large_motion)
     largest = _REACH * (grid.canvas_width or grid.region.width) * grid.width / grid.region.width
-    finer = refined(drawn, grid, settings)
+    ends = finest(drawn, grid, settings)
     result, singles, shifts = list[PairFlow](), list[Whole | None](), list[figures.Parallax]()
     waiting: list[tuple[PairFlow, tuple[Level, Level], Future[Whole | None] | None]] = []
 
@@ -78,11 +81,11 @@ def solve(
         while waiting:  # one at most: a pair's images are large
             pair, images, job = waiting.pop()
             found = job.result() if job else None
-            singles.append(found.finer() if found and finer else found)
+            singles.append(found.finer() if found and ends is not drawn else found)
             result.append(consistency.mend(device, pair, images, singles[-1]))
 
     with ThreadPoolExecutor(1, "single") as looking, progress("flow", len(pairs)) as advance:
-        for pair, its_chart in zip(pairs, drawn, strict=True):
+        for pair, its_chart, its_finest in zip(pairs, drawn, ends, strict=True):
             images = _images(device, layers, pair, its_chart, grid)
             bearings = its_chart.eye.bearings if its_chart.eye else None
             reach = largest / its_chart.coarse if settings.large_motion != "off" else 0.0
@@ -102,12 +105,10 @@ def solve(
             its_flow = PairFlow(pair.a, pair.b, its_chart, *found)
             if _log.isEnabledFor(logging.INFO):
                 shifts.append(figures.parallax(device, its_flow, images, grid))
-            if finer:
-                its_chart = its_chart.finer()
-                images = _images(device, layers, pair, its_chart, grid)
-                its_flow = PairFlow(
-                    pair.a, pair.b, its_chart, *flow.refine(device, *images, *found, parameters)
-                )
+            if its_finest is not its_chart:
+                images = _images(device, layers, pair, its_finest, grid)
+                found = flow.refine(device, *images, *found, parameters)
+                its_flow = PairFlow(pair.a, pair.b, its_finest, *found)
             waiting.append((its_flow, images, job))
             advance(1)
         mend()

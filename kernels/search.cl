@@ -238,7 +238,8 @@ static inline float search_weights(__global const float4 *a, int2 at, int4 grid,
     return sum;
 }
 
-/* Weighted sum of the misfits of a window's row; between pixels of `b`, by fraction t from there on. */
+/* Weighted sum of the misfits of a window's row; between pixels of `b`, by fraction t from there on. All are known
+   to lie within both grids. */
 static inline float search_row_misfit(__global const float4 *a, __global const float4 *b, float2 t, int pitch, int count,
                                       const float *weights, float outside) {
     float4 left = (1.0f - t.y) * b[0] + t.y * b[pitch];
@@ -253,30 +254,38 @@ static inline float search_row_misfit(__global const float4 *a, __global const f
     return sum;
 }
 
+/* `sum` and the same of a row of 2 radius + 1 pixels around `at`, of which some may lie beyond a grid. */
+static inline float search_row_at_border(__global const float4 *a, __global const float4 *b, int2 at, int2 shift,
+                                         float2 t, int4 grid, int radius, const float *weights, float outside,
+                                         float sum) {
+    for (int i = -radius; i <= radius; ++i) {
+        const float weight = *weights++;
+        int2 p = at + (int2)(i, 0);
+        const int2 to = p + shift;
+        if (weight == 0.0f)
+            continue;
+        grid_border(&p, grid);
+        sum += weight * search_misfit(a[p.y * grid.x + p.x], search_sample(b, to, t, grid), outside);
+    }
+    return sum;
+}
+
 /* Mean misfit of a window under one flow, or something above `least` if it is more than that. */
 static inline float search_window(__global const float4 *a, __global const float4 *b, int2 at, float2 f, int4 grid,
                                   int radius, const float *weights, float total, float outside, float least) {
     const float2 base = floor(f), t = f - base;
     const int2 shift = convert_int2(base), first = at - radius, last = at + radius;
+    const int side = 2 * radius + 1;
     /* nearly all windows, and where they are looked for: no border rule is needed */
     const bool inner = min(first.x, first.x + shift.x) >= 0 && max(last.x, last.x + shift.x + 1) < grid.x &&
                        min(first.y, first.y + shift.y) >= 0 && max(last.y, last.y + shift.y + 1) < grid.y;
     float sum = 0.0f;
-    for (int j = -radius; j <= radius; ++j) {
-        if (inner) {
-            const int row = (at.y + j) * grid.x + first.x;
-            sum += search_row_misfit(a + row, b + row + shift.y * grid.x + shift.x, t, grid.x, 2 * radius + 1, weights,
-                                     outside);
-            weights += 2 * radius + 1;
-        } else for (int i = -radius; i <= radius; ++i) {
-            const float weight = *weights++;
-            int2 p = at + (int2)(i, j);
-            const int2 to = p + shift;
-            if (weight == 0.0f)
-                continue;
-            grid_border(&p, grid);
-            sum += weight * search_misfit(a[p.y * grid.x + p.x], search_sample(b, to, t, grid), outside);
-        }
+    for (int j = -radius; j <= radius; ++j, weights += side) {
+        const int row = (at.y + j) * grid.x + first.x, there = row + shift.y * grid.x + shift.x;
+        if (inner)
+            sum += search_row_misfit(a + row, b + there, t, grid.x, side, weights, outside);
+        else
+            sum = search_row_at_border(a, b, at + (int2)(0, j), shift, t, grid, radius, weights, outside, sum);
         if (sum > least * total * 1.001f) /* by more than rounding could make up for */
             return INFINITY;
     }

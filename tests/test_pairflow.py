@@ -139,4 +139,6 @@ def test_what_is_small_is_told_by_the_pixels_of_all_charts() -> None:
     upright = np.broadcast_to(upright, grid.shape)
     for overlaps, fine in (([upright], True), ([askew], False), ([upright] * 4, False), ([], False)):
         drawn = pairflow.charts(overlaps, grid, grid, Settings())
-        assert len(drawn) == len(overlaps) and pairflow.refined(drawn, grid, Settings()) == fine
+        ends = [one.coarse for one in pairflow.finest(drawn, grid, Settings())]
+        assert [one.coarse for one in drawn] == [2] * len(overlaps)
+        assert ends == [1 if fine else 2] * len(overlaps)

@@ -252,18 +252,21 @@ def test_what_makes_images_no_more_alike_is_dropped(
     assert not solution.refused
 
 
+def board(
+    middle: int, half: tuple[int, int], shift: int, background: int = 0
+) -> tuple[np.ndarray, np.ndarray]:
+    """A board before a wall, moved to the right by so many px, as the wall is; and where it is."""
+    wall, front = texture(37, 371, 217), 1.05 - texture(38, 371, 217)
+    y, x = np.mgrid[0:217, 0:371]
+    there = (np.abs(x - shift - middle) < half[0]) & (np.abs(y - 100) < half[1])
+    return np.where(there, np.roll(front, shift, 1), np.roll(wall, background, 1)), there
+
+
 @pytest.mark.parametrize("large_motion", ["auto", "on"])
 def test_a_small_thing_that_moves_far_is_found_if_wanted(device: Device, large_motion: LargeMotion) -> None:
     """A board of 40 x 60 px moves by 33 px in front of a wall that stands. It might be somebody who walked,
     for whom no flow is right."""
-    wall, board = texture(37, 371, 217), 1.05 - texture(38, 371, 217)
-    y, x = np.mgrid[0:217, 0:371]
-
-    def view(shift: int) -> tuple[np.ndarray, np.ndarray]:
-        there = (np.abs(x - shift - 160) < 20) & (np.abs(y - 100) < 30)
-        return np.where(there, np.roll(board, shift, 1), wall), there
-
-    (a, in_a), (b, _) = view(0), view(33)
+    (a, in_a), (b, _) = (board(160, (20, 30), shift) for shift in (0, 33))
     whole = np.ones(a.shape)
     parameters = quality.flow_parameters("normal", large_motion)
     forward, _ = flow.pair_flow(device, on_device(device, a, whole), on_device(device, b, whole), parameters)
@@ -279,18 +282,12 @@ def test_a_small_thing_that_moves_far_is_found_if_wanted(device: Device, large_m
 def test_of_what_is_found_a_part_that_fits_worse_is_dropped(device: Device) -> None:
     """A board that fills much moves by 12 px, the wall stands. What was found has that right, and a patch of
     the wall wrong."""
-    wall, board = texture(37, 371, 217), 1.05 - texture(38, 371, 217)
-    y, x = np.mgrid[0:217, 0:371]
-
-    def view(shift: int) -> tuple[np.ndarray, np.ndarray]:
-        there = (np.abs(x - shift - 120) < 90) & (np.abs(y - 100) < 80)
-        return np.where(there, np.roll(board, shift, 1), wall), there
-
-    (a, in_a), (b, in_b) = view(0), view(12)
+    (a, in_a), (b, in_b) = (board(120, (90, 80), shift) for shift in (0, 12))
     images = [on_device(device, image, np.ones(a.shape)) for image in (a, b)]
     features = device.empty((2, *a.shape, 4))
     for way, image in enumerate(images):
         features.copy(way * a.size, flow.finest_features(device, image, FlowParameters()), 0, a.size)
+    y, x = np.mgrid[0:217, 0:371]
     patch = (np.abs(x - 320) < 15) & (np.abs(y - 100) < 20)
     plain, found = np.zeros((2, 2, *a.shape, 2), np.float32)
     for way, (board_there, by) in enumerate(((in_a, 12), (in_b, -12))):
@@ -333,18 +330,12 @@ def test_rails_before_a_near_surface_follow_the_frame_they_belong_to(device: Dev
 def test_a_small_thing_that_moves_as_near_things_do_is_found(device: Device, by: int, kept: bool) -> None:
     """The wall moves by 3 px to the right: the camera moved left, and what is near moves far to the right.
     What goes left walked."""
-    wall, board = texture(37, 371, 217), 1.05 - texture(38, 371, 217)
-    y, x = np.mgrid[0:217, 0:371]
-
-    def view(shift: int, background: int) -> tuple[np.ndarray, np.ndarray]:
-        there = (np.abs(x - shift - 180) < 20) & (np.abs(y - 100) < 30)
-        return np.where(there, np.roll(board, shift, 1), np.roll(wall, background, 1)), there
 
     def bearings(places: np.ndarray) -> np.ndarray:
         lon, lat = (places[:, 0] - 185) / 300, (108 - places[:, 1]) / 300
         return np.stack([np.cos(lat) * np.sin(lon), np.cos(lat) * np.cos(lon), np.sin(lat)], 1)
 
-    (a, in_a), (b, _) = view(0, 0), view(by, 3)
+    (a, in_a), (b, _) = board(180, (20, 30), 0), board(180, (20, 30), by, 3)
     images = [on_device(device, image, np.ones(a.shape)) for image in (a, b)]
     solved, inner = flow.solve(device, *images, bearings=bearings), ndimage.binary_erosion(in_a, iterations=6)
     inside = solved.forward.get()[inner]
