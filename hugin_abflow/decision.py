@@ -10,7 +10,7 @@ found, and beside it bars of a banister are taken for the next ones.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -63,6 +63,21 @@ class Decision:
 
     found: bool
     refused: tuple[Refused, ...] = ()
+
+
+def believed(plain: Candidate, found: Candidate, gap: float, wraps: bool) -> Candidate:
+    """`found`, but explaining no more than `plain` does where it does not lead back.
+
+    gap     px between start and return from which on it does not.
+    wraps   whether the last column is beside the first one.
+    """
+    ways, height, width = found.misfit.shape
+    way, row, column = np.ogrid[:ways, :height, :width]
+    rows, columns = (np.rint(found.flows[..., k]).astype(int) + at for k, at in ((1, row), (0, column)))
+    columns = columns % width if wraps else np.clip(columns, 0, width - 1)
+    back = found.flows[1 - way, np.clip(rows, 0, height - 1), columns]
+    returns = np.hypot(*np.moveaxis(found.flows + back, -1, 0)) < gap
+    return replace(found, misfit=np.where(returns, found.misfit, np.maximum(found.misfit, plain.misfit)))
 
 
 def decide(

@@ -225,6 +225,7 @@ def _better(
     """
     plain, found = (Candidate(one.get(), _misfit(device, features, one, grid, parameters)) for one in flows)
     how, last_level = parameters.search, parameters.decide_on
+    found = decision.believed(plain, found, how.gap, bool(grid[2]))
 
     def textured() -> decision.Mask:
         slopes: npt.NDArray[np.float32] = features.get()[..., 1:3]

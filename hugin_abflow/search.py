@@ -43,6 +43,7 @@ class SearchParameters:
     # which that is decided) in so large a share of the pixels that both images show
     hope: float = 0.95
     gain: float = 0.82
+    gap: float = 2.0  # and px between start and return from which on it explains nothing
     apart: float = 1.5
     widely: float = 0.25
     # or if no more than this remains where it leads elsewhere, and motion there is that of what stands still,

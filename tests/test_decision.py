@@ -77,6 +77,41 @@ def test_small_parts_are_kept_if_they_move_as_what_stands_still() -> None:
 
 
 @pytest.mark.parametrize("wraps", [False, True])
+def test_what_does_not_lead_back_explains_nothing(wraps: bool) -> None:
+    """It fits by chance: no more counts for it than for flow without a search."""
+    plain, found = candidates((LARGE, 6, 0.02), (SMALL, 6, 0.3))
+    assert np.array_equal(
+        decision.believed(plain, found, 2, wraps).misfit[:, *LARGE], plain.misfit[:, *LARGE]
+    )
+    assert np.array_equal(decision.believed(plain, found, 13, wraps).misfit, found.misfit)
+    found.flows[1] *= -1  # from columns 4 to 43, and 54 to 59, back to 10 to 49, and 60 to 65
+    believed = decision.believed(plain, found, 2, wraps).misfit
+    rows, columns = np.arange(HEIGHT)[:, None], np.arange(WIDTH)
+    there = (rows >= 5) & (rows < 38) & (columns >= 10) & (columns < 44)
+    assert np.array_equal(believed[0] == np.float32(0.02), there)
+    assert np.array_equal(believed[0] == np.float32(0.3), (found.misfit[0] == np.float32(0.3)))  # no better
+
+
+@pytest.mark.parametrize("wraps", [False, True])
+def test_what_leads_over_the_border_leads_back_only_where_columns_wrap(wraps: bool) -> None:
+    plain, found = candidates()
+    found.flows[0, :, WIDTH - 4 :, 0], found.flows[1, :, 2:6, 0] = 6, -6
+    found.misfit[0, :, WIDTH - 4 :] = 0.02
+    believed = decision.believed(plain, found, 2, wraps).misfit[0, :, WIDTH - 4 :]
+    assert np.all(believed == np.float32(0.02 if wraps else 0.1))
+
+
+@pytest.mark.parametrize("way", [0, 1])
+def test_return_is_read_at_the_pixel_that_flow_leads_to(way: int) -> None:
+    plain, found = candidates()
+    found.flows[way, 20, 30] = (2.6, -4.4)
+    found.misfit[way, 20, 30] = 0.02
+    assert decision.believed(plain, found, 2, False).misfit[way, 20, 30] == np.float32(0.1)
+    found.flows[1 - way, 16, 33] = (-2.6, 4.4)
+    assert decision.believed(plain, found, 2, False).misfit[way, 20, 30] == np.float32(0.02)
+
+
+@pytest.mark.parametrize("wraps", [False, True])
 def test_a_part_that_explains_less_is_dropped(wraps: bool) -> None:
     """As one: also where it happens to fit, and what only one image shows of it; the rest is not."""
     beside = slice(10, 20), slice(66, WIDTH)
