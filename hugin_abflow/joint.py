@@ -222,7 +222,7 @@ def _align(
     whole: npt.NDArray[np.bool_] | None = None
     coefficients = coefficient.coefficients(device, layers, masks, grid, settings)
     clipped = highlights.excess(device, layers, masks, grid, settings)
-    transition.narrow(device, layers, coefficients, flows, grid, settings, clipped.max(0))
+    transition.settle(device, layers, coefficients, flows, masks, grid, settings, clipped.max(0))
     fields = geometry.fields(device, layers, coefficients, flows, grid, settings)
     del coefficients
     device.give_back()

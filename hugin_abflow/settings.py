@@ -41,8 +41,9 @@ class Settings:
     movers              with it, take so, too, what flow matches although it moved by itself, where flow tells
                         how the camera moved.
     foreground          and near things that would be bent, where one layer shows all of them.
-    transition_strain   how much changing over from one layer's geometry to the next may stretch it, where
-                        the overlap is wider than that takes; 0..1, 0: the whole overlap, as published.
+    transition_strain   by how much changing over from one layer's geometry to the next may stretch it, where
+                        the overlap is wide enough; transitions go where that takes least room. 0..1, 0:
+                        across the whole overlap, as published.
     guides              let control points lead the flow where it goes astray.
     interpolation       how layers are sampled; "nearest" is for comparison with the paper's own code.
     working_pixels      upper bound of the pixels of the working canvas (flow, coefficients, colour), at least
@@ -72,7 +73,7 @@ class Settings:
     seam: bool = True
     movers: bool = True
     foreground: bool = True
-    transition_strain: float = 0.085
+    transition_strain: float = 0.07
     guides: bool = True
     interpolation: Interpolation = "bicubic"
     working_pixels: int = 0

@@ -1,95 +1,237 @@
-"""How quickly the geometry changes over from one layer to the next (kernels/transition.cl).
+"""Where, and how quickly, the geometry changes over from one layer to the next (kernels/transition.cl).
 
-The published coefficient changes over the whole overlap. That is as slow as it can be, which parallax needs:
-across a transition of width t, flow of length F stretches or squeezes the picture by F / t, its strain. Where
-there is little parallax and much overlap it is slower than anybody can see, and everything in the overlap is
-shown between its places in the photos, as sharp as the flow is right. So the coefficients are sharpened,
+Changing over bends the picture: across a transition of width t, parallax of P px stretches or squeezes it
+by P / t, its strain. The published coefficient changes over across the whole overlap, wherever near things
+are in it; they are shown between their places in the photos, as sharp and as straight as the flow is right.
+A retoucher would lead the transition around them. So the coefficients are those of least
 
-    w_k <- w_k^n / sum_j w_j^n,    n = wanted strain / strain, from 1 to a limit
+    sum_k  integral  (P^2 + P0^2) |grad w_k|^2  +  (2 strain)^2 w_k (1 - w_k),
 
-with a smooth n: most of an overlap comes from one photo as it is, and no transition is steeper than wanted.
-Where layers cannot be brought to one brightness, n stays 1.
+of all that sum to 1 and are 0 where layer k is not. The first term is the strain; the second, of a double
+well, is the price of each place that no photo shows as it is. Together they ask along a transition for about
+the parallax that it meets, so that it runs where there is little, and across it for a width of
+pi P / (2 strain), at which the strain is what is wanted, where the overlap has room for it: a phase field
+(Modica and Mortola 1977; with this well Blowey and Elliott 1991). Near things that end within an overlap are
+left to one photo. Where layers cannot be brought to one brightness there is no well, and transitions are as
+wide as the overlap.
+
+It is relaxed on a pyramid of cells, from a grid on which it has one least, without the well, to the finest.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
 import scipy
 
-from hugin_abflow import geometry
-from hugin_abflow.coefficient import Coefficients
+from hugin_abflow.coefficient import Coefficients, Masks, on_cells
 from hugin_abflow.geometry import PairFlow
-from hugin_abflow.opencl import Device
+from hugin_abflow.opencl import Buffer, Device
 from hugin_abflow.settings import Settings
 from hugin_abflow.working import Grid, WorkingLayer
 
-# Working pixels per cell of the transition grid.
+# Working pixels per cell of the grid of what differs in brightness.
 _CELL = 16
-# Working pixels from one that the strain is measured at to the next: it is averaged over thousands.
-_EVERY = 4
-# Cells over which the strain is averaged (by its fourth power), and the exponent again.
-_SIGMA = 3.0
-# A transition is at least this part of the published one.
-_STEEPEST = 12.0
+# Of the grids on which transitions are found, from the coarsest to the finest.
+_CELLS = (32, 16, 8, 4)
+# Working pixels of parallax that are always reckoned with: flow is hardly truer, a transition no narrower.
+_LEAST_PARALLAX = 2.0
+# Cells of the finest grid over which parallax is averaged.
+_SIGMA = 1.0
+# Sweeps of over-relaxation on each grid, and on the coarsest before there is a well and while it gets deeper.
+_SWEEPS, _FIRST_SWEEPS, _DEEPER_SWEEPS = 20, 100, 30
+_OVER = 1.8
+_DEPTHS = (0.25, 0.5, 0.75)
+# No cell of a sphere is narrower than this part of one at the equator.
+_NARROWEST = 0.02
+
+Mask = npt.NDArray[np.bool_]
+Values = npt.NDArray[np.float32]
 
 
 def transition_grid(grid: Grid) -> Grid:
-    """The coarse grid over the region of the working grid."""
+    """The coarse grid, over the region of the working grid, of where layers are not alike."""
     return grid.coarser(_CELL)
 
 
-def narrow(
+@dataclass(frozen=True)
+class Shares:
+    """Coefficients by cells, as kernels/transition.cl has them: of the layers that cover a cell, if any does
+    whole, else of those that reach into it.
+    """
+
+    cells: Grid
+    first: Buffer
+    owner: Buffer
+    share: Buffer
+
+    @classmethod
+    def equal(cls, device: Device, cells: Grid, cover: Mask) -> Shares:
+        """The same for all layers of a cell. cover: (layers, height, width)."""
+        counts = cover.sum(0, dtype=np.int64).ravel()
+        first = np.concatenate([[0], np.cumsum(counts)]).astype(np.int32)
+        owner = np.nonzero(cover.reshape(len(cover), -1).T)[1].astype(np.int32)
+        share = np.repeat(1 / np.maximum(counts, 1), counts).astype(np.float32)
+        return cls(
+            cells, *(device.upload(one if one.size else one.repeat(1)) for one in (first, owner, share))
+        )
+
+
+def settle(
     device: Device,
     layers: Sequence[WorkingLayer],
     coefficients: Sequence[Coefficients],
     flows: Sequence[PairFlow],
+    masks: Masks,
     grid: Grid,
     settings: Settings,
-    unlike: npt.NDArray[np.float32],
+    unlike: Values,
 ) -> None:
-    """Make coefficients as steep as `settings.transition_strain` allows, in place; 0 changes nothing.
+    """Make coefficients those of least strain, in place. Without flow, or with a strain of 0, they stay.
 
-    unlike: (height, width) on the transition grid, from 0 to 1, where the published coefficients stay.
+    unlike: (height, width) on the transition grid, from 0 to 1, where layers cannot be brought to one
+    brightness.
     """
     if settings.transition_strain == 0 or not flows:
         return
-    cells = transition_grid(grid)
-    strain = device.zeros((*cells.shape, 2))
-    displacements = geometry.displacements(device, layers, coefficients, flows, grid, settings, _EVERY)
-    for layer, coefficient, displacement in zip(layers, coefficients, displacements, strict=True):
+    grids = [_cells(grid, pixels) for pixels in _CELLS]
+    covers = _covers(masks, grids)
+    price = _price(device, flows, masks, grid, grids[-1], covers[-1])
+    shares: Shares | None = None
+    for cells, cover in zip(grids, covers, strict=True):
+        equal = Shares.equal(device, cells, cover)
+        east, south = links(_means(price, cells), cover.max(0), cells)
+        well = wells(cells, grid, settings.transition_strain, unlike)
+        system = tuple(device.upload(one) for one in (east, south, well))
+        if shares is None:
+            relax(device, equal, system, 0.0, _FIRST_SWEEPS)
+            for depth in _DEPTHS:
+                relax(device, equal, system, depth, _DEEPER_SWEEPS)
+        else:
+            device.run(
+                "transition", "transition_refine", cells.border[:2], shares.share, shares.first, shares.owner,
+                shares.cells.border, equal.first, equal.owner, cells.border, equal.share,
+            )  # fmt: skip
+        shares = equal
+        relax(device, shares, system, 1.0, _SWEEPS)
+    assert shares is not None
+    _expand(device, layers, coefficients, shares, grid)
+
+
+def _cells(grid: Grid, pixels: int) -> Grid:
+    """A grid of cells of about `pixels` x `pixels`; where it wraps, its columns can be parted by colour."""
+    cells = grid.coarser(pixels)
+    return grid.resized(cells.width + cells.width % 2, cells.height) if grid.wraps else cells
+
+
+def _covers(masks: Masks, grids: Sequence[Grid]) -> list[Mask]:
+    """Which layers have a share in which cells of each grid, (layers, height, width)."""
+    whole = part = masks.host
+    result = []
+    for cells in reversed(grids):
+        whole, part = on_cells(whole, cells, np.logical_and), on_cells(part, cells, np.logical_or)
+        result.append(np.where(whole.any(0), whole, part))
+    return result[::-1]
+
+
+def _price(
+    device: Device, flows: Sequence[PairFlow], masks: Masks, grid: Grid, cells: Grid, cover: Mask
+) -> npt.NDArray[np.float64]:
+    """P^2 + P0^2 in cells, (height, width), in squared working px."""
+    squared = device.zeros(cells.shape)
+    for flow in flows:
+        chart = flow.chart
         device.run(
-            "transition", "transition_strain", cells.border[:2], displacement, coefficient.blend,
-            layer.pixels, layer.box, grid.border, grid.lens, _EVERY, cells.border, strain,
+            "transition", "transition_parallax", cells.border[:2], flow.forward, flow.backward,
+            (chart.width, chart.height, int(chart.wraps), 0), chart.transform, masks.buffers[flow.a],
+            masks.buffers[flow.b], masks.grid.border, grid.border, grid.lens, cells.border, squared,
         )  # fmt: skip
-    sums = strain.get().astype(np.float64)
-    power = device.upload(exponent(sums, settings.transition_strain, cells.wraps, unlike))
+    several = (cover.sum(0) > 1).astype(np.float64)
+    modes = ("nearest", "wrap" if cells.wraps else "nearest")
+    sums, counts = (
+        scipy.ndimage.gaussian_filter(one, _SIGMA, mode=modes)
+        for one in (np.sqrt(squared.get().astype(np.float64)) * several, several)
+    )
+    price: npt.NDArray[np.float64] = np.square(sums / np.maximum(counts, 1e-6)) + _LEAST_PARALLAX**2
+    return price
+
+
+def _means(values: npt.NDArray[np.float64], cells: Grid) -> npt.NDArray[np.float64]:
+    """Means of a finer grid's values in cells."""
+    sums = np.stack([values, np.ones_like(values)])
+    for axis, count in ((1, cells.height), (2, cells.width)):
+        sums = np.add.reduceat(sums, np.arange(count) * sums.shape[axis] // count, axis)
+    return np.asarray(sums[0] / sums[1])
+
+
+def links(price: npt.NDArray[np.float64], union: Mask, cells: Grid) -> tuple[Values, Values]:
+    """What a difference of shares costs between a cell and the next column's, and the next row's: (height,
+    width).
+
+    By how long the border between them is over how far they lie apart, and the harmonic mean of the price.
+    """
+    rows = np.arange(cells.height)
+    if cells.lens[1]:
+        _, across, latitude, down = cells.lens
+        heights = down / (across * np.maximum(np.cos(latitude - (rows + 0.5) * down), _NARROWEST))
+        widths = across / down * np.maximum(np.cos(latitude - (rows + 1) * down), 0.0)
+    else:
+        shape = cells.region.height / cells.height * cells.width / cells.region.width
+        heights, widths = np.full(cells.height, shape), np.full(cells.height, 1 / shape)
+    result = []
+    for axis, ratio in ((1, heights), (0, widths)):
+        there = union & np.roll(union, -1, axis)
+        if axis == 0:
+            there[-1] = False
+        elif not cells.wraps:
+            there[:, -1] = False
+        mean = 2 / (1 / price + 1 / np.roll(price, -1, axis))
+        result.append(np.where(there, ratio[:, None] * mean, 0.0).astype(np.float32))
+    return result[0], result[1]
+
+
+def wells(cells: Grid, grid: Grid, strain: float, unlike: Values) -> Values:
+    """(2 strain)^2 times the area of each cell, in squared working px, (height, width); 0 where layers are
+    unlike.
+    """
+    rows, columns = np.arange(cells.height), np.arange(cells.width)
+    area = np.full(cells.height, grid.width / cells.width * grid.height / cells.height)
+    if cells.lens[1]:
+        latitudes = cells.lens[2] - (rows + 0.5) * cells.lens[3]
+        area *= np.maximum(np.cos(latitudes), _NARROWEST)
+    height, width = unlike.shape
+    alike = 1 - unlike[rows * height // cells.height][:, columns * width // cells.width]
+    prices: Values = ((2 * strain) ** 2 * area[:, None] * alike).astype(np.float32)
+    return prices
+
+
+def relax(device: Device, shares: Shares, system: tuple[Buffer, ...], depth: float, sweeps: int) -> None:
+    """Sweeps over all cells, in place. system: links and wells; depth: the part of the wells that counts."""
+    cells = shares.cells
+    calls = [
+        (shares.share, shares.first, shares.owner, cells.border, *system, depth, colour, _OVER)
+        for colour in (0, 1)
+    ]
+    size = (-(-cells.width // 2), cells.height)
+    device.repeat("transition", "transition_relax", size, calls, sweeps)
+
+
+def _expand(
+    device: Device,
+    layers: Sequence[WorkingLayer],
+    coefficients: Sequence[Coefficients],
+    shares: Shares,
+    grid: Grid,
+) -> None:
+    """The coefficients on the working grid, in place."""
     total = device.zeros(grid.shape)
-    for layer, coefficient in zip(layers, coefficients, strict=True):
+    for index, (layer, one) in enumerate(zip(layers, coefficients, strict=True)):
         device.run(
-            "transition", "transition_sharpen", layer.box[2:], coefficient.blend, layer.box, grid.border,
-            power, cells.border, total,
+            "transition", "transition_expand", layer.box[2:], one.blend, one.rim, layer.box, grid.border,
+            shares.share, shares.first, shares.owner, shares.cells.border, index, total,
         )  # fmt: skip
-    for layer, coefficient in zip(layers, coefficients, strict=True):
-        device.run(
-            "transition", "transition_ratio", layer.box[2:], coefficient.blend, layer.box, grid.border, total
-        )
-
-
-def exponent(
-    strain: npt.NDArray[np.float64], wanted: float, wraps: bool, unlike: npt.NDArray[np.float32]
-) -> npt.NDArray[np.float32]:
-    """n on the transition grid, (height, width), from sums (height, width, 2) of transition_strain."""
-    smooth = _smooth(strain, wraps)
-    mean = (smooth[..., 0] / np.maximum(smooth[..., 1], 1e-6)) ** 0.25
-    power = 1 + (1 - unlike) * (np.clip(wanted / np.maximum(mean, 1e-6), 1, _STEEPEST) - 1)
-    weighed = _smooth(np.dstack([power, np.ones_like(power)]), wraps)
-    return np.ascontiguousarray(weighed[..., 0] / weighed[..., 1], np.float32)
-
-
-def _smooth(values: npt.NDArray[np.float64], wraps: bool) -> npt.NDArray[np.float64]:
-    """A Gaussian of _SIGMA cells, not normalised at the borders."""
-    modes = ("constant", "wrap" if wraps else "constant", "constant")
-    return np.asarray(scipy.ndimage.gaussian_filter(values, (_SIGMA, _SIGMA, 0), mode=modes))
+    for layer, one in zip(layers, coefficients, strict=True):
+        device.run("transition", "transition_ratio", layer.box[2:], one.blend, layer.box, grid.border, total)

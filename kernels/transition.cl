@@ -1,52 +1,161 @@
-/* How quickly the geometry changes over from one layer to the next. */
+/* Where the geometry changes over from one layer to the next.
 
-/* Strain of a layer where it changes over, |grad w_k| |F_k|, in cells of the transition grid: sums of
-   w (1 - w) strain^4 and of w (1 - w) are added, so that the middle of the transition counts most, and in it the
-   largest strain. Only every few columns and rows of the layer are read. */
-__kernel void transition_strain(__global const float4 *displacement, /* (box.w / every, box.z / every), rounded up */
-                                __global const float *blend,         /* (box.w, box.z) w_k */
-                                __global const float4 *layer,        /* (box.w, box.z) r, g, b, valid */
-                                int4 box, int4 border, float4 lens,  /* place on the working grid; the grid */
-                                int every,                           /* columns and rows from one read to the next */
-                                int4 cells,                          /* transition grid, run size */
-                                __global float2 *strain)             /* (cells.y, cells.x) */
+   Shares. In each cell of a grid the layers that cover it have shares, which sum to 1: share[s] is that of layer
+   owner[s], and a cell's are those from first[cell] to first[cell + 1], by ascending layer. */
+
+/* A share that nothing is left of, so that something else can be made of it: of layers that a coarser grid does not
+   know in a place, and where only layers are that have none beside it. */
+#define TRANSITION_TRACE 1e-6f
+
+/* A cell's links may be weakened by its well to this part of them. */
+#define TRANSITION_WEAKEST 0.25f
+
+/* Squared parallax of a pair in cells, in working px: the longest flow, either way, at places where both layers are. */
+__kernel void transition_parallax(__global const float2 *flow,   /* chart grid, px: F_ab */
+                                  __global const float2 *back,   /* chart grid, px: F_ba */
+                                  int4 grid, float16 chart,      /* chart */
+                                  __global const uchar *mask_a,  /* (masks.y, masks.x) */
+                                  __global const uchar *mask_b,  /* (masks.y, masks.x) */
+                                  int4 masks,                    /* mask grid */
+                                  int4 border, float4 lens,      /* working grid */
+                                  int4 cells,                    /* run size */
+                                  __global float *parallax)      /* (cells.y, cells.x) that of no pair before is less */
 {
-    const int cx = get_global_id(0), cy = get_global_id(1);
-    if (cx >= cells.x || cy >= cells.y)
+    const int x = get_global_id(0), y = get_global_id(1);
+    if (x >= cells.x || y >= cells.y)
         return;
-    /* the layer's own pixels of the cell, its outermost left out */
-    const int left = GREATEST(cx * border.x / cells.x - box.x, 1);
-    const int top = GREATEST(cy * border.y / cells.y - box.y, 1);
-    const int right = LEAST((cx + 1) * border.x / cells.x - box.x, box.z - 1);
-    const int bottom = LEAST((cy + 1) * border.y / cells.y - box.y, box.w - 1);
-    const int columns = (box.z + every - 1) / every;
-    const float unit = lens.y == 0.0f ? 1.0f : 1.0f / lens.y;
-    float2 sum = (float2)(0.0f);
-    for (int y = (top + every - 1) / every * every; y < bottom; y += every) {
-        const float across = lens.y == 0.0f ? 1.0f : fmax(cos(lens.z - (y + box.y + 0.5f) * lens.w), 0.02f);
-        for (int x = (left + every - 1) / every * every; x < right; x += every) {
-            const int at = y * box.z + x;
-            const float w = blend[at];
-            if (w <= 0.0f || w >= 1.0f || layer[at].w == 0.0f || layer[at - 1].w == 0.0f ||
-                layer[at + 1].w == 0.0f || layer[at - box.z].w == 0.0f || layer[at + box.z].w == 0.0f)
-                continue;
-            const float2 slope = 0.5f * (float2)((blend[at + 1] - blend[at - 1]) / across,
-                                                 blend[at + box.z] - blend[at - box.z]);
-            const float3 d = displacement[y / every * columns + x / every].xyz;
-            const float s = unit * ROOT(square2(slope) * square3(d)) / GREATEST(1.0f - w, 0.05f);
-            const float weight = w * (1.0f - w);
-            sum += weight * (float2)(s * s * s * s, 1.0f);
-        }
+    const float2 size = (float2)(border.x, border.y), unit = (float2)(lens.y == 0.0f ? 1.0f : 1.0f / lens.y);
+    const float2 per_pixel = unit / (float2)(chart.s9, chart.sa);
+    float longest = parallax[y * cells.x + x];
+    for (int part = 0; part < 4; ++part) {
+        const float2 share = ((float2)(x, y) + 0.25f + 0.5f * (float2)(part & 1, part >> 1)) /
+                             (float2)(cells.x, cells.y);
+        const int2 m = floor_int2(share * (float2)(masks.x, masks.y));
+        if (!mask_a[m.y * masks.x + m.x] || !mask_b[m.y * masks.x + m.x])
+            continue;
+        const float2 u = chart_position(canvas_point(share * size, lens), &chart);
+        longest = GREATEST(longest, square2(bilinear_flow(flow, u, grid) * per_pixel));
+        longest = GREATEST(longest, square2(bilinear_flow(back, u, grid) * per_pixel));
     }
-    strain[cy * cells.x + cx] += sum;
+    parallax[y * cells.x + x] = longest;
 }
 
-/* w_k to the power of the transition grid, in place; sharpened coefficients still have to sum to 1. */
-__kernel void transition_sharpen(__global float *blend,           /* (box.w, box.z) w_k */
-                                 int4 box, int4 border,           /* place on the working grid, run size; the grid */
-                                 __global const float *power,     /* (cells.y, cells.x) */
-                                 int4 cells,                      /* transition grid, over the same region */
-                                 __global float *total)           /* (border.y, border.x) sum over layers */
+/* The share of a layer in a cell; 0 where it has none. */
+static inline float transition_share(__global const float *share, __global const int *first,
+                                     __global const int *owner, int cell, int layer) {
+    const int end = first[cell + 1];
+    for (int s = first[cell]; s < end; ++s)
+        if (owner[s] == layer)
+            return share[s];
+    return 0.0f;
+}
+
+/* A layer's share between the cells of a grid; cells without any count as 0. */
+static inline float transition_read(__global const float *share, __global const int *first,
+                                    __global const int *owner, float2 q, int4 cells, int layer) {
+    const int2 corner = floor_int2(q - 0.5f);
+    int4 at;
+    const float4 w = grid_taps(corner, q - 0.5f - convert_float2(corner), cells, &at);
+    return w.x * transition_share(share, first, owner, at.x, layer) +
+           w.y * transition_share(share, first, owner, at.y, layer) +
+           w.z * transition_share(share, first, owner, at.z, layer) +
+           w.w * transition_share(share, first, owner, at.w, layer);
+}
+
+/* Shares from those of a coarser grid over the same region. */
+__kernel void transition_refine(__global const float *coarse,       /* shares of the coarser grid */
+                                __global const int *coarse_first, __global const int *coarse_owner,
+                                int4 coarse_cells,                  /* coarser grid */
+                                __global const int *first, __global const int *owner,
+                                int4 cells,                         /* run size */
+                                __global float *share)
+{
+    const int x = get_global_id(0), y = get_global_id(1);
+    if (x >= cells.x || y >= cells.y)
+        return;
+    const int begin = first[y * cells.x + x], end = first[y * cells.x + x + 1];
+    const float2 ratio = (float2)((float)coarse_cells.x / cells.x, (float)coarse_cells.y / cells.y);
+    const float2 q = ((float2)(x, y) + 0.5f) * ratio;
+    float total = 0.0f;
+    for (int s = begin; s < end; ++s) {
+        share[s] = TRANSITION_TRACE +
+                   transition_read(coarse, coarse_first, coarse_owner, q, coarse_cells, owner[s]);
+        total += share[s];
+    }
+    for (int s = begin; s < end; ++s)
+        share[s] /= total;
+}
+
+/* The nearest shares that sum to 1, none below 0: those above a threshold, less it. */
+static inline void transition_project(__global float *share, int begin, int end) {
+    float threshold = -INFINITY;
+    for (int left = end - begin + 1;;) {
+        float excess = -1.0f;
+        int count = 0;
+        for (int s = begin; s < end; ++s)
+            if (share[s] > threshold) {
+                excess += share[s];
+                ++count;
+            }
+        if (count == 0 || count >= left) /* fewer each time, so that rounding keeps nothing going */
+            break;
+        left = count;
+        threshold = excess / count;
+    }
+    for (int s = begin; s < end; ++s)
+        share[s] = GREATEST(share[s] - threshold, 0.0f);
+}
+
+/* One step of successive over-relaxation towards the least of
+
+       sum of links (w_k - w_k')^2  +  sum of cells, well w_k (1 - w_k),
+
+   of all layers' shares w_k, in the cells of one colour of a chequerboard. In a cell that is a parabola, the same for
+   all its layers, so that the nearest shares to where each has its least are the best. */
+__kernel void transition_relax(__global float *share,       /* in place */
+                               __global const int *first, __global const int *owner,
+                               int4 cells,                  /* run size: half the columns, rounded up; rows */
+                               __global const float *east,  /* (cells.y, cells.x) links to the next column, */
+                               __global const float *south, /* (cells.y, cells.x) to the next row; 0: none */
+                               __global const float *well,  /* (cells.y, cells.x) */
+                               float deep,                  /* part of the well that counts */
+                               int colour,                  /* 0 or 1 */
+                               float over)                  /* 1 to 2 */
+{
+    const int y = get_global_id(1), x = 2 * get_global_id(0) + ((y + colour) & 1);
+    if (x >= cells.x || y >= cells.y)
+        return;
+    const int at = y * cells.x + x, begin = first[at], end = first[at + 1];
+    if (end - begin < 2)
+        return;
+    const int left = x > 0 ? at - 1 : at + cells.x - 1, right = x + 1 < cells.x ? at + 1 : at - x;
+    const int up = y > 0 ? at - cells.x : at, down = y + 1 < cells.y ? at + cells.x : at;
+    /* a last column's link leads around the canvas, or is 0 */
+    const float4 link = (float4)(east[left], east[at], y > 0 ? south[up] : 0.0f, south[at]);
+    const float sum = link.x + link.y + link.z + link.w;
+    if (sum <= 0.0f)
+        return;
+    const float scale = 1.0f / GREATEST(sum - deep * well[at], TRANSITION_WEAKEST * sum);
+    for (int s = begin; s < end; ++s) {
+        const int k = owner[s];
+        const float pull = link.x * transition_share(share, first, owner, left, k) +
+                           link.y * transition_share(share, first, owner, right, k) +
+                           link.z * transition_share(share, first, owner, up, k) +
+                           link.w * transition_share(share, first, owner, down, k);
+        share[s] += over * (pull * scale - share[s]);
+    }
+    transition_project(share, begin, end);
+}
+
+/* w_k from the shares, where several layers are, and less towards the layer's border. They still have to sum to 1. */
+__kernel void transition_expand(__global float *blend,            /* (box.w, box.z) w_k, in place */
+                                __global const uchar *rim,        /* (box.w, box.z) m_k in 255ths */
+                                int4 box, int4 border,            /* place on the working grid, run size; the grid */
+                                __global const float *share, __global const int *first,
+                                __global const int *owner,
+                                int4 cells,                       /* over the same region */
+                                int layer,                        /* k */
+                                __global float *total)            /* (border.y, border.x) sum over layers */
 {
     const int x = get_global_id(0), y = get_global_id(1);
     if (x >= box.z || y >= box.w)
@@ -55,9 +164,9 @@ __kernel void transition_sharpen(__global float *blend,           /* (box.w, box
     float w = blend[at];
     if (w > 0.0f && w < 1.0f) {
         const float2 ratio = (float2)((float)cells.x / border.x, (float)cells.y / border.y);
-        const float n = bilinear_scalar(power, ((float2)(x + box.x, y + box.y) + 0.5f) * ratio, cells);
-        const float exponent = n * logarithm(w);
-        w = exponent > -87.0f ? exponential(exponent) : 0.0f;
+        const float2 q = ((float2)(x + box.x, y + box.y) + 0.5f) * ratio;
+        w = transition_read(share, first, owner, q, cells, layer);
+        w = GREATEST(w, TRANSITION_TRACE) * rim[at] / 255.0f;
     }
     blend[at] = w;
     total[(y + box.y) * border.x + x + box.x] += w;

@@ -193,9 +193,24 @@ def off_by(pixels: np.ndarray) -> float:
 
 @pytest.mark.parametrize("mode", ["joint", "sequential"])
 def test_near_thing_is_whole_and_in_its_place_only_with_guides(device, mode):
-    settings = Settings(merge=mode, exposure=False)
+    settings = Settings(merge=mode, exposure=False, transition_strain=0)
     assert off_by(merge_layers(near_scene(), CANVAS, settings)) > 10
     assert off_by(merge_layers(near_scene(), CANVAS, settings, guides=GUIDES)) < 6  # edges, where flow jumps
+
+
+@pytest.mark.parametrize("mode", ["joint", "sequential"])
+def test_transition_goes_round_a_near_thing_that_guides_tell(device, mode):
+    """It is seen as one of the photos shows it; without guides it is there twice, side by side."""
+    settings, shows = Settings(merge=mode, exposure=False), [look(0), look(MOVE)]
+    x = np.arange(CANVAS.width)
+    near = (x > THING[0] - HALF[0] - 12) & (x < THING[0] + HALF[0] + MOVE + 12)
+
+    def unlike(guides):
+        result = merge_layers(near_scene(), CANVAS, settings, guides=guides).astype(int)
+        return min(np.abs(result - photo)[20:140, near].mean() for photo in shows)
+
+    assert unlike(GUIDES) < 2
+    assert unlike(()) > 10
 
 
 def test_guides_may_be_left_aside(device):
@@ -227,7 +242,8 @@ def test_guides_move_with_the_mosaic(device, monkeypatch):
     left, right = masked(look(0), (x < LAST) & (y < 140)), masked(look(MOVE), (x >= FIRST) & (y < 140))
     third = masked(look(20), (x > 120) & (x < 330) & (y > 9), "third")
     to_third = Guide(2, 0, (190.0, 80.0), (170.0, 80.0), "to the third")
-    merge_layers([left, right, third], CANVAS, Settings(merge="sequential"), guides=[*GUIDES, to_third])
+    settings = Settings(merge="sequential", transition_strain=0)
+    merge_layers([left, right, third], CANVAS, settings, guides=[*GUIDES, to_third])
     first, last = seen
     assert {frozenset(ends) for ends in first} == {frozenset((g.at_a, g.at_b)) for g in GUIDES}
     ((in_mosaic, in_third),) = last

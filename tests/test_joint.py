@@ -243,21 +243,24 @@ def test_pixels_of_one_layer_are_copied_where_the_correction_is_zero(monkeypatch
 # How much a shifted canvas's result may differ, in levels of 8 bit: largest, mean. Its layers come in another
 # order, so that sums round otherwise. On the sphere charts have their pixels elsewhere, so that flow differs
 # by hundredths of a pixel and colours by the texture's slope times that. Cells of exposure and of
-# highlights, of 16 px, lie elsewhere, so that gains and weights are blurred over other pixels.
+# highlights, of 16 px, lie elsewhere, so that gains and weights are blurred over other pixels; cells of
+# transitions as well, so that these lie some px from there, and change over as flow errs.
 SHIFTED = {
-    ("cylinder", False): (1, 0.001),
-    ("cylinder", True): (8, 0.8),
-    ("sphere", False): (16, 0.1),
-    ("sphere", True): (16, 0.6),
+    ("cylinder", False, 0.0): (1, 0.001),
+    ("cylinder", True, 0.0): (8, 0.8),
+    ("sphere", False, 0.0): (4, 0.1),
+    ("sphere", True, 0.0): (4, 0.6),
+    ("cylinder", True, 0.07): (40, 0.9),
+    ("sphere", True, 0.07): (40, 0.9),
 }
 
 
-@pytest.mark.parametrize(("name", "exposure"), SHIFTED)
-def test_shifted_canvas_gives_the_shifted_result(name, exposure):
+@pytest.mark.parametrize(("name", "exposure", "strain"), SHIFTED)
+def test_shifted_canvas_gives_the_shifted_result(name, exposure, strain):
     canvas = CANVASES[name]
     layers = moving(canvas)
     covered = masks_of(layers, canvas)
-    cells = {"exposure": exposure, "highlights": exposure}
+    cells = {"exposure": exposure, "highlights": exposure, "transition_strain": strain}
     original = merged(layers, canvas, **cells).astype(int)
     for shift in (1, 64, 237):
         shifted = []
@@ -267,7 +270,7 @@ def test_shifted_canvas_gives_the_shifted_result(name, exposure):
             shifted.append(masked(np.roll(pixels, shift, 1), np.roll(mask, shift, 1), layer.name))
         result = merged(shifted, canvas, **cells)
         difference = np.abs(np.roll(original, shift, 1) - result)
-        largest, mean = SHIFTED[name, exposure]
+        largest, mean = SHIFTED[name, exposure, strain]
         assert difference.max() <= largest and difference.mean() <= mean
         # one pixel off would be far beyond
         assert np.abs(np.roll(original, shift + 1, 1) - result).mean() > 5 * max(mean, 0.1)
@@ -405,8 +408,9 @@ def test_very_long_canvas_is_blended(upright):
         places = [(0, 0), (0, 20_000)]
         canvas = Canvas.plane(width, length)
     layers = [Layer.from_array("layer", p, *place) for p, place in zip((bright, dark), places, strict=True)]
-    result = merged(layers, canvas, exposure=False)
-    profile = result[:, 2, 0] if upright else result[2, :, 0]
-    assert np.all(np.diff(profile.astype(int)) <= 0)
-    assert np.all(profile[:20_000] == 200) and np.all(profile[40_001:] == 100)
-    assert 140 < profile[30_000] < 160
+    for strain in (0.07, 0):
+        result = merged(layers, canvas, exposure=False, transition_strain=strain)
+        profile = result[:, 2, 0] if upright else result[2, :, 0]
+        assert np.all(np.diff(profile.astype(int)) <= 0)
+        assert np.all(profile[:20_000] == 200) and np.all(profile[40_001:] == 100)
+    assert 140 < profile[30_000] < 160  # as published: in the middle

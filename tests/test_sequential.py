@@ -23,6 +23,7 @@ AS_PUBLISHED = {
     "exposure": False,
     "border_feather": 0.0,
     "highlights": False,
+    "transition_strain": 0.0,
     "both_flows": False,
     "fixed_point_steps": 0,
 }

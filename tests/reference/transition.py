@@ -1,4 +1,4 @@
-"""Twins of kernels/transition.cl."""
+"""Twins of kernels/transition.cl. Shares, and which layers have some, are arrays (layers, height, width)."""
 
 from __future__ import annotations
 
@@ -6,63 +6,93 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from reference.common import Array, Numbers, bilinear, pixels
+from reference.common import Array, Numbers, bilinear, canvas_point, chart_position, pixels
+
+TRACE, WEAKEST = 1e-6, 0.25
 
 
-def transition_strain(
-    displacement: Array,
-    blend: Array,
-    layer: Array,
-    box: Sequence[int],
+def transition_parallax(
+    flows: Sequence[Array],
+    chart_grid: Sequence[int],
+    chart: Numbers,
+    masks: Sequence[Array],
     border: Sequence[int],
     lens: Numbers,
-    every: int,
     cells: Sequence[int],
+    parallax: Array,
 ) -> Array:
-    """Sums of w (1 - w) strain^4 and w (1 - w) in each cell, (height, width, 2).
+    """The squares of the longest flow of both ways in each cell, or of `parallax`, where that is more.
 
-    Of the layer's pixels every n-th column and row is read; `displacement` has no others.
+    masks: of both layers, any (height, width) over the same region.
     """
-    left, top, _, height = box
-    lens = np.asarray(lens, np.float64)
-    w = blend.astype(np.float64)
-    across = np.ones(height)
-    unit = 1.0
-    if lens[1]:
-        across = np.maximum(np.cos(lens[2] - (np.arange(height) + top + 0.5) * lens[3]), 0.02)
-        unit = 1 / lens[1]
-    down, right = np.gradient(w)
-    length = np.zeros(w.shape)
-    length[::every, ::every] = unit * np.linalg.norm(displacement[..., :3].astype(np.float64), axis=-1)
-    strain = np.hypot(right / across[:, None], down) * length / np.maximum(1 - w, 0.05)
-    valid = layer[..., 3] != 0
-    usable = valid & (w > 0) & (w < 1)
-    for axis in (0, 1):
-        for step in (-1, 1):
-            usable &= np.roll(valid, step, axis)
-    usable[[0, -1]] = usable[:, [0, -1]] = False
-    result = np.zeros((cells[1], cells[0], 2))
-    for j, i in np.ndindex(cells[1], cells[0]):
-        first = [
-            max(k * b // c - o, 1) for k, b, c, o in zip((i, j), border, cells, (left, top), strict=False)
+    lens, chart = np.asarray(lens, np.float64), np.asarray(chart, np.float64)
+    longest = np.asarray(parallax, np.float64)
+    columns, rows = pixels(cells[0], cells[1])
+    for down in (0.25, 0.75):
+        for right in (0.25, 0.75):
+            x, y = (columns + right) / cells[0], (rows + down) / cells[1]
+            height, width = masks[0].shape
+            there = np.floor(y * height).astype(int), np.floor(x * width).astype(int)
+            both = (masks[0][there] != 0) & (masks[1][there] != 0)
+            point = canvas_point(x * border[0], y * border[1], lens)
+            at = chart_position(point, chart)
+            for flow in flows:
+                total, share = bilinear(flow, chart_grid, *at)
+                found = total / np.maximum(share, 1e-6)[..., None] / chart[9:11] / (lens[1] or 1)
+                longest = np.where(both, np.maximum(longest, (found**2).sum(-1)), longest)
+    return longest
+
+
+def transition_refine(coarse: Array, cells: Sequence[int], owns: Array) -> Array:
+    """Shares on a finer grid from coarser ones. owns: (layers, height, width), which have some there."""
+    height, width = owns.shape[1:]
+    columns, rows = pixels(width, height)
+    x, y = (columns + 0.5) * cells[0] / width, (rows + 0.5) * cells[1] / height
+    read = owns * np.stack([bilinear(one, cells, x, y)[0] + TRACE for one in coarse])
+    return read / np.where(owns.any(0), read.sum(0), 1)
+
+
+def nearest_shares(values: Array) -> Array:
+    """The nearest point to `values` of which no part is below 0 and whose sum is 1, by bisection."""
+    low, high = values.min() - 1, values.max()
+    for _ in range(100):
+        middle = (low + high) / 2
+        low, high = (middle, high) if np.maximum(values - middle, 0).sum() > 1 else (low, middle)
+    return np.maximum(values - low, 0)
+
+
+def transition_relax(
+    share: Array, owns: Array, east: Array, south: Array, well: Array, deep: float, colour: int, over: float
+) -> Array:
+    """Shares after one step, of the cells (x, y) whose x + y has the parity of `colour`."""
+    result = share.astype(np.float64).copy()
+    height, width = owns.shape[1:]
+    for y, x in np.ndindex(height, width):
+        its = np.flatnonzero(owns[:, y, x])
+        links = [
+            (east[y, x - 1], (y, x - 1)),  # from the first column on to the last one
+            (east[y, x], (y, (x + 1) % width)),
+            (south[y - 1, x] if y else 0.0, (y - 1, x)),
+            (south[y, x], (min(y + 1, height - 1), x)),
         ]
-        last = [(k + 1) * b // c - o for k, b, c, o in zip((i, j), border, cells, (left, top), strict=False)]
-        start = [-(-at // every) * every for at in first]
-        part = np.s_[start[1] : max(last[1], 0) : every, start[0] : max(last[0], 0) : every]
-        weight = (w * (1 - w) * usable)[part]
-        result[j, i] = (weight * strain[part] ** 4).sum(), weight.sum()
+        sum_ = sum(link for link, _ in links)
+        if (x + y) % 2 != colour or len(its) < 2 or sum_ <= 0:
+            continue
+        pulled = sum(link * (share * owns)[its, j, i] for link, (j, i) in links)
+        least = pulled / max(sum_ - deep * well[y, x], WEAKEST * sum_)
+        own = share[its, y, x].astype(np.float64)
+        result[its, y, x] = nearest_shares(own + over * (least - own))
     return result
 
 
-def transition_sharpen(
-    blend: Array, box: Sequence[int], border: Sequence[int], power: Array, cells: Sequence[int]
+def transition_expand(
+    blend: Array, rim: Array, box: Sequence[int], border: Sequence[int], share: Array, cells: Sequence[int]
 ) -> Array:
-    """Coefficients to the power of the transition grid at their pixels."""
+    """w_k of a layer on its box from its share (height, width), where it is neither 0 nor 1."""
     columns, rows = pixels(box[2], box[3], box[0], box[1])
     x, y = (columns + 0.5) * cells[0] / border[0], (rows + 0.5) * cells[1] / border[1]
-    total, share = bilinear(power, cells, x, y)
-    w = blend.astype(np.float64)
-    return np.where((w > 0) & (w < 1), w ** (total / share), w)
+    w = np.maximum(bilinear(share, cells, x, y)[0], TRACE) * rim / 255
+    return np.where((blend > 0) & (blend < 1), w, blend.astype(np.float64))
 
 
 def transition_ratio(blend: Array, box: Sequence[int], total: Array) -> Array:
