@@ -2,15 +2,16 @@
 
 What was found is kept if the images are clearly more alike by it, since where patterns repeat much fits a
 little, and if it is no thing that moved by itself: somebody who walked would be torn from what is behind. It
-is none if it is a large part of what they show, or if it moves as what stands still does, seen by a camera
-that moved (epipolar.py). Of what is kept, a part that explains less than no search did is dropped: a chair is
-found, and beside it bars of a banister are taken for the next ones.
+is none if it moves as what stands still does, seen by a camera that moved (epipolar.py), or if it is a large
+part of what they show and leads back from one image to the other: what fits by chance fits one way. Of what is
+kept, a part that explains less than no search did is dropped: a chair is found, and beside it bars of a banister
+are taken for the next ones.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
@@ -65,8 +66,8 @@ class Decision:
     refused: tuple[Refused, ...] = ()
 
 
-def believed(plain: Candidate, found: Candidate, gap: float, wraps: bool) -> Candidate:
-    """`found`, but explaining no more than `plain` does where it does not lead back.
+def believed(plain: Candidate, found: Candidate, gap: float, wraps: bool) -> npt.NDArray[np.float32]:
+    """(2, height, width): the misfit of `found`, no less than that of `plain` where it does not lead back.
 
     gap     px between start and return from which on it does not.
     wraps   whether the last column is beside the first one.
@@ -77,7 +78,7 @@ def believed(plain: Candidate, found: Candidate, gap: float, wraps: bool) -> Can
     columns = columns % width if wraps else np.clip(columns, 0, width - 1)
     back = found.flows[1 - way, np.clip(rows, 0, height - 1), columns]
     returns = np.hypot(*np.moveaxis(found.flows + back, -1, 0)) < gap
-    return replace(found, misfit=np.where(returns, found.misfit, np.maximum(found.misfit, plain.misfit)))
+    return np.where(returns, found.misfit, np.maximum(found.misfit, plain.misfit))
 
 
 def decide(
@@ -87,12 +88,14 @@ def decide(
     last_level: int,
     textured: Callable[[], Mask],
     bearings: Bearings | None,
+    wraps: bool,
     parameters: SearchParameters,
 ) -> Decision:
     """Whether flow as `found` may be taken for `plain`, without a search, after a level.
 
     last_level  the level on which that is decided at last; on coarser ones there is only little to hope for.
     textured    gives (2, height, width): where the images tell motion.
+    wraps       whether the last column is beside the first one.
     """
     common, last = plain.misfit >= 0, level <= last_level
     distance = parameters.apart * 2.0 ** (last_level - level)
@@ -100,7 +103,8 @@ def decide(
     if not apart.any():
         return Decision(False)
     gain = parameters.gain if last else parameters.hope
-    gained = found.misfit[common].mean() <= gain * plain.misfit[common].mean()
+    trusted = believed(plain, found, parameters.gap, wraps)
+    gained = trusted[common].mean() <= gain * plain.misfit[common].mean()
     if gained and (not last or apart.sum() >= parameters.widely * common.sum()):
         return Decision(True)
     remains, before = found.misfit[apart].mean(), plain.misfit[apart].mean()

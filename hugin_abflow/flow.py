@@ -224,20 +224,19 @@ def _better(
     what was refused.
     """
     plain, found = (Candidate(one.get(), _misfit(device, features, one, grid, parameters)) for one in flows)
-    how, last_level = parameters.search, parameters.decide_on
-    found = decision.believed(plain, found, how.gap, bool(grid[2]))
+    how, last_level, wraps = parameters.search, parameters.decide_on, bool(grid[2])
 
     def textured() -> decision.Mask:
         slopes: npt.NDArray[np.float32] = features.get()[..., 1:3]
         told: decision.Mask = (slopes**2).sum(-1) > how.textured**2
         return told
 
-    decided = decision.decide(plain, found, level, last_level, textured, bearings, how)
+    decided = decision.decide(plain, found, level, last_level, textured, bearings, wraps, how)
     if not decided.found:
         return flows[:1], decided.refused
     if level > last_level:
         return flows, ()
-    worse = decision.worse(plain, found, bool(grid[2]))
+    worse = decision.worse(plain, found, wraps)
     if not worse.any():
         return flows[1:], ()
     return [device.upload(np.where(worse[..., None], plain.flows, found.flows))], ()

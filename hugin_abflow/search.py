@@ -43,9 +43,9 @@ class SearchParameters:
     # which that is decided) in so large a share of the pixels that both images show
     hope: float = 0.95
     gain: float = 0.82
-    gap: float = 2.0  # and px between start and return from which on it explains nothing
     apart: float = 1.5
     widely: float = 0.25
+    gap: float = 2.0  # where its return is this far from its start, it explains nothing more for this
     # or if no more than this remains where it leads elsewhere, and motion there is that of what stands still,
     # as gradients of h of at least this tell
     gain_apart: float = 0.75
