@@ -3,9 +3,9 @@
 What was found is kept if the images are clearly more alike by it, since where patterns repeat much fits a
 little, and if it is no thing that moved by itself: somebody who walked would be torn from what is behind. It
 is none if it moves as what stands still does, seen by a camera that moved (epipolar.py), or if it is a large
-part of what they show and leads back from one image to the other: what fits by chance fits one way. Of what is
-kept, a part that explains less than no search did is dropped: a chair is found, and beside it bars of a banister
-are taken for the next ones.
+part of what they show and leads back from one image to the other: what fits by chance fits one way. Of what
+is kept, a part that explains less than no search did is dropped: a chair is found, and beside it bars of a
+banister are taken for the next ones.
 """
 
 from __future__ import annotations
