@@ -2,7 +2,7 @@
 
 What was found is kept if the images are clearly more alike by it, since where patterns repeat much fits a
 little, and if it is no thing that moved by itself: somebody who walked would be torn from what is behind. It
-is none if it moves as what stands still does, seen by a camera that moved (epipolar.py), or if it is a large
+did not if it moves as what stands still does, seen by a camera that moved (epipolar.py), or if it is a large
 part of what they show and leads back from one image to the other: what fits by chance fits one way. Of what
 is kept, a part that explains less than no search did is dropped: a chair is found, and beside it bars of a
 banister are taken for the next ones.
@@ -69,7 +69,7 @@ class Decision:
 def believed(plain: Candidate, found: Candidate, gap: float, wraps: bool) -> npt.NDArray[np.float32]:
     """(2, height, width): the misfit of `found`, no less than that of `plain` where it does not lead back.
 
-    gap     px between start and return from which on it does not.
+    gap     px of the level between start and return from which on it does not.
     wraps   whether the last column is beside the first one.
     """
     ways, height, width = found.misfit.shape

@@ -2,10 +2,11 @@
 
 A near thing shifts by more than what is behind it, and goes from its place in one photo to that in the
 other within their overlap: it is bent, by a strain (transition.py) of what it shifts by more over the
-overlap's width. Where that is much it looks bent, and flow is of no help. But if it ends within the overlap,
-one of the photos shows all of it that the other one does: consistency.py fills its place with the flow of
-what is behind, and seam.py takes it from that photo, whole. What crosses the overlap from one photo's border
-to the other's is left alone: taken from either, it would break at a border.
+overlap's width. Transitions go round it, but not where it is too near to a photo's border for that: there it
+looks bent, and flow is of no help. But if it ends within the overlap, one of the photos shows all of it that
+the other one does: consistency.py fills its place with the flow of what is behind, and seam.py takes it from
+that photo, whole. What crosses the overlap from one photo's border to the other's is left alone: taken from
+either, it would break at a border.
 """
 
 from __future__ import annotations

@@ -40,12 +40,13 @@ class SearchParameters:
     focus: float = 4.0  # e-folds by which a pixel counts less there, for a difference of 1 from the middle
     # what a search found is dropped on a level where more than this share of the misfit without it remains,
     # and kept if no more than this remains at last, and it leads elsewhere by so many px (of the level on
-    # which that is decided) in so large a share of the pixels that both images show
+    # which that is decided) in so large a share of the pixels that both images show; for both, what ends so
+    # many px of its level from where it started, there and back, explains no more than flow without a search
     hope: float = 0.95
     gain: float = 0.82
     apart: float = 1.5
     widely: float = 0.25
-    gap: float = 2.0  # where its return is this far from its start, it explains nothing more for this
+    gap: float = 2.0
     # or if no more than this remains where it leads elsewhere, and motion there is that of what stands still,
     # as gradients of h of at least this tell
     gain_apart: float = 0.75

@@ -30,8 +30,8 @@ class Settings:
                         overlap is cut along the seam that shows least.
     flow_quality        how much time the flow may take: "fast", "normal" or "best".
     large_motion        search for motion of up to a tenth of the canvas's width, for very near things:
-                        "auto" keeps what makes at least a quarter of an overlap clearly more alike,
-                        or what moves as things do that stand still when the camera moves; "on" all
+                        "auto" keeps what makes at least a quarter of an overlap clearly more alike, both
+                        ways, or what moves as things do that stand still when the camera moves; "on" all
                         that is found; what repeats (grids, tiles) and who walks may mislead it. "off":
                         no search.
     exposure            match exposure and colour of the layers where they overlap, spread it smoothly, and
@@ -42,8 +42,8 @@ class Settings:
                         how the camera moved.
     foreground          and near things that would be bent, where one layer shows all of them.
     transition_strain   by how much changing over from one layer's geometry to the next may stretch it, where
-                        the overlap is wide enough; transitions go where that takes least room. 0..1, 0:
-                        across the whole overlap, as published.
+                        the overlap is wide enough; transitions go round what shifts by much. 0..1, 0:
+                        nothing is looked for, and they take the whole overlap, as published.
     guides              let control points lead the flow where it goes astray.
     interpolation       how layers are sampled; "nearest" is for comparison with the paper's own code.
     working_pixels      upper bound of the pixels of the working canvas (flow, coefficients, colour), at least

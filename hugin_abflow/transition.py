@@ -8,14 +8,15 @@ A retoucher would lead the transition around them. So the coefficients are those
     sum_k  integral  (P^2 + P0^2) |grad w_k|^2  +  (2 strain)^2 w_k (1 - w_k),
 
 of all that sum to 1 and are 0 where layer k is not. The first term is the strain; the second, of a double
-well, is the price of each place that no photo shows as it is. Together they ask along a transition for about
-the parallax that it meets, so that it runs where there is little, and across it for a width of
-pi P / (2 strain), at which the strain is what is wanted, where the overlap has room for it: a phase field
-(Modica and Mortola 1977; with this well Blowey and Elliott 1991). Near things that end within an overlap are
-left to one photo. Where layers cannot be brought to one brightness there is no well, and transitions are as
-wide as the overlap.
+well, is the price of each place that no photo shows as it is. Together a transition costs about the parallax
+that it meets along its length, so that it runs where there is little, and is pi P / (2 strain) wide, at which
+the strain is what is wanted, where the overlap has room for it: a phase field (Modica and Mortola 1977; with
+this well Blowey and Elliott 1991). Near things that end within an overlap are left to one photo. Where
+layers cannot be brought to one brightness there is no well, and transitions of layers that reach beyond each
+other are as wide as the overlap. Layers of one and the same mask share it evenly.
 
-It is relaxed on a pyramid of cells, from a grid on which it has one least, without the well, to the finest.
+It is relaxed on a pyramid of cells. On the coarsest the well is added by and by, since there is one least
+without it; the finer ones start from what the coarser ones have found.
 """
 
 from __future__ import annotations
@@ -45,7 +46,7 @@ _SIGMA = 1.0
 _SWEEPS, _FIRST_SWEEPS, _DEEPER_SWEEPS = 20, 100, 30
 _OVER = 1.8
 _DEPTHS = (0.25, 0.5, 0.75)
-# No cell of a sphere is narrower than this part of one at the equator.
+# Cells of a sphere are reckoned with as no narrower than this part of one at the equator.
 _NARROWEST = 0.02
 
 Mask = npt.NDArray[np.bool_]
@@ -75,9 +76,7 @@ class Shares:
         first = np.concatenate([[0], np.cumsum(counts)]).astype(np.int32)
         owner = np.nonzero(cover.reshape(len(cover), -1).T)[1].astype(np.int32)
         share = np.repeat(1 / np.maximum(counts, 1), counts).astype(np.float32)
-        return cls(
-            cells, *(device.upload(one if one.size else one.repeat(1)) for one in (first, owner, share))
-        )
+        return cls(cells, *(device.upload(one) for one in (first, owner, share)))
 
 
 def settle(

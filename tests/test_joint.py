@@ -250,8 +250,8 @@ SHIFTED = {
     ("cylinder", True, 0.0): (8, 0.8),
     ("sphere", False, 0.0): (4, 0.1),
     ("sphere", True, 0.0): (4, 0.6),
-    ("cylinder", True, 0.07): (40, 0.9),
-    ("sphere", True, 0.07): (40, 0.9),
+    ("cylinder", True, 0.07): (25, 0.9),
+    ("sphere", True, 0.07): (25, 0.9),
 }
 
 

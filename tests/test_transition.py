@@ -101,7 +101,7 @@ def random_system(seed: int, cover: np.ndarray, cells: Grid) -> tuple[np.ndarray
     random = np.random.default_rng(seed)
     price = 1 + 20 * random.random(cells.shape)
     east, south = transition.links(price, cover.any(0), cells)
-    return east, south, (3 * random.random(cells.shape)).astype(np.float32)
+    return east, south, (60 * random.random(cells.shape)).astype(np.float32)
 
 
 @pytest.mark.parametrize("name", list(GRIDS))
@@ -186,6 +186,32 @@ def test_links_of_a_sphere_are_those_of_its_surface() -> None:
     between = math.pi / 2 - (np.arange(19) + 1) * math.pi / 20
     assert south[:-1] == pytest.approx(np.repeat(2 * np.cos(between)[:, None], 40, 1), rel=1e-5)
     assert not south[-1].any()
+
+
+def test_wells_are_as_large_as_their_cells() -> None:
+    """On a plane all alike, on a sphere less towards the poles, and none where layers are unlike."""
+    unlike = np.zeros((2, 4), np.float32)
+    unlike[1, 2] = 1
+    flat = transition.wells(plane(8, 4), plane(80, 40), 0.5, unlike)
+    assert flat[:2] == pytest.approx(100) and flat[2:, :4] == pytest.approx(100)
+    assert not flat[2:, 4:6].any() and flat[2:, 6:] == pytest.approx(100)
+    curved = transition.wells(sphere(40, 20), sphere(400, 200), 0.5, np.zeros((1, 1), np.float32))
+    latitudes = math.pi / 2 - (np.arange(20) + 0.5) * math.pi / 20
+    assert curved == pytest.approx(np.repeat(100 * np.cos(latitudes)[:, None], 40, 1), rel=1e-5)
+
+
+@pytest.mark.parametrize("width", range(31, 41))
+def test_columns_that_wrap_can_be_parted_by_colour(width: int) -> None:
+    """Else the first and the last one of a row, of one colour, would read each other."""
+    assert transition._cells(plane(width, 20, wraps=True), 4).width % 2 == 0
+    assert transition._cells(plane(width, 20), 4) == plane(width, 20).coarser(4)
+
+
+def test_cells_that_no_layer_covers_whole_are_shared_by_those_that_reach_into_them() -> None:
+    masks = np.zeros((2, 8, 16), bool)
+    masks[0, :, :6], masks[1, :, 6:] = True, True
+    (cover,) = transition._covers(Masks(plane(16, 8), (), masks), [plane(4, 2)])
+    assert cover[:, 0].tolist() == [[True, True, False, False], [False, True, True, True]]
 
 
 def test_links_lead_along_the_union_alone() -> None:
@@ -291,12 +317,12 @@ def test_a_near_thing_within_the_overlap_is_one_photo_s(device: Device) -> None:
     assert min(first.max(), (1 - first).max()) < 0.03
 
 
-def test_what_crosses_the_overlap_bends_no_more_than_before(device: Device) -> None:
+def test_what_crosses_the_overlap_bends_little_more_than_wanted(device: Device) -> None:
     shift = np.zeros(WIDE.shape)
     shift[30:] = 15
     made = scene(device, WIDE, left_and_right(WIDE, 20), shift)
     before = np.diff(made[1][1].blend.get()[34:], axis=1).max()
-    assert np.diff(settled(device, WIDE, made)[1][34:], axis=1).max() < 1.6 * max(STRAIN / 15, before)
+    assert before < np.diff(settled(device, WIDE, made)[1][34:], axis=1).max() < 1.4 * STRAIN / 15
 
 
 def test_three_layers_share_what_all_of_them_cover(device: Device) -> None:
