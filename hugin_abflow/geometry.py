@@ -86,25 +86,6 @@ def fields(
     return result
 
 
-def displacements(
-    device: Device,
-    layers: Sequence[WorkingLayer],
-    coefficients: Sequence[Coefficients],
-    flows: Sequence[PairFlow],
-    grid: Grid,
-    settings: Settings,
-    every: int = 1,
-) -> list[Buffer]:
-    """The displacement alone, as in `fields`; the fourth component is 0.
-
-    every   columns and rows of a layer's box from one to the next: (height / every, width / every, 4).
-    """
-    return [
-        _displacement(device, index, layers, coefficients, flows, grid, settings, every)
-        for index in range(len(layers))
-    ]
-
-
 def _displacement(
     device: Device,
     index: int,
@@ -113,15 +94,14 @@ def _displacement(
     flows: Sequence[PairFlow],
     grid: Grid,
     settings: Settings,
-    every: int = 1,
 ) -> Buffer:
-    """One layer's of `displacements`."""
+    """One layer's field, in which the fourth component is 0."""
     layer = layers[index]
-    size = tuple(-(-n // every) for n in layer.box[2:])
-    four_at_a_time = (-(-size[0] // 4), size[1])
+    width, height = layer.box[2:]
+    four_at_a_time = (-(-width // 4), height)
     guess: Buffer | None = None
     for _ in range(1 + settings.fixed_point_steps):
-        field = device.zeros((*size[::-1], 4))
+        field = device.zeros((height, width, 4))
         for pair in flows:
             if index not in (pair.a, pair.b):
                 continue
@@ -131,8 +111,8 @@ def _displacement(
             chart_grid = (pair.chart.width, pair.chart.height, int(pair.chart.wraps), 0)
             device.run(
                 "geometry", "geometry_add", four_at_a_time, coefficients[other].blend, layers[other].box,
-                layer.pixels, layer.box, every, grid.border, grid.lens, flow, back, chart_grid,
-                pair.chart.transform, start, guess or field, field, size,
+                layer.pixels, layer.box, grid.border, grid.lens, flow, back, chart_grid,
+                pair.chart.transform, start, guess or field, field,
             )  # fmt: skip
         guess = field
     return field

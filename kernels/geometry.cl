@@ -94,30 +94,28 @@ static inline points4 geometry_ways(points4 q, __global const float2 *flow, __gl
 __kernel void geometry_add(__global const float *blend_j,   /* (box_j.w, box_j.z) */
                            int4 box_j,                      /* place on the working grid */
                            __global const float4 *layer_k,  /* (box_k.w, box_k.z) r, g, b, valid */
-                           int4 box_k,                      /* place on the working grid */
-                           int every,                       /* columns and rows from one to the next */
+                           int4 box_k,                      /* place on the working grid; run size, its columns
+                                                               by GEOMETRY_CHUNK, rounded up */
                            int4 border, float4 lens,        /* working grid */
                            __global const float2 *flow,     /* chart grid, px: F_jk */
                            __global const float2 *back,     /* chart grid, px: F_kj */
                            int4 grid, float16 chart,        /* chart */
                            int from,                        /* GEOMETRY_... */
-                           __global const float4 *guess,    /* (size.y, size.x) displacement */
-                           __global float4 *field,          /* (size.y, size.x) displacement is added */
-                           int2 size)                       /* box_k.zw / every, rounded up; run size: that,
-                                                               its columns by GEOMETRY_CHUNK, rounded up */
+                           __global const float4 *guess,    /* (box_k.w, box_k.z) displacement */
+                           __global float4 *field)          /* (box_k.w, box_k.z) displacement is added */
 {
-    const int i = get_global_id(0) * GEOMETRY_CHUNK, j = get_global_id(1);
-    if (i >= size.x || j >= size.y)
+    const int x = get_global_id(0) * GEOMETRY_CHUNK, y = get_global_id(1);
+    if (x >= box_k.z || y >= box_k.w)
         return;
-    const int y = j * every, at = j * size.x + i, last = size.x - 1 - i;
+    const int at = y * box_k.z + x, last = box_k.z - 1 - x;
     float share[GEOMETRY_CHUNK], most = 0.0f;
     for (int k = 0; k < GEOMETRY_CHUNK; ++k) {
-        share[k] = k <= last ? geometry_share(blend_j, box_j, layer_k, box_k, (i + k) * every, y) : 0.0f;
+        share[k] = k <= last ? geometry_share(blend_j, box_j, layer_k, box_k, x + k, y) : 0.0f;
         most = GREATEST(most, share[k]);
     }
     if (most == 0.0f)
         return;
-    const float4 px = convert_float4((i + (int4)(0, 1, 2, 3)) * every + box_k.x) + 0.5f;
+    const float4 px = convert_float4(x + (int4)(0, 1, 2, 3) + box_k.x) + 0.5f;
     const float4 py = (float4)(y + box_k.y + 0.5f);
     points4 q = lens.y == 0.0f ? (points4){px, py, (float4)(0.0f)} : canvas_sphere4(px, py, lens);
     if (from == GEOMETRY_GUESSED) {

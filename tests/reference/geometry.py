@@ -49,7 +49,6 @@ def geometry_add(
     box_j: Sequence[int],
     layer_k: Array,
     box_k: Sequence[int],
-    every: int,
     lens: Numbers,
     flow: Array,
     back: Array,
@@ -59,9 +58,9 @@ def geometry_add(
     guess: Array,
     field: Array,
 ) -> Array:
-    """Field of layer k at every n-th column and row, with the part of layer j added to its displacement."""
-    x, y = (at[::every, ::every] for at in pixels(box_k[2], box_k[3], box_k[0], box_k[1]))
-    weight = np.where(layer_k[::every, ::every, 3] != 0, take(blend_j, box_j, x, y), 0.0)
+    """Field of layer k with the part of layer j added to its displacement."""
+    x, y = pixels(box_k[2], box_k[3], box_k[0], box_k[1])
+    weight = np.where(layer_k[..., 3] != 0, take(blend_j, box_j, x, y), 0.0)
     weight[weight < NEGLIGIBLE] = 0
     point = canvas_point(x + 0.5, y + 0.5, lens)
     if start == GUESSED:
