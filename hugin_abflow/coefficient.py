@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -19,6 +20,8 @@ from hugin_abflow.working import Grid, WorkingLayer
 
 # Distances are smooth: a mask grid of this many pixels is fine enough, and four times faster.
 _FINE_PIXELS = 600_000
+
+_Kind = TypeVar("_Kind", bound=np.generic)
 
 
 @dataclass(frozen=True)
@@ -47,14 +50,14 @@ class Masks:
         return Masks(self.grid, tuple(self.buffers[i] for i in indices), self.host[list(indices)])
 
 
-def on_cells(masks_: npt.NDArray[np.bool_], cells: Grid, rule: np.ufunc) -> npt.NDArray[np.bool_]:
-    """Masks (n, height, width) of any finer grid over the region of `cells`, per cell: `np.logical_or` for
-    cells that they reach into, `np.logical_and` for those that they cover whole.
+def on_cells(values: npt.NDArray[_Kind], cells: Grid, rule: np.ufunc) -> npt.NDArray[_Kind]:
+    """What any finer grid over the region of `cells` has, (n, height, width), per cell. Of masks
+    `np.logical_or` tells cells that they reach into, `np.logical_and` those that they cover whole.
     """
     for axis, count in ((1, cells.height), (2, cells.width)):
-        starts = np.arange(count) * masks_.shape[axis] // count
-        masks_ = rule.reduceat(masks_, starts, axis)
-    return masks_
+        starts = np.arange(count) * values.shape[axis] // count
+        values = rule.reduceat(values, starts, axis)
+    return values
 
 
 def masks(device: Device, layers: Sequence[WorkingLayer], grid: Grid) -> Masks:

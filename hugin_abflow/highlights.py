@@ -20,9 +20,10 @@ import numpy.typing as npt
 from hugin_abflow.coefficient import Masks, on_cells
 from hugin_abflow.opencl import Buffer, Device
 from hugin_abflow.settings import Settings
-from hugin_abflow.transition import transition_grid
 from hugin_abflow.working import Grid, WorkingLayer
 
+# Working pixels per cell.
+_CELL = 16
 # A pixel's brightest channel, of white, from which on it may be clipped, and where it surely is.
 _NEARLY, _SURELY = 0.9, 0.98
 # The softmax's own weights span e^10: with as much, layers are mixed next to the border of the darker one.
@@ -30,15 +31,20 @@ _NEARLY, _SURELY = 0.9, 0.98
 _STRENGTH = 12.0
 
 
+def highlights_grid(grid: Grid) -> Grid:
+    """The coarse grid, over the region of the working grid, on which it is told what is clipped."""
+    return grid.coarser(_CELL)
+
+
 def excess(
     device: Device, layers: Sequence[WorkingLayer], masks: Masks, grid: Grid, settings: Settings
 ) -> npt.NDArray[np.float32]:
-    """e_k of all layers, float32 (layers, height, width) on the transition grid, 0..1.
+    """e_k of all layers, float32 (layers, height, width) on `highlights_grid`, 0..1.
 
     0 where a layer is not, where it is alone, and where all are clipped alike; everywhere for floats, which
     are never clipped, and with `settings.highlights` off.
     """
-    cells = transition_grid(grid)
+    cells = highlights_grid(grid)
     clipped = np.zeros((len(layers), *cells.shape), np.float32)
     if not settings.highlights or layers[0].layer.dtype.kind != "u":
         return clipped
@@ -62,7 +68,7 @@ def give_way(
     grid: Grid,
 ) -> None:
     """Scale the colour weights of fields (geometry.py), in place; clipped: `excess`."""
-    cells = transition_grid(grid)
+    cells = highlights_grid(grid)
     for layer, field, share in zip(layers, fields, clipped, strict=True):
         if share.any():
             device.run(

@@ -28,15 +28,14 @@ import numpy as np
 import numpy.typing as npt
 import scipy
 
+from hugin_abflow.cells import Mask
 from hugin_abflow.coefficient import Coefficients, Masks, on_cells
 from hugin_abflow.geometry import PairFlow
 from hugin_abflow.opencl import Buffer, Device
 from hugin_abflow.settings import Settings
 from hugin_abflow.working import Grid, WorkingLayer
 
-# Working pixels per cell of the grid of what differs in brightness.
-_CELL = 16
-# Of the grids on which transitions are found, from the coarsest to the finest.
+# Working pixels per cell of the grids on which transitions are found, from the coarsest to the finest.
 _CELLS = (32, 16, 8, 4)
 # Working pixels of parallax that are always reckoned with: flow is hardly truer, a transition no narrower.
 _LEAST_PARALLAX = 2.0
@@ -49,13 +48,7 @@ _DEPTHS = (0.25, 0.5, 0.75)
 # Cells of a sphere are reckoned with as no narrower than this part of one at the equator.
 _NARROWEST = 0.02
 
-Mask = npt.NDArray[np.bool_]
 Values = npt.NDArray[np.float32]
-
-
-def transition_grid(grid: Grid) -> Grid:
-    """The coarse grid, over the region of the working grid, of where layers are not alike."""
-    return grid.coarser(_CELL)
 
 
 @dataclass(frozen=True)
@@ -91,8 +84,8 @@ def settle(
 ) -> None:
     """Make coefficients those of least strain, in place. Without flow, or with a strain of 0, they stay.
 
-    unlike: (height, width) on the transition grid, from 0 to 1, where layers cannot be brought to one
-    brightness.
+    unlike: (height, width) on any coarse grid over the same region, from 0 to 1, where layers cannot be
+    brought to one brightness.
     """
     if settings.transition_strain == 0 or not flows:
         return
@@ -101,20 +94,20 @@ def settle(
     price = _price(device, flows, masks, grid, grids[-1], covers[-1])
     shares: Shares | None = None
     for cells, cover in zip(grids, covers, strict=True):
-        equal = Shares.equal(device, cells, cover)
+        finer = Shares.equal(device, cells, cover)
         east, south = links(_means(price, cells), cover.max(0), cells)
         well = wells(cells, grid, settings.transition_strain, unlike)
         system = tuple(device.upload(one) for one in (east, south, well))
         if shares is None:
-            relax(device, equal, system, 0.0, _FIRST_SWEEPS)
+            relax(device, finer, system, 0.0, _FIRST_SWEEPS)
             for depth in _DEPTHS:
-                relax(device, equal, system, depth, _DEEPER_SWEEPS)
+                relax(device, finer, system, depth, _DEEPER_SWEEPS)
         else:
             device.run(
                 "transition", "transition_refine", cells.border[:2], shares.share, shares.first, shares.owner,
-                shares.cells.border, equal.first, equal.owner, cells.border, equal.share,
+                shares.cells.border, finer.first, finer.owner, cells.border, finer.share,
             )  # fmt: skip
-        shares = equal
+        shares = finer
         relax(device, shares, system, 1.0, _SWEEPS)
     assert shares is not None
     _expand(device, layers, coefficients, shares, grid)
@@ -160,10 +153,9 @@ def _price(
 
 def _means(values: npt.NDArray[np.float64], cells: Grid) -> npt.NDArray[np.float64]:
     """Means of a finer grid's values in cells."""
-    sums = np.stack([values, np.ones_like(values)])
-    for axis, count in ((1, cells.height), (2, cells.width)):
-        sums = np.add.reduceat(sums, np.arange(count) * sums.shape[axis] // count, axis)
-    return np.asarray(sums[0] / sums[1])
+    sums, counts = on_cells(np.stack([values, np.ones_like(values)]), cells, np.add)
+    means: npt.NDArray[np.float64] = sums / counts
+    return means
 
 
 def links(price: npt.NDArray[np.float64], union: Mask, cells: Grid) -> tuple[Values, Values]:
@@ -175,7 +167,7 @@ def links(price: npt.NDArray[np.float64], union: Mask, cells: Grid) -> tuple[Val
     rows = np.arange(cells.height)
     if cells.lens[1]:
         _, across, latitude, down = cells.lens
-        heights = down / (across * np.maximum(np.cos(latitude - (rows + 0.5) * down), _NARROWEST))
+        heights = down / (across * _narrowing(cells))
         widths = across / down * np.maximum(np.cos(latitude - (rows + 1) * down), 0.0)
     else:
         shape = cells.region.height / cells.height * cells.width / cells.region.width
@@ -197,14 +189,19 @@ def wells(cells: Grid, grid: Grid, strain: float, unlike: Values) -> Values:
     unlike.
     """
     rows, columns = np.arange(cells.height), np.arange(cells.width)
-    area = np.full(cells.height, grid.width / cells.width * grid.height / cells.height)
-    if cells.lens[1]:
-        latitudes = cells.lens[2] - (rows + 0.5) * cells.lens[3]
-        area *= np.maximum(np.cos(latitudes), _NARROWEST)
+    area = grid.width / cells.width * grid.height / cells.height * _narrowing(cells)
     height, width = unlike.shape
     alike = 1 - unlike[rows * height // cells.height][:, columns * width // cells.width]
     prices: Values = ((2 * strain) ** 2 * area[:, None] * alike).astype(np.float32)
     return prices
+
+
+def _narrowing(cells: Grid) -> npt.NDArray[np.float64]:
+    """How wide cells are, by row, beside one at the equator; 1 on a plane, where `lens` is 0."""
+    _, _, latitude, down = cells.lens
+    latitudes = latitude - (np.arange(cells.height) + 0.5) * down
+    widths: npt.NDArray[np.float64] = np.maximum(np.cos(latitudes), _NARROWEST)
+    return widths
 
 
 def relax(device: Device, shares: Shares, system: tuple[Buffer, ...], depth: float, sweeps: int) -> None:

@@ -4,7 +4,7 @@
    of what the layer shows white. 0 where the layer is not. */
 __kernel void highlights_share(__global const float4 *layer, /* (box.w, box.z) r, g, b, valid */
                                int4 box,                     /* place on the working grid */
-                               int4 border, int4 cells,      /* working grid; transition grid, run size */
+                               int4 border, int4 cells,      /* working grid; highlights grid, run size */
                                float4 white,                 /* what the layer shows white, r, g, b */
                                float nearly, float surely,   /* of that, in the brightest channel */
                                __global float *share)        /* (cells.y, cells.x) */
@@ -32,7 +32,7 @@ __kernel void highlights_share(__global const float4 *layer, /* (box.w, box.z) r
 __kernel void highlights_yield(__global float4 *field,       /* (box.w, box.z) of the working grid; w is scaled */
                                int4 box, int4 border,        /* place on the working grid, run size; that grid */
                                __global const float *clipped, /* (cells.y, cells.x), 0..1 */
-                               int4 cells,                   /* transition grid, over the same region */
+                               int4 cells,                   /* highlights grid, over the same region */
                                float strength)
 {
     const int x = get_global_id(0), y = get_global_id(1);

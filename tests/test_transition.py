@@ -12,7 +12,7 @@ from reference import transition as twin
 from scipy import ndimage
 from tolerances import POSITION, SUM, TRIGONOMETRY, assert_close
 
-from hugin_abflow import transition
+from hugin_abflow import highlights, transition
 from hugin_abflow.chart import pair_chart
 from hugin_abflow.coefficient import Coefficients, Masks
 from hugin_abflow.geometry import PairFlow
@@ -263,7 +263,7 @@ def settled(
     device: Device, grid: Grid, made: Scene, settings: Settings | None = None, unlike: float = 0.0
 ) -> list[np.ndarray]:
     layers, coefficients, flows, masks = made
-    everywhere = np.full(transition.transition_grid(grid).shape, unlike, np.float32)
+    everywhere = np.full(highlights.highlights_grid(grid).shape, unlike, np.float32)
     transition.settle(device, layers, coefficients, flows, masks, grid, settings or Settings(), everywhere)
     return [one.blend.get() for one in coefficients]
 
