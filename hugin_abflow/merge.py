@@ -244,7 +244,7 @@ def _check_early(plan: Plan, settings: Settings, output: Path | str | None, comp
         refuse_input(target, [plan.file, *plan.photos])
     check_target(target, compression)
     if settings.device is not None:
-        choose(settings.device)
+        choose(settings.device, settings.threads)
 
 
 def refuse_input(output: Path, inputs: Iterable[Path]) -> None:

@@ -42,6 +42,10 @@ _INSTALL = {
 _HIDING = ("OCL_ICD_VENDORS", "POCL_DEVICES", "POCL_CACHE_DIR")
 
 
+# Whether drivers have read the environment; they do so once.
+_loaded = threading.Event()
+
+
 @dataclass(frozen=True)
 class DeviceInfo:
     """One line of ``--list-devices``. memory: bytes; kind: "GPU", "CPU" or "other"."""
@@ -73,13 +77,16 @@ def _kind(device: cl.Device) -> str:
     return "CPU" if device.type & cl.device_type.CPU else "other"
 
 
-def _devices() -> list[cl.Device]:
-    """All devices of all platforms; `DeviceError` where there is none."""
+def _devices(threads: int = 0) -> list[cl.Device]:
+    """All devices of all platforms; `DeviceError` where there is none. threads: as of `Device`."""
     pocl.find_cache()
+    if not _loaded.is_set():
+        pocl.use_cores(threads)
     try:
         platforms = cl.get_platforms()
     except cl.Error:
         platforms = []
+    _loaded.set()
     found = []
     for platform in platforms:
         try:
@@ -115,9 +122,12 @@ def list_devices() -> list[DeviceInfo]:
     ]
 
 
-def choose(wanted: str | None) -> cl.Device:
-    """The device that --device means; None: the one used by default. Raises `DeviceError`: there is none."""
-    found = _devices()
+def choose(wanted: str | None, threads: int = 0) -> cl.Device:
+    """The device that --device means; None: the one used by default. Raises `DeviceError`: there is none.
+
+    threads         as of `Device`; drivers may ask for it only once.
+    """
+    found = _devices(threads)
     if wanted is None:
         return max(found, key=_speed)
     if wanted.isdecimal():
@@ -279,7 +289,7 @@ class Device:
     """
 
     def __init__(self, wanted: str | None = None, threads: int = 0) -> None:
-        chosen = choose(wanted)
+        chosen = choose(wanted, threads)
         pocl.name_processor(chosen.version, chosen.int_ptr)
         self.device = _part(chosen, threads)
         self.context = cl.Context([self.device])

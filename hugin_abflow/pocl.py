@@ -9,6 +9,9 @@ compiler does not end. Either device is given the name of another processor.
 **A home that cannot be written**, as in containers, and of services. PoCL keeps what it compiled there, and
 offers no device if it cannot; pyopencl fails as well. On a full disk, or one that no program may be run from,
 it ends the process. They are given a folder among temporary files.
+
+**Fewer cores.** PoCL 3.0 says that a part of a processor (a sub-device) has as many as were asked for, and
+calculates on all of them; with TBB, newer ones offer no parts. It is told by variables that it reads once.
 """
 
 from __future__ import annotations
@@ -43,6 +46,9 @@ _CACHES = ("pocl/kcache", "pytools")
 # Where temporary files may be, beside where TMPDIR says.
 _PLACES = ("/tmp", "/var/tmp")
 
+# What tells PoCL how many cores it may use: since 5.0, and before.
+_CORES = ("POCL_CPU_MAX_CU_COUNT", "POCL_MAX_PTHREAD_COUNT")
+
 # Compiled kernels take several MiB for each depth and number of channels.
 _LEAST_ROOM = 32 << 20
 
@@ -75,6 +81,15 @@ def find_cache() -> None:
         "write, with %d MiB of room, on a disk from which programs may be run",
         _LEAST_ROOM >> 20,
     )
+
+
+def use_cores(count: int) -> None:
+    """Have PoCL use so many cores, in the whole process, and no more than there are; 0: all.
+
+    To be called before OpenCL's drivers are loaded. What the environment says already counts.
+    """
+    if count and not any(name in os.environ for name in _CORES):
+        os.environ.update(dict.fromkeys(_CORES, str(min(count, os.cpu_count() or count))))
 
 
 def _holds_programs(folder: Path) -> bool:

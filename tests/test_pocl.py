@@ -13,7 +13,7 @@ from types import SimpleNamespace
 import pytest
 
 from hugin_abflow import pocl
-from hugin_abflow.opencl import Device
+from hugin_abflow.opencl import Device, choose
 
 HERE = sys.platform == "linux" and platform.machine() == "x86_64"
 only_linux = pytest.mark.skipif(sys.platform != "linux", reason="caches are elsewhere on other systems")
@@ -152,6 +152,43 @@ def test_a_processor_with_another_name_builds(guess: str, device: Device, tmp_pa
     )
     assert done.returncode == 0, done.stderr
     assert "blend_band" in done.stdout
+
+
+_CORES_RUN = """
+import sys
+from hugin_abflow.opencl import Device, choose
+
+used = [Device(threads=int(threads)) for threads in sys.argv[1:]]
+print(choose(None).platform.name, choose(None).max_compute_units, used[-1].device.max_compute_units)
+"""
+
+
+@pytest.mark.parametrize(
+    ("asked", "said", "whole", "part"),
+    [
+        ((1,), {}, 1, 1),
+        ((0, 1), {}, None, 1),  # too late for PoCL to hear: a part of the device, as far as it goes
+        ((0,), {"POCL_MAX_PTHREAD_COUNT": "1"}, 1, 1),
+        ((1 << 10,), {}, None, None),
+    ],
+)
+def test_pocl_itself_uses_as_many_cores_as_it_may(
+    device: Device, asked: tuple[int, ...], said: dict[str, str], whole: int | None, part: int | None
+) -> None:
+    """The device that it offers has no more: its parts calculate on all cores of it. None: all."""
+    if "PoCL" not in device.device.version:
+        pytest.skip("the device is none of PoCL's")
+    environment = {name: value for name, value in os.environ.items() if name not in pocl._CORES}
+    done = subprocess.run(
+        [sys.executable, "-c", _CORES_RUN, *map(str, asked)],
+        timeout=120,
+        env=environment | said,
+        capture_output=True,
+        text=True,
+    )
+    assert done.returncode == 0, done.stderr
+    every = choose(None).max_compute_units
+    assert done.stdout.split()[-2:] == [str(whole or every), str(part or every)]
 
 
 @pytest.fixture
