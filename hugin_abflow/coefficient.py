@@ -78,22 +78,39 @@ def masks(device: Device, layers: Sequence[WorkingLayer], grid: Grid) -> Masks:
     return Masks(mask_grid, tuple(buffers), np.stack([b.get() for b in buffers]).astype(bool))
 
 
-def _table(grid: Grid) -> npt.NDArray[np.float32]:
-    """Parts of the distance between two pixels of the mask grid, as coefficient.cl takes them."""
+def _table(grid: Grid, within: float = math.inf) -> npt.NDArray[np.float32]:
+    """Parts of the distance between two pixels of the mask grid, and how far seeds are looked for, as
+    coefficient.cl takes them. within: the distance that matters, in mask px, on the sphere in radians; one pixel
+    more is read to interpolate.
+    """
     rows, columns = np.arange(grid.height), np.arange(grid.width)
     if not grid.lens[1]:
-        return np.concatenate([rows, columns, np.ones(grid.height)]).astype(np.float32)
+        parts = [rows, columns, np.ones(grid.height), np.full(grid.height, within + 1)]
+        return np.concatenate(parts).astype(np.float32)
     _, dlon, lat, dlat = grid.lens
-    latitudes = lat - (rows + 0.5) * dlat
-    parts = [np.sin(rows * dlat / 2), np.sin(columns * dlon / 2), np.cos(latitudes)]
+    latitudes, within = lat - (rows + 0.5) * dlat, within + dlat
+    # so far they reach to the side from the row nearest to a pole that they come past
+    nearest = np.cos(np.minimum(np.abs(latitudes) + within, math.pi / 2))
+    sines = math.sin(min(within, math.pi / 2)) / np.maximum(nearest, 1e-9)
+    aside = np.where(sines < 1, np.arcsin(np.minimum(sines, 1)) / dlon, math.inf)
+    reach = np.maximum(aside, within / dlat)
+    parts = [np.sin(rows * dlat / 2), np.sin(columns * dlon / 2), np.cos(latitudes), reach]
     return np.concatenate(parts).astype(np.float32)
 
 
-def distance(device: Device, masks_: Masks, index: int, cover: Buffer, working: Grid) -> Buffer:
-    """D_k of layer `index` in working pixels, float32 on the mask grid; `cover` is the union's mask."""
+def distance(
+    device: Device, masks_: Masks, index: int, cover: Buffer, working: Grid, within: float = math.inf
+) -> Buffer:
+    """D_k of layer `index` in working pixels, float32 on the mask grid; `cover` is the union's mask.
+
+    within          working px up to which distances matter; longer ones may be told as longer than they are,
+                    and are found faster.
+    """
     grid = masks_.grid
     size = grid.border[:2]
-    table = device.upload(_table(grid))
+    spherical = working.lens[1] > 0
+    unit = 1 / working.lens[1] if spherical else working.width / grid.width
+    table = device.upload(_table(grid, within / unit))
     seed, flooded = (device.empty(grid.shape, np.int32) for _ in range(2))
     mask = masks_.buffers[index]
     device.run("coefficient", "coefficient_seed", size, mask, cover, grid.border, seed)
@@ -105,8 +122,6 @@ def distance(device: Device, masks_: Masks, index: int, cover: Buffer, working: 
     for jump in [*steps, 2, 1]:
         device.run("coefficient", "coefficient_flood", size, seed, grid.border, table, jump, flooded)
         seed, flooded = flooded, seed
-    spherical = working.lens[1] > 0
-    unit = 1 / working.lens[1] if spherical else working.width / grid.width
     furthest = math.pi / working.lens[1] if spherical else math.hypot(*working.shape)
     result = device.empty(grid.shape)
     device.run(
@@ -117,16 +132,21 @@ def distance(device: Device, masks_: Masks, index: int, cover: Buffer, working: 
 
 
 def coefficients(
-    device: Device, layers: Sequence[WorkingLayer], masks_: Masks, grid: Grid, settings: Settings
+    device: Device,
+    layers: Sequence[WorkingLayer],
+    masks_: Masks,
+    grid: Grid,
+    settings: Settings,
+    within: float = math.inf,
 ) -> list[Coefficients]:
-    """The blend coefficients of all layers."""
+    """The blend coefficients of all layers. within: as of `distance`; at least the settings' feather."""
     cover = device.upload(np.logical_or.reduce(masks_.host, 0), np.uint8)
     total = device.zeros(grid.shape)
     ratio = (masks_.grid.width / grid.width, masks_.grid.height / grid.height)
     expanded = []
     for index, layer in enumerate(layers):
         blend = device.empty(layer.pixels.shape[:2])
-        on_masks = distance(device, masks_, index, cover, grid)
+        on_masks = distance(device, masks_, index, cover, grid, within)
         device.run(
             "coefficient", "coefficient_expand", layer.box[2:], on_masks, masks_.grid.border, ratio,
             layer.pixels, layer.box, grid.border, blend, total,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 import logging
+import math
 import threading
 from collections import Counter
 from collections.abc import Callable, Generator, Iterator, Sequence
@@ -220,9 +221,12 @@ def _align(
     """
     regions: npt.NDArray[np.bool_] | None = None
     whole: npt.NDArray[np.bool_] | None = None
-    coefficients = coefficient.coefficients(device, layers, masks, grid, settings)
+    settled = transition.wanted(flows, settings)
+    within = settings.border_feather if settled else math.inf
+    coefficients = coefficient.coefficients(device, layers, masks, grid, settings, within)
     clipped = highlights.excess(device, layers, masks, grid, settings)
-    transition.settle(device, layers, coefficients, flows, masks, grid, settings, clipped.max(0))
+    if settled:
+        transition.settle(device, layers, coefficients, flows, masks, grid, settings, clipped.max(0))
     fields = geometry.fields(device, layers, coefficients, flows, grid, settings)
     del coefficients
     device.give_back()

@@ -72,6 +72,11 @@ class Shares:
         return cls(cells, *(device.upload(one) for one in (first, owner, share)))
 
 
+def wanted(flows: Sequence[PairFlow], settings: Settings) -> bool:
+    """Whether there is something to look for: without flow, or with a strain of 0, coefficients stay."""
+    return settings.transition_strain > 0 and len(flows) > 0
+
+
 def settle(
     device: Device,
     layers: Sequence[WorkingLayer],
@@ -82,13 +87,12 @@ def settle(
     settings: Settings,
     unlike: Values,
 ) -> None:
-    """Make coefficients those of least strain, in place. Without flow, or with a strain of 0, they stay.
+    """Make coefficients those of least strain, in place; see `wanted`. What they are where several layers
+    are counts for nothing.
 
     unlike: (height, width) on any coarse grid over the same region, from 0 to 1, where layers cannot be
     brought to one brightness.
     """
-    if settings.transition_strain == 0 or not flows:
-        return
     grids = [_cells(grid, pixels) for pixels in _CELLS]
     covers = _covers(masks, grids)
     price = _price(device, flows, masks, grid, grids[-1], covers[-1])

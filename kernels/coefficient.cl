@@ -34,9 +34,9 @@ __kernel void coefficient_seed(__global const uchar *mask,  /* (grid.y, grid.x) 
 }
 
 /* A measure that grows with the distance of two mask pixels; coefficient_distance makes it one. The table holds
-   a vertical part by |dy| (grid.y), a horizontal part by |dx| (grid.x) and a factor per row (grid.y). On a
-   plane: dy, dx, 1, hence the squared distance. On the sphere: sin(dlat / 2), sin(dlon / 2), cos(lat), hence the
-   haversine, which is exact for small angles. */
+   a vertical part by |dy| (grid.y), a horizontal part by |dx| (grid.x), a factor per row (grid.y), and how far seeds
+   are looked for from each row (grid.y), in mask px. On a plane: dy, dx, 1, hence the squared distance. On the sphere:
+   sin(dlat / 2), sin(dlon / 2), cos(lat), hence the haversine, which is exact for small angles. */
 static inline float coefficient_measure(int2 p, int2 q, int4 grid, __global const float *table) {
     int dx = MAGNITUDE(p.x - q.x);
     if (grid.z)
@@ -55,8 +55,9 @@ __kernel void coefficient_flood(__global const int *seed,    /* (grid.y, grid.x)
     const int x = get_global_id(0), y = get_global_id(1);
     if (x >= grid.x || y >= grid.y)
         return;
-    if (seed[y * grid.x + x] == x + (y << 16)) { /* a seed itself: nothing is nearer */
-        flooded[y * grid.x + x] = x + (y << 16);
+    const int known = seed[y * grid.x + x];
+    if (known == x + (y << 16) || step > table[2 * grid.y + grid.x + y]) { /* a seed itself: nothing is nearer */
+        flooded[y * grid.x + x] = known;
         return;
     }
     const bool inner = x >= step && y >= step && x + step < grid.x && y + step < grid.y;

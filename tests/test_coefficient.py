@@ -49,10 +49,12 @@ def brute_force(mask: np.ndarray, cover: np.ndarray, grid: Grid) -> np.ndarray:
     return result
 
 
-def kernel_distance(device: Device, masks: list[np.ndarray], index: int, grid: Grid) -> np.ndarray:
+def kernel_distance(
+    device: Device, masks: list[np.ndarray], index: int, grid: Grid, within: float = math.inf
+) -> np.ndarray:
     cover = np.maximum.reduce(masks)
     covers = cover_masks(device, masks, grid)
-    return coefficient.distance(device, covers, index, device.upload(cover, np.uint8), grid).get()
+    return coefficient.distance(device, covers, index, device.upload(cover, np.uint8), grid, within).get()
 
 
 def unit(grid: Grid) -> float:
@@ -118,6 +120,19 @@ def test_flood_equals_its_twin(device: Device, name: str, step: int) -> None:
     assert 0.05 < (kernel >= 0).mean() < 1
     if not grid.lens[1]:
         assert np.array_equal(kernel, expected)
+    near = device.empty(grid.shape, np.int32)
+    reach = random.choice([1.0, 7.5, 31.9, 32.0], grid.height)
+    parts = coefficient._table(grid)
+    parts[-grid.height :] = reach
+    device.run(
+        "coefficient", "coefficient_flood", grid.border[:2],
+        device.upload(seed), grid.border, device.upload(parts), step, near,
+    )  # fmt: skip
+    assert np.array_equal(near.get(), np.where(step > reach[:, None], seed, kernel))
+    assert np.array_equal(
+        twin.coefficient_flood(seed, grid.border, grid.lens, step, reach),
+        np.where(step > reach[:, None], seed, expected),
+    )
     full = np.ones(grid.shape)
     seeds = (kernel, expected)
     far = [twin.coefficient_distance(s, full, grid.border, grid.lens, unit(grid), 0.0) for s in seeds]
@@ -136,6 +151,28 @@ def test_distances_are_those_of_brute_force(device: Device, name: str, index: in
     assert expected.max() > 10
     assert (off > 1e-3).mean() < 0.02
     assert off.max() < 1
+
+
+@pytest.mark.parametrize("name", [*NAMES, "poles"])
+@pytest.mark.parametrize("within", [0.0, 0.4, 1.0, 2.5, 6.0, 11.0])
+def test_short_distances_are_the_same_if_only_they_matter(device: Device, name: str, within: float) -> None:
+    """To one pixel more, which is read to interpolate; also near the poles, where columns are narrow. Long
+    ones may be anything that is longer.
+    """
+    grid = sphere(256, 128) if name == "poles" else GRIDS[name]
+    masks = two_masks(2, grid)
+    if name == "poles":  # borders all around both of them, at any distance
+        masks[0][: grid.height // 9], masks[1][-grid.height // 9 :] = 1, 1
+        masks[0] &= patches(8, grid.width, grid.height, 0.97, 2).astype(np.uint8)
+    exact = brute_force(masks[0], np.maximum(*masks), grid)
+    near, covered = kernel_distance(device, masks, 0, grid, within), masks[0] > 0
+    matters = covered & (exact <= within + 0.999)
+    assert matters.any() == (exact[covered].min() <= within + 0.999)
+    off = np.abs(near - exact)[matters]
+    assert (off > 1e-3).sum() <= 0.02 * off.size  # as of the test above
+    assert off.max(initial=0) < 1
+    assert (near >= exact * (1 - 1e-4) - 1e-3)[covered].all()
+    assert (near[~covered] == 0).all()
 
 
 @pytest.mark.parametrize("name", NAMES)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import threading
 from dataclasses import replace
 from itertools import pairwise, permutations
@@ -22,7 +23,7 @@ from pictures import (
     texture,
 )
 
-from hugin_abflow import chart, consistency, joint, merge, single
+from hugin_abflow import chart, coefficient, consistency, joint, merge, single
 from hugin_abflow.cells import Whole
 from hugin_abflow.errors import SettingsError
 from hugin_abflow.layer import Box, Canvas, Layer
@@ -327,6 +328,20 @@ def test_neither_threads_nor_memory_change_a_pixel(monkeypatch):
         merged(layers, canvas, max_memory=20 << 20)
     with pytest.raises(SettingsError, match="too little for these layers, which take about"):
         merged(layers, canvas, max_memory=20 << 20, flow=False)
+
+
+@pytest.mark.parametrize("canvas", ["sphere", "plane"])
+@pytest.mark.parametrize("strain", [0.0, 0.07])
+def test_only_transitions_do_without_long_distances(monkeypatch, canvas, strain):
+    """With them, short ones are found alone, and nothing changes."""
+    layers, asked = moving(CANVASES[canvas]), []
+    short = merged(layers, CANVASES[canvas], transition_strain=strain)
+    find = coefficient.coefficients
+    monkeypatch.setattr(
+        coefficient, "coefficients", lambda *given: asked.append(given[-1]) or find(*given[:-1])
+    )
+    np.testing.assert_array_equal(merged(layers, CANVASES[canvas], transition_strain=strain), short)
+    assert asked == [6.0 if strain else math.inf]
 
 
 @pytest.mark.parametrize("looked_for", [True, False])

@@ -44,8 +44,12 @@ def between(x: Array, y: Array, place: Array, grid: Sequence[int], lens: Numbers
     return 2 * np.arcsin(np.minimum(1, chord / 2))
 
 
-def coefficient_flood(seed: Array, grid: Sequence[int], lens: Numbers, step: int) -> Array:
-    """Each pixel's nearest seed among those that it and its eight neighbours at `step` know."""
+def coefficient_flood(
+    seed: Array, grid: Sequence[int], lens: Numbers, step: int, reach: Array | None = None
+) -> Array:
+    """Each pixel's nearest seed among those that it and its eight neighbours at `step` know; what it knows
+    itself in rows that look less far. reach: px, by row; default: all look as far.
+    """
     x, y = pixels(grid[0], grid[1])
     best, nearest = np.full(seed.shape, -1), np.full(seed.shape, np.inf)
     for dy in (-step, 0, step):
@@ -55,6 +59,8 @@ def coefficient_flood(seed: Array, grid: Sequence[int], lens: Numbers, step: int
             far = np.where(found >= 0, between(x, y, np.maximum(found, 0), grid, lens), np.inf)
             closer = (far < nearest) | ((far == nearest) & (found >= 0) & (found < best))
             best, nearest = np.where(closer, found, best), np.where(closer, far, nearest)
+    if reach is not None:
+        best = np.where(step > reach[:, None], seed, best)
     return best.astype(np.int32)
 
 
