@@ -27,6 +27,7 @@ PARTS: dict[str, Mapping[str, Any]] = {
     "no seam": {"seam": False},
     "no movers": {"movers": False},
     "no foreground": {"foreground": False},
+    "no relay": {"relay": False},
     "no exposure": {"exposure": False},
     "no highlights": {"highlights": False},
     "transition as published": {"transition_strain": 0.0},

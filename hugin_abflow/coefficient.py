@@ -80,8 +80,8 @@ def masks(device: Device, layers: Sequence[WorkingLayer], grid: Grid) -> Masks:
 
 def _table(grid: Grid, within: float = math.inf) -> npt.NDArray[np.float32]:
     """Parts of the distance between two pixels of the mask grid, and how far seeds are looked for, as
-    coefficient.cl takes them. within: the distance that matters, in mask px, on the sphere in radians; one pixel
-    more is read to interpolate.
+    coefficient.cl takes them. within: the distance that matters, in mask px, on the sphere in radians; one
+    pixel more is read to interpolate.
     """
     rows, columns = np.arange(grid.height), np.arange(grid.width)
     if not grid.lens[1]:

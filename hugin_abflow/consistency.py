@@ -12,12 +12,13 @@ edges: what is beside it was matched half with it.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass
 
 import numpy as np
 
 from hugin_abflow.cells import CELL, Mask, Whole
-from hugin_abflow.geometry import PairFlow
+from hugin_abflow.chart import Chart
+from hugin_abflow.geometry import Pair, PairFlow
 from hugin_abflow.opencl import Buffer, Device
 from hugin_abflow.pyramid import Level
 
@@ -41,19 +42,38 @@ _EDGE = 0.08
 _SWEEPS, _RELAXATION, _LEAST_PIXELS = 4, 1.5, 64
 
 
-def mend(device: Device, pair: PairFlow, images: Sequence[Level], whole: Whole | None = None) -> PairFlow:
-    """The pair's flows, filled where they disagree and in the place of what is taken from one photo.
+@dataclass(frozen=True)
+class Weighed(Pair):
+    """Flow between the layers of a pair as it was found, and how far it is trusted.
 
-    images: log brightness of both layers on the pair's chart.
+    forward, backward   float32 (height, width, 4) on their chart: flow in px, trust 0..1, and brightness of
+                        the layer that it starts on, 0 where it shows nothing.
+    whole               whether something is taken from one of them.
     """
+
+    chart: Chart
+    forward: Buffer
+    backward: Buffer
+    whole: bool
+
+
+def weigh(device: Device, pair: PairFlow, images: Sequence[Level], whole: Whole | None = None) -> Weighed:
+    """How far a pair's flows are trusted. images: log brightness of both layers on the pair's chart."""
     ways = [(pair.forward, pair.backward), (pair.backward, pair.forward)]
     cells = (whole.first, whole.second) if whole else (None, None)
-    wraps = pair.chart.wraps
     forward, backward = (
-        _fill(device, trust(device, *way, wraps, level.image, its), wraps, bool(whole))
+        _supported(device, trust(device, *way, pair.chart.wraps, level.image, its), pair.chart.wraps)
         for way, level, its in zip(ways, images, cells, strict=True)
     )
-    return replace(pair, forward=forward, backward=backward)
+    return Weighed(pair.a, pair.b, pair.chart, forward, backward, bool(whole))
+
+
+def mend(device: Device, found: Weighed) -> PairFlow:
+    """The pair's flows, filled where they are not trusted, and in the place of what is taken from one."""
+    forward, backward = (
+        _fill(device, trusted, found.chart.wraps, found.whole) for trusted in (found.forward, found.backward)
+    )
+    return PairFlow(found.a, found.b, found.chart, forward, backward)
 
 
 def trust(
@@ -75,7 +95,8 @@ def trust(
     return trusted
 
 
-def _fill(device: Device, trusted: Buffer, wraps: bool, whole: bool) -> Buffer:
+def _supported(device: Device, trusted: Buffer, wraps: bool) -> Buffer:
+    """Less trust, in place, where there is little around."""
     around, grid = trusted, _grid(trusted, wraps)
     for _ in range(_AROUND):
         around = _coarser(device, around, wraps)
@@ -83,7 +104,11 @@ def _fill(device: Device, trusted: Buffer, wraps: bool, whole: bool) -> Buffer:
         "consistency", "consistency_support", grid[:2], around, _grid(around, wraps), 2.0**_AROUND, _ENOUGH,
         trusted, grid,
     )  # fmt: skip
-    levels = [trusted]
+    return trusted
+
+
+def _fill(device: Device, trusted: Buffer, wraps: bool, whole: bool) -> Buffer:
+    grid, levels = _grid(trusted, wraps), [trusted]
     while max(levels[-1].shape[:2]) > 1:
         levels.append(_coarser(device, levels[-1], wraps))
     filled = _carried(device, levels, wraps, _SWEEPS)

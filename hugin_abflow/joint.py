@@ -56,8 +56,9 @@ _LEAST_OVERLAP = 64
 # What only one layer shows first passes for exposure in part: its region grows to its size in a few rounds.
 _SEAM_ROUNDS = 2
 # Bytes that are to come for each working pixel of a layer: a field, an array of coefficients, a rim, offsets
-# and what they are made from; for each pixel of charts: flow both ways; and of the largest, to solve it.
-_STEP_BYTES, _FLOW_BYTES, _SOLVER_BYTES = 16 + 4 + 1 + 9, 16, 250
+# and what they are made from; for each pixel of charts: flow both ways, and before that as it was found; and
+# of the largest, to solve it.
+_STEP_BYTES, _FLOW_BYTES, _FOUND_BYTES, _SOLVER_BYTES = 16 + 4 + 1 + 9, 16, 32, 250
 # What libraries take that are still being loaded (`_making_ready`).
 _LIBRARY_BYTES = 50 << 20
 # Below this a working canvas is too small to be worth another attempt.
@@ -182,8 +183,9 @@ def _making_ready(device: Device, first: Layer, settings: Settings) -> Iterator[
     """Load and build what comes after reading, meanwhile: it takes most of a second on one core, and several
     where kernels are compiled for the first time; no process that is to end waits for all of it.
     """
-    of_flow = ("chart", "pyramid", "flow", "search", "consistency", "transition") if settings.flow else ()
-    kernels = ("coefficient", "saturation", *of_flow, "highlights", "geometry", "colour", "seam", "multiband")
+    of_flow = ("chart", "pyramid", "flow", "search", "consistency", "relay", "transition")
+    flow = of_flow if settings.flow else ()
+    kernels = ("coefficient", "saturation", *flow, "highlights", "geometry", "colour", "seam", "multiband")
     libraries = ("scipy.ndimage", "scipy.sparse.csgraph", "scipy.sparse.linalg")
     steps: list[Callable[[], object]] = [partial(device.build, name) for name in kernels]
     steps += [partial(importlib.import_module, name) for name in libraries]
@@ -367,7 +369,7 @@ def _check_memory(
     sizes = [chart.width * chart.height for chart in pairflow.finest(charts, grid, settings)]
     at_last, meanwhile = _STEP_BYTES * pixels, _SOLVER_BYTES * max(sizes, default=0)
     there = memory.resident() + device.own_memory + _LIBRARY_BYTES
-    needed = there + _FLOW_BYTES * sum(sizes) + max(at_last, meanwhile)
+    needed = there + max(_FLOW_BYTES * sum(sizes) + at_last, _FOUND_BYTES * sum(sizes) + meanwhile)
     limit = memory.limit(settings.max_memory)
     _log.info("memory: about %s of %s at working resolution", memory.size(needed), memory.size(limit))
     if needed <= limit:

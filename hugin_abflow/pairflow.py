@@ -15,9 +15,10 @@ from functools import partial
 import numpy as np
 import numpy.typing as npt
 
-from hugin_abflow import chart, consistency, figures, flow, guidance, quality, single
+from hugin_abflow import chart, consistency, figures, flow, guidance, quality, relay, single
 from hugin_abflow.cells import View, Whole
 from hugin_abflow.chart import Chart
+from hugin_abflow.consistency import Weighed
 from hugin_abflow.geometry import Pair, PairFlow
 from hugin_abflow.guides import Guide
 from hugin_abflow.opencl import Device
@@ -74,15 +75,15 @@ def solve(
     parameters = quality.flow_parameters(settings.flow_quality, settings.large_motion)
     largest = _REACH * (grid.canvas_width or grid.region.width) * grid.width / grid.region.width
     ends = finest(drawn, grid, settings)
-    result, singles, shifts = list[PairFlow](), list[Whole | None](), list[figures.Parallax]()
+    weighed, singles, shifts = list[Weighed](), list[Whole | None](), list[figures.Parallax]()
     waiting: list[tuple[PairFlow, tuple[Level, Level], Future[Whole | None] | None]] = []
 
-    def mend() -> None:
+    def weigh() -> None:
         while waiting:  # one at most: a pair's images are large
             pair, images, job = waiting.pop()
             found = job.result() if job else None
             singles.append(found.finer() if found and ends is not drawn else found)
-            result.append(consistency.mend(device, pair, images, singles[-1]))
+            weighed.append(consistency.weigh(device, pair, images, singles[-1]))
 
     with ThreadPoolExecutor(1, "single") as looking, progress("flow", len(pairs)) as advance:
         for pair, its_chart, its_finest in zip(pairs, drawn, ends, strict=True):
@@ -96,7 +97,7 @@ def solve(
             placed = guidance.on_chart(its_guides, first, its_chart, grid)
             if its_guides:
                 found = guidance.lead(device, images, found, placed, its_chart.around(grid))
-            mend()
+            weigh()
             job = None
             if settings.seam and (settings.foreground or (settings.movers and its_chart.eye)):
                 views = (View.of(images[0]), View.of(images[1]))
@@ -111,7 +112,14 @@ def solve(
                 its_flow = PairFlow(pair.a, pair.b, its_finest, *found)
             waiting.append((its_flow, images, job))
             advance(1)
-        mend()
+        weigh()
+        if settings.relay and relay.triangles(pairs):
+            for a, b in relay.mend(device, weighed):
+                _log.info(
+                    "flow of %s and %s: by way of other layers, which contradict their own",
+                    layers[a].layer.name, layers[b].layer.name,
+                )  # fmt: skip
+        result = [consistency.mend(device, weighed.pop(0)) for _ in range(len(weighed))]
         device.give_back()  # it waits: else the last pair's time would be told as that of what follows
     return result, shifts, singles
 

@@ -41,6 +41,8 @@ class Settings:
     movers              with it, take so, too, what flow matches although it moved by itself, where flow tells
                         how the camera moved.
     foreground          and near things that would be bent, where one layer shows all of them.
+    relay               where flow of a pair of layers contradicts that of others, or is not sure where theirs
+                        is, take theirs, by way of a third layer.
     transition_strain   by how much changing over from one layer's geometry to the next may stretch it, where
                         the overlap is wide enough; transitions go round what shifts by much. 0..1, 0:
                         nothing is looked for, and they take the whole overlap, as published.
@@ -73,6 +75,7 @@ class Settings:
     seam: bool = True
     movers: bool = True
     foreground: bool = True
+    relay: bool = True
     transition_strain: float = 0.07
     guides: bool = True
     interpolation: Interpolation = "bicubic"
@@ -118,7 +121,7 @@ class Settings:
                 expected = " or ".join(map(repr, choices))
                 raise SettingsError(f"{name} is {value!r}; choose {expected}")
         for name in (
-            "flow", "exposure", "highlights", "seam", "movers", "foreground", "guides", "both_flows",
+            "flow", "exposure", "highlights", "seam", "movers", "foreground", "relay", "guides", "both_flows",
         ):  # fmt: skip
             if not isinstance(getattr(self, name), bool):
                 raise SettingsError(f"{name} is {getattr(self, name)!r}; choose True or False")

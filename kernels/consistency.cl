@@ -3,9 +3,6 @@
    image. In the place of what is taken from one photo, edges are its own and tell nothing of what
    is around. */
 
-/* Brightness of what tells nothing. */
-#define UNTOLD 1e3f
-
 /* The area that a pixel's has become where its flow leads. Beyond a border that does not wrap flow is the same. */
 static inline float area_there(__global const float2 *flow, int x, int y, int4 grid) {
     const int at = y * grid.x + x, turn = grid.z ? grid.x - 1 : 0;

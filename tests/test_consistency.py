@@ -205,7 +205,7 @@ def mended(
     nothing = np.zeros(forward.shape[:2])
     shown = [device.upload((nothing if one is None else one).astype(np.float32)) for one in images]
     levels = [Level(one, device.zeros(nothing.shape), pair.chart.wraps) for one in shown]
-    result = consistency.mend(device, pair, levels, moved)
+    result = consistency.mend(device, consistency.weigh(device, pair, levels, moved))
     assert (result.a, result.b, result.chart) == (0, 1, pair.chart)
     return result.forward.get(), result.backward.get()
 

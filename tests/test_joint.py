@@ -347,16 +347,19 @@ def test_only_transitions_do_without_long_distances(monkeypatch, canvas, strain)
 @pytest.mark.parametrize("looked_for", [True, False])
 def test_every_pair_is_mended_with_its_own_images(monkeypatch, looked_for):
     """In their order, the last one, too, each with what is taken whole."""
-    sampled, mended, given = [], [], []
-    sample, mend, align = chart.sample, consistency.mend, joint._align
+    sampled, weighed, mended, given = [], [], {}, []
+    sample, weigh, mend, align = chart.sample, consistency.weigh, consistency.mend, joint._align
 
     def spy_sample(device, layer, grid, chart):
         sampled.append((layer, chart, sample(device, layer, grid, chart)))
         return sampled[-1][2]
 
-    def spy_mend(device, pair, images, whole=None):
-        mended.append((pair, images, whole, mend(device, pair, images, whole)))
-        return mended[-1][3]
+    def spy_weigh(device, pair, images, whole=None):
+        weighed.append((pair, images, whole, weigh(device, pair, images, whole)))
+        return weighed[-1][3]
+
+    def spy_mend(device, found):
+        return mended.setdefault(id(found), mend(device, found))
 
     def spy_align(device, layers, pairs, flows, *rest):
         given.append((layers, list(flows)))
@@ -368,13 +371,14 @@ def test_every_pair_is_mended_with_its_own_images(monkeypatch, looked_for):
     monkeypatch.setattr(single, "find", lambda *_: next(left))
     monkeypatch.setattr(single, "on_canvas", lambda *_: None)
     monkeypatch.setattr(chart, "sample", spy_sample)
+    monkeypatch.setattr(consistency, "weigh", spy_weigh)
     monkeypatch.setattr(consistency, "mend", spy_mend)
     monkeypatch.setattr(joint, "_align", spy_align)
     merged(moving(SPHERE), SPHERE, movers=looked_for, foreground=False)
     [(layers, flows)] = given
-    assert len(flows) == len(mended) == len(sampled) // 2 > 3
-    for number, (flow, (pair, images, whole, result)) in enumerate(zip(flows, mended, strict=True)):
-        assert flow is result
+    assert len(flows) == len(weighed) == len(sampled) // 2 > 3
+    for number, (flow, (pair, images, whole, found_flow)) in enumerate(zip(flows, weighed, strict=True)):
+        assert flow is mended[id(found_flow)]
         assert whole is found[number]
         shown = [(layer, level) for layer, its_chart, level in sampled if its_chart is pair.chart]
         assert [level for _, level in shown] == list(images)

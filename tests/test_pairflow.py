@@ -9,7 +9,7 @@ import pytest
 from pictures import merged, one_device
 from scipy import ndimage
 
-from hugin_abflow import chart, consistency, flow, joint, pairflow, quality, single
+from hugin_abflow import chart, consistency, flow, joint, pairflow, quality, relay, single
 from hugin_abflow.cells import Whole
 from hugin_abflow.errors import SettingsError
 from hugin_abflow.layer import Canvas, Layer
@@ -41,15 +41,15 @@ def small(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.fixture
-def mended(monkeypatch: pytest.MonkeyPatch) -> list[tuple[Any, ...]]:
-    """What `consistency.mend` is given, and what it gives."""
-    given, mend = list[tuple[Any, ...]](), consistency.mend
+def weighed(monkeypatch: pytest.MonkeyPatch) -> list[tuple[Any, ...]]:
+    """What `consistency.weigh` is given, and what it gives."""
+    given, weigh = list[tuple[Any, ...]](), consistency.weigh
 
     def spy(device: Any, pair: Any, images: Any, whole: Any) -> Any:
-        given.append((pair, images, whole, mend(device, pair, images, whole)))
+        given.append((pair, images, whole, weigh(device, pair, images, whole)))
         return given[-1][3]
 
-    monkeypatch.setattr(consistency, "mend", spy)
+    monkeypatch.setattr(consistency, "weigh", spy)
     return given
 
 
@@ -59,11 +59,11 @@ def mended(monkeypatch: pytest.MonkeyPatch) -> list[tuple[Any, ...]]:
     [("normal", 31, True), ("normal", 201, False), ("best", 201, True), ("fast", 61, False)],
 )
 def test_flow_is_refined_where_overlaps_are_small(
-    mended: list[tuple[Any, ...]], name: FlowQuality, shared: int, fine: bool
+    weighed: list[tuple[Any, ...]], name: FlowQuality, shared: int, fine: bool
 ) -> None:
     """Else it stays on charts of half the resolution. It is told in px of its chart."""
     merged(layers(shared), CANVAS, flow_quality=name, working_pixels=CANVAS.width * CANVAS.height)
-    ((pair, images, _, _),) = mended
+    ((pair, images, _, _),) = weighed
     assert pair.chart.coarse == (1 if fine else 2)
     assert pair.forward.shape[:2] == images[0].image.shape == (pair.chart.height, pair.chart.width)
     both = ndimage.binary_erosion(images[0].mask.get() * images[1].mask.get() > 0, iterations=5)
@@ -104,7 +104,7 @@ def test_memory_is_reckoned_for_charts_as_fine_as_they_get(monkeypatch: pytest.M
 
 @pytest.mark.usefixtures(small.__name__)
 def test_what_is_taken_whole_is_told_on_the_chart_that_its_flow_has(
-    mended: list[tuple[Any, ...]], monkeypatch: pytest.MonkeyPatch
+    weighed: list[tuple[Any, ...]], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """It is looked for on the coarse one."""
     seen, places = [], []
@@ -121,7 +121,7 @@ def test_what_is_taken_whole_is_told_on_the_chart_that_its_flow_has(
     monkeypatch.setattr(single, "find", find)
     monkeypatch.setattr(single, "on_canvas", on_canvas)
     merged(layers(31), CANVAS, working_pixels=CANVAS.width * CANVAS.height)
-    ((coarse, found),), ((pair, _, whole, _),) = seen, mended
+    ((coarse, found),), ((pair, _, whole, _),) = seen, weighed
     assert (coarse.coarse, pair.chart.coarse) == (2, 1)
     assert np.array_equal(whole.first, np.kron(found.first, np.ones((2, 2), bool)))
     grid = full_grid(CANVAS, layers(31))
@@ -142,3 +142,21 @@ def test_what_is_small_is_told_by_the_pixels_of_all_charts() -> None:
         ends = [one.coarse for one in pairflow.finest(drawn, grid, Settings())]
         assert [one.coarse for one in drawn] == [2] * len(overlaps)
         assert ends == [1 if fine else 2] * len(overlaps)
+
+
+@pytest.mark.parametrize("wanted", [True, False])
+def test_flow_is_compared_with_that_of_other_pairs(monkeypatch: pytest.MonkeyPatch, wanted: bool) -> None:
+    """Before it is filled, and where three layers overlap alone."""
+    asked, filled = list[list[tuple[int, int]]](), list[int]()
+    monkeypatch.setattr(
+        relay, "mend", lambda device, found: asked.append([(one.a, one.b) for one in found]) or []
+    )
+    fill = consistency.mend
+    monkeypatch.setattr(consistency, "mend", lambda *given: filled.append(len(asked)) or fill(*given))
+    two = layers(31)
+    merged(two, CANVAS, relay=wanted)
+    assert asked == [] and filled == [0]
+    pixels = np.ascontiguousarray(two[0].read(0, CANVAS.height)[:, 60:])
+    merged([*two, Layer.from_array("c", pixels, 61)], CANVAS, relay=wanted)
+    assert asked == ([[(0, 1), (0, 2), (1, 2)]] if wanted else [])
+    assert filled[1:] == [int(wanted)] * 3

@@ -1,0 +1,209 @@
+"""Flow of a pair that other pairs contradict, by way of a third layer instead (kernels/relay.cl).
+
+Where a, b and c overlap, the way from a to c is that from a to b and on to c. Where it is not, one of the
+three flows is wrong: most often that of a small overlap, of which much is seen beyond it in the other layer,
+or in which a pattern was matched one repeat too far; and it may lead back to the start all the same. Which
+one it is, the other triangles tell, and the images: a pair is the less reliable the more pairs contradict it
+that are reliable themselves, and the worse its layers fit by it,
+
+    r_ac = (h_ac + A_ac) / (h_ac + A_ac + D_ac).
+
+h is what an overlap has to say of itself, by its fit; A and D are the parts of it, as far as its own flow is
+trusted, in which ways by another layer b lead where that does, or elsewhere, by how far both legs of each are
+believed, times r_ab r_bc. It is solved by a fixed point, from r = 1. Flow that is refuted so becomes the mean
+of the other ways. Where they know much of an overlap in which its own flow is not trusted, they tell that.
+"""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from hugin_abflow.chart import Chart
+from hugin_abflow.consistency import Weighed
+from hugin_abflow.geometry import Pair
+from hugin_abflow.opencl import Buffer, Device
+
+# Chart pixels in the side of a cell, in the middle of which ways are compared.
+_CELL = 8
+# Noise of log brightness, below which texture tells nothing.
+_NOISE = 0.03
+# Chart pixels between two ways that agree to a quarter.
+_AGREES = 3.0
+# What an overlap that fits has to say of itself, against one other way that is believed all over it.
+_OWN = 0.3
+# A pair that is less reliable than this is refuted. In rendered rooms, whose parallax is known, wrong ones
+# were below .2, right ones above .45.
+_REFUTED = 0.33
+# The share of an overlap that others have to know, and its own flow does not, to be asked.
+_MISSED = 0.15
+# Rounds of the fixed point, each of which goes half of the way.
+_ROUNDS = 8
+# A way has to be known so far in so many cells.
+_KNOWN, _LEAST_CELLS = 0.05, 4
+
+Values = npt.NDArray[np.float64]
+Key = tuple[int, int]
+
+
+@dataclass(frozen=True)
+class _Way:
+    """Found flow from one layer of a pair to the other; in cells, (height, width): its way, in px (..., 2),
+    whether it lies in the overlap, and its trust, 0 beside that; and the mean of its fit.
+    """
+
+    chart: Chart
+    found: Buffer
+    cells: Buffer
+    flow: Values
+    inside: npt.NDArray[np.bool_]
+    trust: Values
+    fit: float
+
+    @property
+    def grid(self) -> tuple[int, int, int, int]:
+        """As kernels take it."""
+        return self.chart.width, self.chart.height, int(self.chart.wraps), 0
+
+    @property
+    def area(self) -> float:
+        """Working px in which it is trusted."""
+        return float(self.trust.sum()) * (_CELL * self.chart.coarse) ** 2
+
+
+@dataclass(frozen=True)
+class _Other:
+    """A way by a third layer: how far it is known, 0..1 in cells; and the sums, in cells, of where it leads
+    as the pair's own flow does, and elsewhere.
+    """
+
+    by: int
+    known: Values
+    agrees: float
+    differs: float
+
+
+def triangles(pairs: Iterable[Pair]) -> bool:
+    """Whether there are three layers each two of which are a pair."""
+    beside = _beside((pair.a, pair.b) for pair in pairs)
+    return any(beside[a] & beside[b] for a, its in beside.items() for b in its)
+
+
+def mend(device: Device, found: Sequence[Weighed]) -> list[Key]:
+    """Replace, in place, flow that others refute, and what they know better; returns of which pairs."""
+    ways = dict(_ways(device, found))
+    beside = _beside(ways)
+    others = {(a, c): list(_others(device, ways, a, c, sorted(beside[a] & beside[c]))) for a, c in ways}
+    reliable = _reliable(ways, others)
+    refuted = {key for key, value in reliable.items() if value < _REFUTED}
+    changed = list[tuple[Key, Buffer]]()
+    for (a, c), way in ways.items():
+        sound = [one for one in others[a, c] if not {(a, one.by), (one.by, c)} & refuted]
+        if not sound or ((a, c) not in refuted and _missed(way, sound) < _MISSED):
+            continue
+        total = device.zeros((way.chart.height, way.chart.width, 4))
+        for one in sound:
+            _add(device, ways, (a, one.by, c), 1, reliable[a, one.by] * reliable[one.by, c], total)
+        changed.append(((a, c), total))
+    for key, total in changed:  # only now: they are legs of others
+        way, own = ways[key], 0.0 if key in refuted else 1.0
+        device.run("relay", "relay_take", way.grid[:2], total, way.grid, own, way.found)
+    return sorted({(min(key), max(key)) for key, _ in changed})
+
+
+def _beside(keys: Iterable[Key]) -> dict[int, set[int]]:
+    """With which others each layer is a pair."""
+    result = defaultdict[int, set[int]](set)
+    for a, b in keys:
+        result[a].add(b)
+        result[b].add(a)
+    return result
+
+
+def _ways(device: Device, found: Sequence[Weighed]) -> Iterator[tuple[Key, _Way]]:
+    for pair in found:
+        for key, own, other in (
+            ((pair.a, pair.b), pair.forward, pair.backward),
+            ((pair.b, pair.a), pair.backward, pair.forward),
+        ):
+            yield key, _way(device, pair.chart, own, other)
+
+
+def _way(device: Device, chart: Chart, own: Buffer, other: Buffer) -> _Way:
+    grid, size = (chart.width, chart.height, int(chart.wraps), 0), _cells(chart)
+    cells = device.empty((*size[::-1], 4))
+    device.run("relay", "relay_cells", size, own, other, grid, _CELL, _NOISE, size, cells)
+    values = cells.get().astype(np.float64)
+    inside, trust, fit = values[..., 2] >= 0, np.maximum(values[..., 2], 0), values[..., 3]
+    known = trust * (fit >= 0)
+    mean = float((known * fit).sum() / known.sum()) if known.any() else 1.0
+    values[..., 3] = np.where(fit >= 0, fit, mean)  # where it cannot be seen
+    cells.set(values.astype(np.float32))
+    return _Way(chart, own, cells, values[..., :2], inside, trust, mean)
+
+
+def _cells(chart: Chart) -> tuple[int, int]:
+    """Of a chart: columns, rows."""
+    return -(-chart.width // _CELL), -(-chart.height // _CELL)
+
+
+def _others(device: Device, ways: dict[Key, _Way], a: int, c: int, by: Iterable[int]) -> Iterator[_Other]:
+    """The ways from a to c by other layers that tell something. What small overlaps say of large ones counts
+    less, by their areas.
+    """
+    own = ways[a, c]
+    for b in by:
+        total = device.zeros((*own.trust.shape, 4))
+        _add(device, ways, (a, b, c), _CELL, 1.0, total)
+        values = total.get().astype(np.float64)
+        known = values[..., 2]
+        if np.count_nonzero(known > _KNOWN) < _LEAST_CELLS:
+            continue
+        flow = values[..., :2] / np.maximum(known, 1e-12)[..., None]
+        agree = 1 / np.square(1 + np.square(flow - own.flow).sum(-1) / _AGREES**2)
+        smaller = min(ways[a, b].area, ways[b, c].area)
+        told = min(1.0, smaller / max(own.area, 1.0)) * known * own.trust
+        yield _Other(b, known, float((told * agree).sum()), float((told * (1 - agree)).sum()))
+
+
+def _add(
+    device: Device, ways: dict[Key, _Way], path: tuple[int, int, int], step: int, share: float, total: Buffer
+) -> None:
+    """Add the way from a to c by b, for path (a, b, c), at every step-th pixel of their chart."""
+    a, b, c = path
+    first, second, own = ways[a, b], ways[b, c], ways[a, c]
+    size = total.shape[1], total.shape[0]
+    device.run(
+        "relay", "relay_add", size, first.found, first.cells, first.grid, first.chart.transform,
+        second.found, second.cells, second.grid, second.chart.transform, _CELL, own.grid,
+        own.chart.transform, step, size, share, total,
+    )  # fmt: skip
+
+
+def _reliable(ways: dict[Key, _Way], others: dict[Key, list[_Other]]) -> dict[Key, float]:
+    """How reliable each pair is, 0..1, both ways the same."""
+    reliable = dict.fromkeys(ways, 1.0)
+    for _ in range(_ROUNDS):
+        told = {key: _told(key, ways[key], others[key], reliable) for key in ways}
+        reliable = {(a, c): (2 * r + told[a, c] + told[c, a]) / 4 for (a, c), r in reliable.items()}
+    return reliable
+
+
+def _told(key: Key, own: _Way, others: Sequence[_Other], reliable: dict[Key, float]) -> float:
+    """How reliable a pair is, if the others are as reliable as that."""
+    a, c = key
+    weights = [reliable[a, one.by] * reliable[one.by, c] for one in others]
+    differs = sum(w * one.differs for w, one in zip(weights, others, strict=True))
+    agrees = sum(w * one.agrees for w, one in zip(weights, others, strict=True))
+    held = _OWN * own.fit * float(own.trust.sum()) + agrees
+    return held / (held + differs) if differs else 1.0
+
+
+def _missed(way: _Way, others: Sequence[_Other]) -> float:
+    """The share of an overlap in which others know the way, and its own flow is not trusted."""
+    known = np.minimum(sum(one.known for one in others), 1.0)
+    return float(((1 - way.trust) * known)[way.inside].mean()) if way.inside.any() else 0.0

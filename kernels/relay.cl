@@ -1,0 +1,147 @@
+/* Flow of a pair by way of a third layer, and how far flows are to be believed. Found flow: flow in px, trust,
+   brightness as consistency_trust gives them. Cells: squares of so many pixels of a chart, the last ones less. */
+
+/* By how much brightness may be off its mean: what differs by more tells no more. */
+#define RELAY_MOST 0.3f
+
+/* Brightness of the pair's other layer where flow leads from pixel p; UNTOLD where it is not known. */
+static inline float relay_seen(__global const float4 *other, int2 p, float2 flow, int4 grid) {
+    const float2 q = (float2)(p.x, p.y) + flow;
+    const int2 corner = floor_int2(q);
+    const float2 t = q - convert_float2(corner);
+    float sum = 0.0f;
+    for (int j = 0; j < 2; ++j)
+        for (int i = 0; i < 2; ++i) {
+            const int at = grid_index(corner + (int2)(i, j), grid);
+            const float c = at < 0 ? 0.0f : other[at].w;
+            if (c == 0.0f || c >= UNTOLD)
+                return UNTOLD;
+            sum += (i ? t.x : 1.0f - t.x) * (j ? t.y : 1.0f - t.y) * c;
+        }
+    return sum;
+}
+
+/* For the middle of each cell the flow there and its trust, -1 where not both layers show something; and its fit: with s^2 the
+   variance of brightness around it, e^2 that of its difference from what the other layer shows where the flows lead,
+   ((s^2 + n^2) / (s^2 + n^2 + 2 e^2))^4; -1 where next to nothing is known. */
+__kernel void relay_cells(__global const float4 *found, /* (grid.y, grid.x) from layer a to layer b */
+                          __global const float4 *other, /* (grid.y, grid.x) from b to a */
+                          int4 grid,                    /* width, height, wraps, 0 */
+                          int cell,                     /* px in the side of a cell */
+                          float noise,                  /* n: of brightness */
+                          int2 size,                    /* run size */
+                          __global float4 *cells)       /* (size.y, size.x) flow, trust, fit */
+{
+    const int x = get_global_id(0), y = get_global_id(1);
+    if (x >= size.x || y >= size.y)
+        return;
+    const int2 middle = (int2)(LEAST(x * cell + cell / 2, grid.x - 1), LEAST(y * cell + cell / 2, grid.y - 1));
+    float known = 0.0f, mean = 0.0f, off = 0.0f, texture = 0.0f, misfit = 0.0f;
+    for (int pass = 0; pass < 2; ++pass) {
+        for (int j = -cell; j < cell; j += 2) /* every second pixel tells enough */
+            for (int i = -cell; i < cell; i += 2) {
+                int2 p = middle + (int2)(i, j);
+                if (!grid_border(&p, grid))
+                    continue;
+                const float4 f = found[p.y * grid.x + p.x];
+                if (f.w == 0.0f || f.w >= UNTOLD)
+                    continue;
+                const float seen = relay_seen(other, p, f.xy, grid), d = f.w - seen;
+                if (seen >= UNTOLD)
+                    continue;
+                if (pass == 0) {
+                    known += 1.0f;
+                    mean += f.w;
+                    off += d;
+                } else {
+                    const float s = LIMITED(f.w - mean, -RELAY_MOST, RELAY_MOST);
+                    const float e = LIMITED(d - off, -RELAY_MOST, RELAY_MOST);
+                    texture += s * s;
+                    misfit += e * e;
+                }
+            }
+        if (pass == 0 && known > 0.0f) {
+            mean /= known;
+            off /= known;
+        }
+    }
+    const float told = texture + known * noise * noise, fit = told / (told + 2.0f * misfit);
+    const int at = middle.y * grid.x + middle.x;
+    const float4 own = found[at];
+    const bool shown = own.w != 0.0f && own.w < UNTOLD && other[at].w != 0.0f;
+    cells[y * size.x + x] = (float4)(own.xy, shown ? own.z : -1.0f,
+                                     known < 0.2f * cell * cell ? -1.0f : fit * fit * fit * fit);
+}
+
+/* Where flow leads from position u of its chart, in place; and how far that is to be believed there: trust times fit,
+   0 beside the chart. */
+static inline float relay_follow(__global const float4 *found, __global const float4 *cells, int4 grid, int cell,
+                                 float2 *u) {
+    if (!(u->x >= 0.0f && u->y >= 0.0f && u->x < grid.x && u->y < grid.y))
+        return 0.0f;
+    int4 at;
+    const float4 w = bilinear_taps(*u, grid, &at);
+    const float4 f = w.x * found[at.x] + w.y * found[at.y] + w.z * found[at.z] + w.w * found[at.w];
+    const int column = (int)u->x / cell, row = (int)u->y / cell;
+    *u += f.xy;
+    return f.z * cells[row * ((grid.x + cell - 1) / cell) + column].w;
+}
+
+/* The point of a chart's position. */
+static inline float3 relay_point(float2 u, const float16 *chart) {
+    if (chart->sd == 0.0f)
+        return (float3)((u.x - chart->sb) / chart->s9, (u.y - chart->sc) / chart->sa, 0.0f);
+    const points q = chart_sphere(u.x, u.y, chart);
+    return (float3)(q.x, q.y, q.z);
+}
+
+/* Add the flow from a to c by way of b, F_ab(q) and then F_bc where that leads, at every step-th pixel of their
+   chart, weighted by how far both are believed. */
+__kernel void relay_add(__global const float4 *first,        /* (first_grid.y, first_grid.x) found, from a to b */
+                        __global const float4 *first_cells,  /* of relay_cells */
+                        int4 first_grid, float16 first_chart,
+                        __global const float4 *second,       /* (second_grid.y, second_grid.x) from b to c */
+                        __global const float4 *second_cells,
+                        int4 second_grid, float16 second_chart,
+                        int cell,
+                        int4 grid, float16 chart,            /* of a and c */
+                        int step, int2 size,                 /* run size */
+                        float share,                         /* what it counts */
+                        __global float4 *sum) /* (size.y, size.x) weighted flow, px of their chart, and weights */
+{
+    const int x = get_global_id(0), y = get_global_id(1);
+    if (x >= size.x || y >= size.y)
+        return;
+    const int2 p = (int2)(LEAST(x * step + step / 2, grid.x - 1), LEAST(y * step + step / 2, grid.y - 1));
+    const float2 from = convert_float2(p) + 0.5f;
+    float2 u = chart_position(relay_point(from, &chart), &first_chart);
+    float weight = share * relay_follow(first, first_cells, first_grid, cell, &u);
+    if (weight <= 0.0f)
+        return;
+    u = chart_position(relay_point(u, &first_chart), &second_chart);
+    weight *= relay_follow(second, second_cells, second_grid, cell, &u);
+    if (weight <= 0.0f)
+        return;
+    float2 way = chart_position(relay_point(u, &second_chart), &chart) - from;
+    const float period = chart.sd != 0.0f ? 2.0f * M_PI_F * chart.s9 : chart.se * chart.s9;
+    if (period > 0.0f) /* the shorter way around */
+        way.x -= period * floor_int(way.x / period + 0.5f);
+    sum[y * size.x + x] += (float4)(weight * way, weight, 0.0f);
+}
+
+/* Where found flow is not trusted, it becomes that by way of others, as far as they are; in place. */
+__kernel void relay_take(__global const float4 *sum, /* (grid.y, grid.x) of relay_add, with a step of 1 */
+                         int4 grid,                  /* run size */
+                         float own,                  /* what found flow's trust counts: 0 or 1 */
+                         __global float4 *found)     /* (grid.y, grid.x) */
+{
+    const int x = get_global_id(0), y = get_global_id(1);
+    if (x >= grid.x || y >= grid.y)
+        return;
+    const int at = y * grid.x + x;
+    const float4 its = sum[at];
+    const float kept = own * found[at].z, taken = (1.0f - kept) * LEAST(its.z, 1.0f), trust = kept + taken;
+    if (taken > 0.0f)
+        found[at].xy = (kept * found[at].xy + taken / its.z * its.xy) / trust;
+    found[at].z = trust;
+}

@@ -1,0 +1,115 @@
+"""Twins of kernels/relay.cl."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from reference.common import (
+    Array,
+    Numbers,
+    bilinear,
+    chart_point,
+    chart_position,
+    four_taps,
+    grid_border,
+    on_grid,
+    pixels,
+)
+from reference.consistency import UNTOLD
+
+MOST = 0.3
+
+
+def _shown(brightness: Array) -> Array:
+    return (brightness != 0) & (brightness < UNTOLD)
+
+
+def seen(other: Array, flow: Array, grid: Sequence[int]) -> tuple[Array, Array]:
+    """What the other layer shows where flow leads from each pixel, and whether that is known."""
+    columns, rows = pixels(grid[0], grid[1])
+    total, known = np.zeros(columns.shape), np.ones(columns.shape, bool)
+    for column, row, weight in four_taps(columns + 0.5 + flow[..., 0], rows + 0.5 + flow[..., 1]):
+        found, inside = on_grid(other[..., 3], grid, column, row)
+        known &= (inside > 0) & _shown(found)
+        total += weight * found
+    return total, known
+
+
+def relay_cells(found: Array, other: Array, grid: Sequence[int], cell: int, noise: float) -> Array:
+    """(height, width, 4) of cells: flow in their middles, its trust in the overlap, else -1, and its fit
+    around, -1 where that is not known.
+    """
+    found, other = found.astype(np.float64), other.astype(np.float64)
+    there, known = seen(other, found, grid)
+    own = found[..., 3]
+    known &= _shown(own)
+    off = own - there
+    result = np.empty((-(-grid[1] // cell), -(-grid[0] // cell), 4))
+    for y, x in np.ndindex(result.shape[:2]):
+        row, column = min(y * cell + cell // 2, grid[1] - 1), min(x * cell + cell // 2, grid[0] - 1)
+        step = np.arange(-cell, cell, 2)
+        columns, rows, inside = grid_border(*np.meshgrid(column + step, row + step), grid)
+        at = rows[inside], columns[inside]
+        at = tuple(axis[known[at]] for axis in at)
+        fit = -1.0
+        if len(at[0]) >= 0.2 * cell * cell:
+            texture, misfit = (
+                np.mean(np.clip(values[at] - values[at].mean(), -MOST, MOST) ** 2) for values in (own, off)
+            )
+            fit = ((texture + noise**2) / (texture + noise**2 + 2 * misfit)) ** 4
+        here = found[row, column]
+        both = _shown(here[3]) and other[row, column, 3] != 0
+        result[y, x] = [*here[:2], here[2] if both else -1, fit]
+    return result
+
+
+def _follow(
+    found: Array, cells: Array, grid: Sequence[int], cell: int, u: Array, v: Array
+) -> tuple[Array, Array, Array]:
+    """Where flow leads from chart positions, and how far it is believed."""
+    inside = (u >= 0) & (v >= 0) & (u < grid[0]) & (v < grid[1])
+    total, share = bilinear(found[..., :3].astype(np.float64), grid, u, v)
+    flow = total / np.maximum(share, 1e-9)[..., None]
+    columns, rows = (np.where(inside, axis, 0).astype(int) // cell for axis in (u, v))
+    believed = np.where(inside, flow[..., 2] * cells[rows, columns, 3], 0)
+    return u + flow[..., 0], v + flow[..., 1], believed
+
+
+def relay_add(
+    first: tuple[Array, Array, Sequence[int], Numbers],
+    second: tuple[Array, Array, Sequence[int], Numbers],
+    cell: int,
+    grid: Sequence[int],
+    chart: Numbers,
+    step: int,
+    share: float,
+) -> Array:
+    """Weighted flow by way of another layer, and weights, (height, width, 4), at every step-th pixel; each
+    part is found flow, its cells, its grid and its chart.
+    """
+    places = [np.minimum(np.arange(-(-n // step)) * step + step // 2, n - 1) + 0.5 for n in grid[:2]]
+    x, y = np.meshgrid(*places)
+    u, v = chart_position(chart_point(x, y, chart), first[3])
+    u, v, weight = _follow(*first[:3], cell, u, v)
+    u, v = chart_position(chart_point(u, v, first[3]), second[3])
+    u, v, more = _follow(*second[:3], cell, u, v)
+    weight = share * weight * more
+    u, v = chart_position(chart_point(u, v, second[3]), chart)
+    across, down = u - x, v - y
+    period = 2 * np.pi * chart[9] if chart[13] else chart[14] * chart[9]
+    if period:
+        across = (across + period / 2) % period - period / 2
+    return np.stack([weight * across, weight * down, weight, np.zeros_like(weight)], -1)
+
+
+def relay_take(total: Array, own: float, found: Array) -> Array:
+    """Found flow, and what others say for the rest of its trust."""
+    kept = own * found[..., 2]
+    taken = (1 - kept) * np.minimum(total[..., 2], 1)
+    other = total[..., :2] / np.maximum(total[..., 2], 1e-9)[..., None]
+    trust = kept + taken
+    mixed = (kept[..., None] * found[..., :2] + taken[..., None] * other) / np.maximum(trust, 1e-9)[..., None]
+    flow = np.where((taken > 0)[..., None], mixed, found[..., :2])
+    return np.dstack([flow, trust, found[..., 3]])

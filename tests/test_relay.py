@@ -1,0 +1,333 @@
+"""Flow by way of other layers: kernels against twins, and scenes whose flow is known."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+from itertools import combinations, permutations
+
+import numpy as np
+import pytest
+from grids import patches, plane, sphere
+from reference import common
+from reference import consistency as consistency_twin
+from reference import relay as twin
+from tolerances import SUM, TRIGONOMETRY, assert_close
+
+from hugin_abflow import relay
+from hugin_abflow.chart import Chart, pair_chart
+from hugin_abflow.consistency import Weighed
+from hugin_abflow.geometry import Pair
+from hugin_abflow.opencl import Device
+from hugin_abflow.working import Grid
+
+CANVASES = {"plane": plane(151, 97), "cylinder": plane(151, 97, wraps=True), "sphere": sphere(302, 151)}
+
+
+def random_found(seed: int, width: int, height: int, far: float = 2.0) -> np.ndarray:
+    """Smooth flow, trust with patches of none, brightness with steps, with patches of nothing and of what
+    tells nothing.
+    """
+    random = np.random.default_rng(seed)
+    found = np.empty((height, width, 4))
+    x, y = np.meshgrid(np.arange(width), np.arange(height))
+    found[..., 0], found[..., 1] = far * np.sin(x / 9 + seed), far * np.cos(y / 7 + x / 23)
+    found[..., 2] = random.random((height, width)) * patches(seed, width, height, 0.8)
+    found[..., 3] = random.normal(size=(height, width)) * 0.05 + patches(seed + 1, width, height, 0.5) * 0.7
+    found[patches(seed + 2, width, height, 0.1, 9) > 0, 3] = consistency_twin.UNTOLD
+    found[patches(seed + 3, width, height, 0.1, 9) > 0, 3] = 0
+    return found.astype(np.float32)
+
+
+@pytest.mark.parametrize("wraps", [False, True])
+@pytest.mark.parametrize("size", [(77, 53), (64, 31), (5, 3), (1, 7), (1, 1)])
+def test_cells_equal_their_twin(device: Device, wraps: bool, size: tuple[int, int]) -> None:
+    grid = (*size, int(wraps), 0)
+    found, other = (random_found(seed, *size) for seed in (1, 20))
+    cells = -(-size[0] // 8), -(-size[1] // 8)
+    result = device.empty((*cells[::-1], 4))
+    device.run(
+        "relay",
+        "relay_cells",
+        cells,
+        device.upload(found),
+        device.upload(other),
+        grid,
+        8,
+        0.03,
+        cells,
+        result,
+    )
+    expected = twin.relay_cells(found, other, grid, 8, 0.03)
+    if size == (77, 53):
+        assert all(-1 in part and part.max() > 0 for part in (expected[..., 2], expected[..., 3]))
+        assert np.ptp(expected[..., 3][expected[..., 3] >= 0]) > 0.1
+    assert_close(result.get(), expected, TRIGONOMETRY, decisions=0.02)
+
+
+def test_the_fit_is_that_of_a_flow_that_is_right_or_wrong(device: Device) -> None:
+    """Of a texture that moved by 3 px; where there is none, any flow fits."""
+    random = np.random.default_rng(3)
+    texture = 0.2 * random.normal(size=(48, 99)) + 1
+    flat = np.ones((48, 99))
+    for shown, flow, low, high in (
+        (texture, 3, 0.99, 1.0), (texture, 0, 0.0, 0.05), (flat, 3, 0.99, 1.0), (flat, 0, 0.99, 1.0),
+    ):  # fmt: skip
+        found, other = np.zeros((2, 48, 96, 4), np.float32)
+        found[..., 0], found[..., 2] = flow, 1
+        found[..., 3], other[..., 3] = shown[:, 3:], shown[:, :-3] + 0.4  # and is brighter
+        cells = device.empty((6, 12, 4))
+        device.run(
+            "relay", "relay_cells", (12, 6), device.upload(found), device.upload(other), (96, 48, 0, 0), 8,
+            0.03, (12, 6), cells,
+        )  # fmt: skip
+        assert low <= cells.get()[:, :-1, 3].min() and cells.get()[:, :-1, 3].max() <= high
+
+
+@pytest.mark.parametrize("name", list(CANVASES))
+@pytest.mark.parametrize("step", [1, 8])
+def test_ways_equal_their_twin(device: Device, name: str, step: int) -> None:
+    """On three charts of their own, each of which holds a part of the others."""
+    canvas = CANVASES[name]
+    rows, columns = np.indices(canvas.shape)
+    overlaps = [
+        columns < 0.7 * canvas.width,
+        rows > 0.2 * canvas.height,
+        np.abs(columns - canvas.width / 2) < 0.3 * canvas.width,
+    ]
+    charts = [pair_chart(overlap, canvas, canvas) for overlap in overlaps]
+    grids = [(one.width, one.height, int(one.wraps), 0) for one in charts]
+    parts = []
+    for seed, (chart, grid) in enumerate(zip(charts[:2], grids[:2], strict=True)):
+        found = random_found(10 * seed, chart.width, chart.height)
+        cells = np.random.default_rng(seed).random((-(-grid[1] // 8), -(-grid[0] // 8), 4))
+        parts.append((found, cells.astype(np.float32), grid, chart.transform))
+    size = -(-grids[2][0] // step), -(-grids[2][1] // step)
+    total = device.upload(np.full((*size[::-1], 4), 0.25, np.float32))
+    device.run(
+        "relay", "relay_add", size,
+        *(device.upload(one) if isinstance(one, np.ndarray) and one.ndim > 1 else one for one in parts[0]),
+        *(device.upload(one) if isinstance(one, np.ndarray) and one.ndim > 1 else one for one in parts[1]),
+        8, grids[2], charts[2].transform, step, size, 0.7, total,
+    )  # fmt: skip
+    expected = twin.relay_add(*parts, 8, grids[2], charts[2].transform, step, 0.7)
+    assert 0.3 < (expected[..., 2] > 0).mean() < 1
+    # a cell, or a chart's rim, may be missed by rounding
+    assert_close(total.get() - 0.25, expected, 2e-3, decisions=0.01)
+    assert_close(total.get()[..., 2] - 0.25, expected[..., 2], TRIGONOMETRY, decisions=0.01)
+
+
+@pytest.mark.parametrize("own", [0.0, 1.0])
+def test_taking_equals_its_twin(device: Device, own: float) -> None:
+    random = np.random.default_rng(5)
+    total = random.normal(size=(53, 77, 4)).astype(np.float32)
+    total[..., 2] = random.random((53, 77)) * 1.5 * patches(4, 77, 53, 0.7)
+    found = random_found(6, 77, 53)
+    result = device.upload(found)
+    device.run("relay", "relay_take", (77, 53), device.upload(total), (77, 53, 0, 0), own, result)
+    expected = twin.relay_take(total, own, found)
+    assert_close(result.get()[..., 2:], expected[..., 2:], SUM)
+    sure = expected[..., 2] > 0.05
+    assert_close(result.get()[sure][:, :2], expected[sure][:, :2], 1e-4)
+
+
+# The module, on scenes in which each layer shows the same, moved by so many px.
+
+
+class Scene:
+    """Layers that lie apart, on a canvas; flows of all pairs, which can be spoilt."""
+
+    def __init__(
+        self,
+        device: Device,
+        canvas: Grid,
+        shifts: Sequence[float],
+        overlaps: dict[tuple[int, int], np.ndarray] | None = None,
+        texture: float = 0.2,
+    ) -> None:
+        self.device, self.canvas, self.shifts, self.texture = device, canvas, shifts, texture
+        everywhere = np.ones(canvas.shape, bool)
+        pairs = overlaps or dict.fromkeys(combinations(range(len(shifts)), 2), everywhere)
+        self.charts = {pair: pair_chart(overlap, canvas, canvas) for pair, overlap in pairs.items()}
+        self.found = [self._weighed(a, b, chart) for (a, b), chart in self.charts.items()]
+
+    def _moved(self, points: np.ndarray, by: float) -> np.ndarray:
+        """Points of the scene, to the right."""
+        if not self.canvas.lens[1]:
+            return points + np.array([by, 0, 0])
+        turn = by * self.canvas.lens[1]
+        x, y, z = np.moveaxis(points, -1, 0)
+        return np.stack(
+            [x * math.cos(turn) + y * math.sin(turn), y * math.cos(turn) - x * math.sin(turn), z], -1
+        )
+
+    def flow(self, a: int, b: int) -> np.ndarray:
+        """The true one, (height, width, 2)."""
+        chart = self.charts[min(a, b), max(a, b)]
+        t = chart.transform
+        x, y = np.meshgrid(np.arange(chart.width) + 0.5, np.arange(chart.height) + 0.5)
+        points = self._moved(common.chart_point(x, y, t), self.shifts[b] - self.shifts[a])
+        u, v = common.chart_position(points, t)
+        period = 2 * math.pi * t[9] if t[13] else t[14] * t[9]
+        across = (u - x + period / 2) % period - period / 2 if period else u - x
+        return np.stack([across, v - y], -1)
+
+    def _brightness(self, layer: int, chart: Chart) -> np.ndarray:
+        x, y = np.meshgrid(np.arange(chart.width) + 0.5, np.arange(chart.height) + 0.5)
+        points = self._moved(common.chart_point(x, y, chart.transform), -self.shifts[layer])
+        scale = 0.7 if not self.canvas.lens[1] else 0.7 / self.canvas.lens[1]
+        waves = np.sin(scale * points @ [1.0, 0.31, 0.17]) + np.cos(scale * points @ [-0.23, 0.9, 0.71])
+        # periods that the cylinder's are not matter little
+        return 1 + self.texture * waves
+
+    def _weighed(self, a: int, b: int, chart: Chart) -> Weighed:
+        ways = []
+        for start, end in ((a, b), (b, a)):
+            trust = np.ones((chart.height, chart.width))
+            values = [*np.moveaxis(self.flow(start, end), -1, 0), trust, self._brightness(start, chart)]
+            ways.append(self.device.upload(np.stack(values, -1).astype(np.float32)))
+        return Weighed(a, b, chart, *ways, False)
+
+    def spoil(self, a: int, b: int, by: float, trust: float = 1.0) -> None:
+        """Flow of a pair that leads elsewhere, and back."""
+        for buffer, sign in zip(self._buffers(a, b), (1, -1), strict=True):
+            values = buffer.get()
+            values[..., 0] += sign * by
+            values[..., 2] = trust
+            buffer.set(values)
+
+    def _buffers(self, a: int, b: int) -> tuple:
+        (pair,) = (one for one in self.found if (one.a, one.b) == (a, b))
+        return pair.forward, pair.backward
+
+    def off(self, a: int, b: int) -> float:
+        """By how much a pair's flow is wrong, px: the median of both ways, where it is trusted."""
+        forward, backward = (buffer.get() for buffer in self._buffers(a, b))
+        wrong = [
+            np.linalg.norm(values[..., :2] - self.flow(*way), axis=-1)[values[..., 2] > 0.3]
+            for values, way in ((forward, (a, b)), (backward, (b, a)))
+        ]
+        return float(np.median(np.concatenate(wrong)))
+
+    def mend(self) -> list[tuple[int, int]]:
+        return relay.mend(self.device, self.found)
+
+    def state(self) -> list[np.ndarray]:
+        return [buffer.get() for one in self.found for buffer in (one.forward, one.backward)]
+
+
+SHIFTS = (0.0, 3.0, -2.0, 5.0)
+
+
+@pytest.mark.parametrize("name", list(CANVASES))
+@pytest.mark.parametrize("texture", [0.0, 0.2])
+def test_what_agrees_stays_to_the_bit(device: Device, name: str, texture: float) -> None:
+    scene = Scene(device, CANVASES[name], SHIFTS, texture=texture)
+    before = scene.state()
+    assert scene.mend() == []
+    assert all(np.array_equal(*both) for both in zip(before, scene.state(), strict=True))
+
+
+@pytest.mark.parametrize("name", list(CANVASES))
+@pytest.mark.parametrize("pair", list(combinations(range(4), 2)))
+def test_the_pair_that_two_triangles_contradict_is_the_wrong_one(
+    device: Device, name: str, pair: tuple[int, int]
+) -> None:
+    """Without texture, whatever the images say; it leads back to the start all the same."""
+    scene = Scene(device, CANVASES[name], SHIFTS, texture=0.0)
+    scene.spoil(*pair, 20.0)
+    others = {other: scene.off(*other) for other in scene.charts if other != pair}
+    assert scene.off(*pair) == pytest.approx(20, abs=0.5)
+    assert scene.mend() == [pair]
+    assert scene.off(*pair) < 0.05
+    assert {other: scene.off(*other) for other in others} == others
+
+
+@pytest.mark.parametrize("pair", list(combinations(range(3), 2)))
+def test_of_three_layers_the_images_tell_which_flow_is_wrong(device: Device, pair: tuple[int, int]) -> None:
+    scene = Scene(device, CANVASES["plane"], SHIFTS[:3])
+    scene.spoil(*pair, 20.0)
+    assert scene.mend() == [pair]
+    assert scene.off(*pair) < 0.05
+
+
+def test_what_nothing_decides_stays(device: Device) -> None:
+    """Three layers of one colour: each pair has as much to say as the others."""
+    scene = Scene(device, CANVASES["plane"], SHIFTS[:3], texture=0.0)
+    scene.spoil(0, 1, 20.0)
+    before = scene.state()
+    assert scene.mend() == []
+    assert all(np.array_equal(*both) for both in zip(before, scene.state(), strict=True))
+
+
+@pytest.mark.parametrize("wide", [True, False])
+def test_small_overlaps_refute_no_large_ones(device: Device, wide: bool) -> None:
+    """But large ones small ones."""
+    canvas = CANVASES["plane"]
+    columns = np.indices(canvas.shape)[1]
+    small, large = columns < 24, columns < 140
+    overlaps = {(0, 1): large if wide else small, (0, 2): large, (1, 2): large}
+    if wide:
+        overlaps = {(0, 1): large, (0, 2): small, (1, 2): small}
+    scene = Scene(device, canvas, SHIFTS[:3], overlaps, texture=0.0)
+    scene.spoil(0, 1, 20.0)
+    assert (0, 1) not in scene.mend() if wide else scene.mend() in ([], [(0, 1)])
+    assert scene.off(0, 2) < 0.05 or not wide
+
+
+@pytest.mark.parametrize("name", list(CANVASES))
+def test_where_a_flow_is_not_trusted_the_others_tell_it(device: Device, name: str) -> None:
+    """Its own stays where it is."""
+    scene = Scene(device, CANVASES[name], SHIFTS, texture=0.0)
+    for buffer in scene._buffers(1, 2):
+        values = buffer.get()
+        half = values.shape[1] // 2
+        values[:, half:, :2], values[:, half:, 2] = 7, 0
+        buffer.set(values)
+    before = scene._buffers(1, 2)[0].get()
+    assert scene.mend() == [(1, 2)]
+    after = scene._buffers(1, 2)[0].get()
+    half = before.shape[1] // 2
+    assert np.array_equal(before[:, :half], after[:, :half])
+    assert (after[..., 2] > 0.5).mean() > 0.8
+    assert scene.off(1, 2) < 0.05
+
+
+def test_a_few_untrusted_pixels_are_left_to_what_is_around(device: Device) -> None:
+    scene = Scene(device, CANVASES["plane"], SHIFTS)
+    for buffer in scene._buffers(1, 2):
+        values = buffer.get()
+        values[:, :14, 2] = 0
+        buffer.set(values)
+    before = scene.state()
+    assert scene.mend() == []
+    assert all(np.array_equal(*both) for both in zip(before, scene.state(), strict=True))
+
+
+def test_the_order_of_layers_does_not_matter(device: Device) -> None:
+    """Nor which one of a pair is the first."""
+    results = []
+    for order in list(permutations(range(4)))[::5]:
+        scene = Scene(device, CANVASES["plane"], [SHIFTS[k] for k in order])
+        pair = sorted((order.index(1), order.index(2)))
+        scene.spoil(*pair, 20.0 if order.index(1) < order.index(2) else -20.0)
+        assert scene.mend() == [tuple(pair)]
+        forward, backward = scene._buffers(*pair)
+        results.append((forward if order.index(1) < order.index(2) else backward).get())
+    for other in results[1:]:
+        assert np.allclose(other, results[0], atol=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("pairs", "expected"),
+    [
+        ([], False),
+        ([(0, 1)], False),
+        ([(0, 1), (1, 2)], False),
+        ([(0, 1), (1, 2), (2, 3), (0, 3)], False),
+        ([(0, 1), (0, 2), (1, 2)], True),
+        ([(0, 2), (1, 2), (2, 3), (1, 3)], True),
+    ],
+)
+def test_three_layers_each_two_of_which_overlap(pairs: Iterable[tuple[int, int]], expected: bool) -> None:
+    assert relay.triangles([Pair(*pair) for pair in pairs]) == expected
