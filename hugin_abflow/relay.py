@@ -10,8 +10,8 @@ that are reliable themselves, and the worse its layers fit by it,
 
 h is what an overlap has to say of itself, by its fit; A and D are the parts of it, as far as its own flow is
 trusted, in which ways by another layer b lead where that does, or elsewhere, by how far both legs of each are
-believed, times r_ab r_bc. It is solved by a fixed point, from r = 1. Flow that is refuted so becomes the mean
-of the other ways. Where they know much of an overlap in which its own flow is not trusted, they tell that.
+believed, times r_ab r_bc. It is solved by a fixed point, from r = 1. Flow that is doubted so becomes the mean
+of the other ways where they are known, and so does that of which they know much more.
 """
 
 from __future__ import annotations
@@ -36,11 +36,14 @@ _NOISE = 0.03
 _AGREES = 3.0
 # What an overlap that fits has to say of itself, against one other way that is believed all over it.
 _OWN = 0.3
-# A pair that is less reliable than this is refuted. In rendered rooms, whose parallax is known, wrong ones
-# were below .2, right ones above .45.
-_REFUTED = 0.33
-# The share of an overlap that others have to know, and its own flow does not, to be asked.
+# Pairs that are less reliable than this go by way of others that are more so, where these know it. (In
+# rendered rooms, whose parallax is known, a bound of .9 spoilt some that were right.) Below the second bound
+# nothing of their own flow is left: most of it was wrong.
+_DOUBTED, _REFUTED = 0.7, 0.33
+# So do those of which others know this share, at least, where their own flow is not trusted.
 _MISSED = 0.15
+# How far a way is to be believed, both legs times their fit and reliability, that is as good as sure.
+_SURE = 0.1
 # Rounds of the fixed point, each of which goes half of the way.
 _ROUNDS = 8
 # A way has to be known so far in so many cells.
@@ -94,24 +97,24 @@ def triangles(pairs: Iterable[Pair]) -> bool:
 
 
 def mend(device: Device, found: Sequence[Weighed]) -> list[Key]:
-    """Replace, in place, flow that others refute, and what they know better; returns of which pairs."""
+    """Replace, in place, flow that others contradict, or know better; returns of which pairs."""
     ways = dict(_ways(device, found))
     beside = _beside(ways)
     others = {(a, c): list(_others(device, ways, a, c, sorted(beside[a] & beside[c]))) for a, c in ways}
     reliable = _reliable(ways, others)
-    refuted = {key for key, value in reliable.items() if value < _REFUTED}
     changed = list[tuple[Key, Buffer]]()
     for (a, c), way in ways.items():
-        sound = [one for one in others[a, c] if not {(a, one.by), (one.by, c)} & refuted]
-        if not sound or ((a, c) not in refuted and _missed(way, sound) < _MISSED):
+        by = {one.by: reliable[a, one.by] * reliable[one.by, c] for one in others[a, c]}
+        better = [one for one in others[a, c] if by[one.by] > min(reliable[a, c], _DOUBTED)]
+        if not better or (reliable[a, c] > _DOUBTED and _missed(way, better) < _MISSED):
             continue
         total = device.zeros((way.chart.height, way.chart.width, 4))
-        for one in sound:
-            _add(device, ways, (a, one.by, c), 1, reliable[a, one.by] * reliable[one.by, c], total)
+        for one in better:
+            _add(device, ways, (a, one.by, c), 1, by[one.by], total)
         changed.append(((a, c), total))
     for key, total in changed:  # only now: they are legs of others
-        way, own = ways[key], 0.0 if key in refuted else 1.0
-        device.run("relay", "relay_take", way.grid[:2], total, way.grid, own, way.found)
+        way, own = ways[key], 0.0 if reliable[key] < _REFUTED else 1.0
+        device.run("relay", "relay_take", way.grid[:2], total, way.grid, _SURE, own, way.found)
     return sorted({(min(key), max(key)) for key, _ in changed})
 
 

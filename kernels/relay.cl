@@ -129,10 +129,11 @@ __kernel void relay_add(__global const float4 *first,        /* (first_grid.y, f
     sum[y * size.x + x] += (float4)(weight * way, weight, 0.0f);
 }
 
-/* Where found flow is not trusted, it becomes that by way of others, as far as they are; in place. */
+/* Found flow becomes that by way of others where they know it, in place. */
 __kernel void relay_take(__global const float4 *sum, /* (grid.y, grid.x) of relay_add, with a step of 1 */
                          int4 grid,                  /* run size */
-                         float own,                  /* what found flow's trust counts: 0 or 1 */
+                         float enough,               /* weight of others from which on they are sure */
+                         float own,                  /* what found flow's trust counts where they are not: 0 or 1 */
                          __global float4 *found)     /* (grid.y, grid.x) */
 {
     const int x = get_global_id(0), y = get_global_id(1);
@@ -140,7 +141,7 @@ __kernel void relay_take(__global const float4 *sum, /* (grid.y, grid.x) of rela
         return;
     const int at = y * grid.x + x;
     const float4 its = sum[at];
-    const float kept = own * found[at].z, taken = (1.0f - kept) * LEAST(its.z, 1.0f), trust = kept + taken;
+    const float taken = LEAST(its.z / enough, 1.0f), kept = own * (1.0f - taken) * found[at].z, trust = kept + taken;
     if (taken > 0.0f)
         found[at].xy = (kept * found[at].xy + taken / its.z * its.xy) / trust;
     found[at].z = trust;

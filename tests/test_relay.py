@@ -121,11 +121,11 @@ def test_ways_equal_their_twin(device: Device, name: str, step: int) -> None:
 def test_taking_equals_its_twin(device: Device, own: float) -> None:
     random = np.random.default_rng(5)
     total = random.normal(size=(53, 77, 4)).astype(np.float32)
-    total[..., 2] = random.random((53, 77)) * 1.5 * patches(4, 77, 53, 0.7)
+    total[..., 2] = random.random((53, 77)) * 0.5 * patches(4, 77, 53, 0.7)
     found = random_found(6, 77, 53)
     result = device.upload(found)
-    device.run("relay", "relay_take", (77, 53), device.upload(total), (77, 53, 0, 0), own, result)
-    expected = twin.relay_take(total, own, found)
+    device.run("relay", "relay_take", (77, 53), device.upload(total), (77, 53, 0, 0), 0.3, own, result)
+    expected = twin.relay_take(total, 0.3, own, found)
     assert_close(result.get()[..., 2:], expected[..., 2:], SUM)
     sure = expected[..., 2] > 0.05
     assert_close(result.get()[sure][:, :2], expected[sure][:, :2], 1e-4)
@@ -277,20 +277,38 @@ def test_small_overlaps_refute_no_large_ones(device: Device, wide: bool) -> None
 
 @pytest.mark.parametrize("name", list(CANVASES))
 def test_where_a_flow_is_not_trusted_the_others_tell_it(device: Device, name: str) -> None:
-    """Its own stays where it is."""
     scene = Scene(device, CANVASES[name], SHIFTS, texture=0.0)
     for buffer in scene._buffers(1, 2):
         values = buffer.get()
         half = values.shape[1] // 2
         values[:, half:, :2], values[:, half:, 2] = 7, 0
         buffer.set(values)
-    before = scene._buffers(1, 2)[0].get()
     assert scene.mend() == [(1, 2)]
-    after = scene._buffers(1, 2)[0].get()
-    half = before.shape[1] // 2
-    assert np.array_equal(before[:, :half], after[:, :half])
-    assert (after[..., 2] > 0.5).mean() > 0.8
+    assert (scene._buffers(1, 2)[0].get()[..., 2] > 0.5).mean() > 0.8
     assert scene.off(1, 2) < 0.05
+
+
+@pytest.mark.parametrize(("spoilt", "kept"), [(60, True), (110, False)])
+def test_where_others_do_not_reach_doubted_flow_stays_and_refuted_flow_does_not(
+    device: Device, spoilt: int, kept: bool
+) -> None:
+    """A third and a fourth layer are at the left alone; there flow is wrong."""
+    canvas = CANVASES["plane"]
+    columns = np.indices(canvas.shape)[1]
+    overlaps = dict.fromkeys(combinations(range(4), 2), columns < 110) | {(0, 1): columns < 140}
+    scene = Scene(device, canvas, SHIFTS, overlaps, texture=0.0)
+    wrong = scene._buffers(0, 1)
+    for buffer, sign in zip(wrong, (1, -1), strict=True):
+        values = buffer.get()
+        values[:, :spoilt, 0] += sign * 20
+        buffer.set(values)
+    before = wrong[0].get()
+    assert scene.mend() == [(0, 1)]
+    after = wrong[0].get()
+    assert np.abs(after[:, 5 : spoilt - 5, :2] - scene.flow(0, 1)[:, 5 : spoilt - 5]).max() < 0.05
+    right = np.s_[:, 135:140]
+    assert np.array_equal(after[right][..., :2], before[right][..., :2])
+    assert np.array_equal(after[right][..., 2], before[right][..., 2] * kept)
 
 
 def test_a_few_untrusted_pixels_are_left_to_what_is_around(device: Device) -> None:

@@ -104,10 +104,10 @@ def relay_add(
     return np.stack([weight * across, weight * down, weight, np.zeros_like(weight)], -1)
 
 
-def relay_take(total: Array, own: float, found: Array) -> Array:
-    """Found flow, and what others say for the rest of its trust."""
-    kept = own * found[..., 2]
-    taken = (1 - kept) * np.minimum(total[..., 2], 1)
+def relay_take(total: Array, enough: float, own: float, found: Array) -> Array:
+    """What others say, and found flow for the rest, with their trust."""
+    taken = np.minimum(total[..., 2] / enough, 1)
+    kept = own * (1 - taken) * found[..., 2]
     other = total[..., :2] / np.maximum(total[..., 2], 1e-9)[..., None]
     trust = kept + taken
     mixed = (kept[..., None] * found[..., :2] + taken[..., None] * other) / np.maximum(trust, 1e-9)[..., None]
