@@ -103,8 +103,8 @@ def distance(
 ) -> Buffer:
     """D_k of layer `index` in working pixels, float32 on the mask grid; `cover` is the union's mask.
 
-    within          working px up to which distances matter; longer ones may be told as longer than they are,
-                    and are found faster.
+    within          working px up to which distances matter; to find no longer ones takes less time. Those may
+                    be told as longer than they are.
     """
     grid = masks_.grid
     size = grid.border[:2]

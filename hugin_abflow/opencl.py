@@ -42,10 +42,6 @@ _INSTALL = {
 _HIDING = ("OCL_ICD_VENDORS", "POCL_DEVICES", "POCL_CACHE_DIR")
 
 
-# Whether drivers have read the environment; they do so once.
-_loaded = threading.Event()
-
-
 @dataclass(frozen=True)
 class DeviceInfo:
     """One line of ``--list-devices``. memory: bytes; kind: "GPU", "CPU" or "other"."""
@@ -80,19 +76,17 @@ def _kind(device: cl.Device) -> str:
 def _devices(threads: int = 0) -> list[cl.Device]:
     """All devices of all platforms; `DeviceError` where there is none. threads: as of `Device`."""
     pocl.find_cache()
-    if not _loaded.is_set():
-        pocl.use_cores(threads)
-    try:
-        platforms = cl.get_platforms()
-    except cl.Error:
-        platforms = []
-    _loaded.set()
     found = []
-    for platform in platforms:
+    with pocl.cores(threads):
         try:
-            found += platform.get_devices()
-        except cl.Error as error:  # a platform without devices must not hide the others
-            _log.debug("%s: %s", platform.name, error)
+            platforms = cl.get_platforms()
+        except cl.Error:
+            platforms = []
+        for platform in platforms:
+            try:
+                found += platform.get_devices()
+            except cl.Error as error:  # a platform without devices must not hide the others
+                _log.debug("%s: %s", platform.name, error)
     if not found:
         remedy = _INSTALL.get(sys.platform, _INSTALL["linux"])
         raise DeviceError(f"no OpenCL device found; {_hidden()}{remedy}")
@@ -283,7 +277,8 @@ class Device:
     """A device with its queue and built kernels.
 
     wanted      as `Settings.device`.
-    threads     cores that a processor may use; 0: all. Other devices use what they have.
+    threads     cores that a processor may use; 0: all. Other devices use what they have. PoCL keeps to what
+                it is first asked for in a process, if that is less.
 
     Raises `DeviceError` if there is none, none fits `wanted`, or a kernel does not build.
     """

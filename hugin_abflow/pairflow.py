@@ -116,7 +116,7 @@ def solve(
         if settings.relay and relay.triangles(pairs):
             for a, b in relay.mend(device, weighed):
                 _log.info(
-                    "flow of %s and %s: by way of other layers, which contradict their own",
+                    "flow of %s and %s: by way of other layers, which contradict it or know more",
                     layers[a].layer.name, layers[b].layer.name,
                 )  # fmt: skip
         result = [consistency.mend(device, weighed.pop(0)) for _ in range(len(weighed))]

@@ -23,8 +23,8 @@ import platform
 import stat
 import struct
 import sys
-from collections.abc import Set
-from contextlib import suppress
+from collections.abc import Iterator, Set
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 _log = logging.getLogger(__name__)
@@ -83,13 +83,20 @@ def find_cache() -> None:
     )
 
 
-def use_cores(count: int) -> None:
-    """Have PoCL use so many cores, in the whole process, and no more than there are; 0: all.
+@contextmanager
+def cores(count: int) -> Iterator[None]:
+    """Have PoCL use so many cores, and no more than there are, if its drivers are loaded meanwhile; 0: all.
 
-    To be called before OpenCL's drivers are loaded. What the environment says already counts.
+    What the environment says already counts. Nothing is left in it.
     """
-    if count and not any(name in os.environ for name in _CORES):
-        os.environ.update(dict.fromkeys(_CORES, str(min(count, os.cpu_count() or count))))
+    told = {} if not count or any(name in os.environ for name in _CORES) else dict.fromkeys(_CORES)
+    for name in told:
+        os.environ[name] = str(min(count, os.cpu_count() or count))
+    try:
+        yield
+    finally:
+        for name in told:
+            os.environ.pop(name, None)
 
 
 def _holds_programs(folder: Path) -> bool:

@@ -6,12 +6,14 @@ or in which a pattern was matched one repeat too far; and it may lead back to th
 one it is, the other triangles tell, and the images: a pair is the less reliable the more pairs contradict it
 that are reliable themselves, and the worse its layers fit by it,
 
-    r_ac = (h_ac + A_ac) / (h_ac + A_ac + D_ac).
+    r_ac = (h f_ac T_ac + A_ac) / (h f_ac T_ac + A_ac + D_ac).
 
-h is what an overlap has to say of itself, by its fit; A and D are the parts of it, as far as its own flow is
-trusted, in which ways by another layer b lead where that does, or elsewhere, by how far both legs of each are
-believed, times r_ab r_bc. It is solved by a fixed point, from r = 1. Flow that is doubted so becomes the mean
-of the other ways where they are known, and so does that of which they know much more.
+T is the sum of trust in its own flow, over cells of its overlap; f its mean fit; h a constant. A is the sum,
+over all other layers b, of what ways by b say for that flow, and D of what they say against it: the trust
+that both have in a cell, times the fit of the legs, r_ab r_bc, and how near to each other they lead, or how
+far. It is solved by a fixed point, from r = 1. Of doubted pairs, and of
+those of which others know much more than their own flow is sure of, what contradicts the more reliable ways
+becomes their mean, and so does what is not trusted.
 """
 
 from __future__ import annotations
@@ -37,10 +39,12 @@ _AGREES = 3.0
 # What an overlap that fits has to say of itself, against one other way that is believed all over it.
 _OWN = 0.3
 # Pairs that are less reliable than this go by way of others that are more so, where these know it. (In
-# rendered rooms, whose parallax is known, a bound of .9 spoilt some that were right.) Below the second bound
-# nothing of their own flow is left: most of it was wrong.
-_DOUBTED, _REFUTED = 0.7, 0.33
-# So do those of which others know this share, at least, where their own flow is not trusted.
+# rendered rooms, whose parallax is known, .9 spoilt some that were right.)
+_DOUBTED = 0.8
+# Below this, if others are sure in such a part of the overlap, nothing of its own flow is left.
+_REFUTED, _COVERED = 0.33, 0.3
+# The share of an overlap that others have to know, and its own flow does not, to be asked where it is not
+# doubted.
 _MISSED = 0.15
 # How far a way is to be believed, both legs times their fit and reliability, that is as good as sure.
 _SURE = 0.1
@@ -48,6 +52,9 @@ _SURE = 0.1
 _ROUNDS = 8
 # A way has to be known so far in so many cells.
 _KNOWN, _LEAST_CELLS = 0.05, 4
+# Third layers that are asked about a pair, those with the largest overlaps: where many overlap each other,
+# all triangles would be too many.
+_MOST = 4
 
 Values = npt.NDArray[np.float64]
 Key = tuple[int, int]
@@ -55,12 +62,13 @@ Key = tuple[int, int]
 
 @dataclass(frozen=True)
 class _Way:
-    """Found flow from one layer of a pair to the other; in cells, (height, width): its way, in px (..., 2),
+    """Found flow from one layer of a pair to the other, and back; in cells, (height, width): its way, in px,
     whether it lies in the overlap, and its trust, 0 beside that; and the mean of its fit.
     """
 
     chart: Chart
     found: Buffer
+    back: Buffer
     cells: Buffer
     flow: Values
     inside: npt.NDArray[np.bool_]
@@ -97,25 +105,49 @@ def triangles(pairs: Iterable[Pair]) -> bool:
 
 
 def mend(device: Device, found: Sequence[Weighed]) -> list[Key]:
-    """Replace, in place, flow that others contradict, or know better; returns of which pairs."""
+    """Replace, in place, flow that others contradict, or know better; returns of which pairs, as (a, b)."""
     ways = dict(_ways(device, found))
-    beside = _beside(ways)
-    others = {(a, c): list(_others(device, ways, a, c, sorted(beside[a] & beside[c]))) for a, c in ways}
+    others = dict(_all_others(device, ways))
     reliable = _reliable(ways, others)
-    changed = list[tuple[Key, Buffer]]()
-    for (a, c), way in ways.items():
-        by = {one.by: reliable[a, one.by] * reliable[one.by, c] for one in others[a, c]}
-        better = [one for one in others[a, c] if by[one.by] > min(reliable[a, c], _DOUBTED)]
-        if not better or (reliable[a, c] > _DOUBTED and _missed(way, better) < _MISSED):
+    changed = []
+    # legs are more reliable than what is replaced by them, so that they are as they were found
+    for a, c in sorted(((pair.a, pair.b) for pair in found), key=lambda pair: (reliable[pair], pair)):
+        both, doubted = ((a, c), (c, a)), reliable[a, c] < _DOUBTED
+        least = min(reliable[a, c], _DOUBTED)
+        better = {
+            (start, end): {
+                one.by: share
+                for one in others[start, end]
+                if (share := reliable[start, one.by] * reliable[one.by, end]) > least
+            }
+            for start, end in both
+        }
+        if not all(better.values()):  # both ways have to lead back
             continue
-        total = device.zeros((way.chart.height, way.chart.width, 4))
-        for one in better:
-            _add(device, ways, (a, one.by, c), 1, by[one.by], total)
-        changed.append(((a, c), total))
-    for key, total in changed:  # only now: they are legs of others
-        way, own = ways[key], 0.0 if reliable[key] < _REFUTED else 1.0
-        device.run("relay", "relay_take", way.grid[:2], total, way.grid, _SURE, own, way.found)
-    return sorted({(min(key), max(key)) for key, _ in changed})
+        known = [_known(others[key], better[key]) for key in both]
+        missed, covered = (
+            min(share(ways[key], its) for key, its in zip(both, known, strict=True))
+            for share in (_missed, _covered)
+        )
+        if doubted or missed >= _MISSED:
+            counts = 0.0 if reliable[a, c] < _REFUTED and covered >= _COVERED else 1.0
+            for key, total in [(key, _sum(device, ways, key, better[key])) for key in both]:
+                way = ways[key]
+                device.run(
+                    "relay", "relay_take", way.grid[:2], total, way.grid, _SURE, _AGREES, counts,
+                    way.found,
+                )  # fmt: skip
+            changed.append((a, c))
+    return sorted(changed)
+
+
+def _sum(device: Device, ways: dict[Key, _Way], key: Key, by: dict[int, float]) -> Buffer:
+    """The weighted sum of ways by other layers at all pixels. by: what each of them counts."""
+    chart = ways[key].chart
+    total = device.zeros((chart.height, chart.width, 4))
+    for b, share in by.items():
+        _add(device, ways, (key[0], b, key[1]), 1, share, total)
+    return total
 
 
 def _beside(keys: Iterable[Key]) -> dict[int, set[int]]:
@@ -146,7 +178,7 @@ def _way(device: Device, chart: Chart, own: Buffer, other: Buffer) -> _Way:
     mean = float((known * fit).sum() / known.sum()) if known.any() else 1.0
     values[..., 3] = np.where(fit >= 0, fit, mean)  # where it cannot be seen
     cells.set(values.astype(np.float32))
-    return _Way(chart, own, cells, values[..., :2], inside, trust, mean)
+    return _Way(chart, own, other, cells, values[..., :2], inside, trust, mean)
 
 
 def _cells(chart: Chart) -> tuple[int, int]:
@@ -154,11 +186,18 @@ def _cells(chart: Chart) -> tuple[int, int]:
     return -(-chart.width // _CELL), -(-chart.height // _CELL)
 
 
-def _others(device: Device, ways: dict[Key, _Way], a: int, c: int, by: Iterable[int]) -> Iterator[_Other]:
-    """The ways from a to c by other layers that tell something. What small overlaps say of large ones counts
-    less, by their areas.
-    """
-    own = ways[a, c]
+def _all_others(device: Device, ways: dict[Key, _Way]) -> Iterator[tuple[Key, list[_Other]]]:
+    """The ways by third layers, for each way."""
+    beside = _beside(ways)
+    for a, c in ways:
+        smaller = {b: min(ways[a, b].area, ways[b, c].area) for b in beside[a] & beside[c]}
+        largest = sorted(smaller, key=lambda b: (-smaller[b], b))[:_MOST]
+        yield (a, c), list(_others(device, ways, (a, c), sorted(largest)))
+
+
+def _others(device: Device, ways: dict[Key, _Way], key: Key, by: Iterable[int]) -> Iterator[_Other]:
+    """The ways from a to c by some other layers, of those that tell something."""
+    own, (a, c) = ways[key], key
     for b in by:
         total = device.zeros((*own.trust.shape, 4))
         _add(device, ways, (a, b, c), _CELL, 1.0, total)
@@ -168,8 +207,7 @@ def _others(device: Device, ways: dict[Key, _Way], a: int, c: int, by: Iterable[
             continue
         flow = values[..., :2] / np.maximum(known, 1e-12)[..., None]
         agree = 1 / np.square(1 + np.square(flow - own.flow).sum(-1) / _AGREES**2)
-        smaller = min(ways[a, b].area, ways[b, c].area)
-        told = min(1.0, smaller / max(own.area, 1.0)) * known * own.trust
+        told = known * own.trust
         yield _Other(b, known, float((told * agree).sum()), float((told * (1 - agree)).sum()))
 
 
@@ -181,9 +219,9 @@ def _add(
     first, second, own = ways[a, b], ways[b, c], ways[a, c]
     size = total.shape[1], total.shape[0]
     device.run(
-        "relay", "relay_add", size, first.found, first.cells, first.grid, first.chart.transform,
-        second.found, second.cells, second.grid, second.chart.transform, _CELL, own.grid,
-        own.chart.transform, step, size, share, total,
+        "relay", "relay_add", size, first.found, first.back, first.cells, first.grid,
+        first.chart.transform, second.found, second.back, second.cells, second.grid,
+        second.chart.transform, _CELL, own.grid, own.chart.transform, step, size, share, total,
     )  # fmt: skip
 
 
@@ -206,7 +244,17 @@ def _told(key: Key, own: _Way, others: Sequence[_Other], reliable: dict[Key, flo
     return held / (held + differs) if differs else 1.0
 
 
-def _missed(way: _Way, others: Sequence[_Other]) -> float:
-    """The share of an overlap in which others know the way, and its own flow is not trusted."""
-    known = np.minimum(sum(one.known for one in others), 1.0)
-    return float(((1 - way.trust) * known)[way.inside].mean()) if way.inside.any() else 0.0
+def _known(others: Sequence[_Other], by: Iterable[int]) -> Values:
+    """How far a way is known by some of the others, by cells."""
+    return np.asarray(np.sum([one.known for one in others if one.by in by], axis=0))
+
+
+def _missed(way: _Way, known: Values) -> float:
+    """The share of an overlap that others know, and in which its own flow is not trusted. known: by cells."""
+    return float(((1 - way.trust) * np.minimum(known, 1))[way.inside].mean()) if way.inside.any() else 0.0
+
+
+def _covered(way: _Way, known: Values) -> float:
+    """The share of what own flow is trusted in that others are sure of."""
+    trusted = way.trust.sum()
+    return float((way.trust * np.minimum(known / _SURE, 1)).sum() / trusted) if trusted else 1.0

@@ -59,7 +59,8 @@ class Settings:
     band_rows           rows of a full-resolution band; 0: chosen from the canvas width and `max_memory`.
     max_memory          bytes that host and device may take together; 0: half of the machine's memory. It
                         changes no pixel.
-    threads             processor cores that are used at a time; 0: all. It changes no pixel.
+    threads             processor cores that are used at a time; 0: all. It changes no pixel. PoCL keeps to
+                        the first number that it is opened with in a process.
     device              index in ``--list-devices`` or part of a device's name; None: the fastest GPU,
                         else CPU.
     """

@@ -56,7 +56,8 @@ __kernel void coefficient_flood(__global const int *seed,    /* (grid.y, grid.x)
     if (x >= grid.x || y >= grid.y)
         return;
     const int known = seed[y * grid.x + x];
-    if (known == x + (y << 16) || step > table[2 * grid.y + grid.x + y]) { /* a seed itself: nothing is nearer */
+    /* a seed itself, nothing is nearer; or nothing that far matters */
+    if (known == x + (y << 16) || step > table[2 * grid.y + grid.x + y]) {
         flooded[y * grid.x + x] = known;
         return;
     }

@@ -21,9 +21,9 @@ static inline float relay_seen(__global const float4 *other, int2 p, float2 flow
     return sum;
 }
 
-/* For the middle of each cell the flow there and its trust, -1 where not both layers show something; and its fit: with s^2 the
-   variance of brightness around it, e^2 that of its difference from what the other layer shows where the flows lead,
-   ((s^2 + n^2) / (s^2 + n^2 + 2 e^2))^4; -1 where next to nothing is known. */
+/* For the middle of each cell the flow there and its trust, -1 where not both layers show something; and its fit: with
+   s^2 the variance of brightness around it, e^2 that of its difference from what the other layer shows where the flows
+   lead, ((s^2 + n^2) / (s^2 + n^2 + 2 e^2))^4; -1 where next to nothing is known. */
 __kernel void relay_cells(__global const float4 *found, /* (grid.y, grid.x) from layer a to layer b */
                           __global const float4 *other, /* (grid.y, grid.x) from b to a */
                           int4 grid,                    /* width, height, wraps, 0 */
@@ -74,17 +74,20 @@ __kernel void relay_cells(__global const float4 *found, /* (grid.y, grid.x) from
 }
 
 /* Where flow leads from position u of its chart, in place; and how far that is to be believed there: trust times fit,
-   0 beside the chart. */
-static inline float relay_follow(__global const float4 *found, __global const float4 *cells, int4 grid, int cell,
-                                 float2 *u) {
+   0 beside the chart and where not both layers show something: flow is carried on there, and leads back as well. */
+static inline float relay_follow(__global const float4 *found, __global const float4 *back,
+                                 __global const float4 *cells, int4 grid, int cell, float2 *u) {
     if (!(u->x >= 0.0f && u->y >= 0.0f && u->x < grid.x && u->y < grid.y))
         return 0.0f;
+    const int x = (int)u->x, y = (int)u->y, pixel = y * grid.x + x;
     int4 at;
-    const float4 w = bilinear_taps(*u, grid, &at);
-    const float4 f = w.x * found[at.x] + w.y * found[at.y] + w.z * found[at.z] + w.w * found[at.w];
-    const int column = (int)u->x / cell, row = (int)u->y / cell;
-    *u += f.xy;
-    return f.z * cells[row * ((grid.x + cell - 1) / cell) + column].w;
+    const float4 taps = bilinear_taps(*u, grid, &at);
+    const float4 w = taps * (float4)(found[at.x].z, found[at.y].z, found[at.z].z, found[at.w].z);
+    const float trust = w.x + w.y + w.z + w.w;
+    if (found[pixel].w == 0.0f || back[pixel].w == 0.0f || trust <= 0.0f)
+        return 0.0f;
+    *u += (w.x * found[at.x].xy + w.y * found[at.y].xy + w.z * found[at.z].xy + w.w * found[at.w].xy) / trust;
+    return trust * cells[y / cell * ((grid.x + cell - 1) / cell) + x / cell].w;
 }
 
 /* The point of a chart's position. */
@@ -98,10 +101,11 @@ static inline float3 relay_point(float2 u, const float16 *chart) {
 /* Add the flow from a to c by way of b, F_ab(q) and then F_bc where that leads, at every step-th pixel of their
    chart, weighted by how far both are believed. */
 __kernel void relay_add(__global const float4 *first,        /* (first_grid.y, first_grid.x) found, from a to b */
+                        __global const float4 *first_back,   /* (first_grid.y, first_grid.x) from b to a */
                         __global const float4 *first_cells,  /* of relay_cells */
                         int4 first_grid, float16 first_chart,
                         __global const float4 *second,       /* (second_grid.y, second_grid.x) from b to c */
-                        __global const float4 *second_cells,
+                        __global const float4 *second_back, __global const float4 *second_cells,
                         int4 second_grid, float16 second_chart,
                         int cell,
                         int4 grid, float16 chart,            /* of a and c */
@@ -115,11 +119,11 @@ __kernel void relay_add(__global const float4 *first,        /* (first_grid.y, f
     const int2 p = (int2)(LEAST(x * step + step / 2, grid.x - 1), LEAST(y * step + step / 2, grid.y - 1));
     const float2 from = convert_float2(p) + 0.5f;
     float2 u = chart_position(relay_point(from, &chart), &first_chart);
-    float weight = share * relay_follow(first, first_cells, first_grid, cell, &u);
+    float weight = share * relay_follow(first, first_back, first_cells, first_grid, cell, &u);
     if (weight <= 0.0f)
         return;
     u = chart_position(relay_point(u, &first_chart), &second_chart);
-    weight *= relay_follow(second, second_cells, second_grid, cell, &u);
+    weight *= relay_follow(second, second_back, second_cells, second_grid, cell, &u);
     if (weight <= 0.0f)
         return;
     float2 way = chart_position(relay_point(u, &second_chart), &chart) - from;
@@ -129,20 +133,27 @@ __kernel void relay_add(__global const float4 *first,        /* (first_grid.y, f
     sum[y * size.x + x] += (float4)(weight * way, weight, 0.0f);
 }
 
-/* Found flow becomes that by way of others where they know it, in place. */
+/* Found flow becomes that by way of others where they know it, and it leads elsewhere or is not trusted, in place; not
+   in the place of what is taken from one photo. */
 __kernel void relay_take(__global const float4 *sum, /* (grid.y, grid.x) of relay_add, with a step of 1 */
                          int4 grid,                  /* run size */
                          float enough,               /* weight of others from which on they are sure */
-                         float own,                  /* what found flow's trust counts where they are not: 0 or 1 */
+                         float agrees,               /* px between both that leave a quarter of their agreement */
+                         float counts,               /* what found flow's trust counts: 0 or 1 */
                          __global float4 *found)     /* (grid.y, grid.x) */
 {
     const int x = get_global_id(0), y = get_global_id(1);
     if (x >= grid.x || y >= grid.y)
         return;
     const int at = y * grid.x + x;
-    const float4 its = sum[at];
-    const float taken = LEAST(its.z / enough, 1.0f), kept = own * (1.0f - taken) * found[at].z, trust = kept + taken;
+    const float4 its = sum[at], own = found[at];
+    if (own.w >= UNTOLD)
+        return;
+    const float told = LEAST(its.z / enough, 1.0f);
+    const float2 other = its.z > 0.0f ? its.xy / its.z : own.xy;
+    const float off = 1.0f + square2(other - own.xy) / (agrees * agrees), agreement = 1.0f / (off * off);
+    const float kept = counts * own.z * (1.0f - told * (1.0f - agreement)), taken = told * (1.0f - kept);
     if (taken > 0.0f)
-        found[at].xy = (kept * found[at].xy + taken / its.z * its.xy) / trust;
-    found[at].z = trust;
+        found[at].xy = (kept * own.xy + taken * other) / (kept + taken);
+    found[at].z = kept + taken;
 }

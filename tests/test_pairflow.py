@@ -100,6 +100,10 @@ def test_memory_is_reckoned_for_charts_as_fine_as_they_get(monkeypatch: pytest.M
     few, fast, same, best = reckoned
     assert 0 <= same - few < 2 and best - same == pytest.approx(4 * (fast - few), abs=8)
     assert fast - few > 20
+    monkeypatch.setattr(joint, "_FOUND_BYTES", 10_000)
+    with pytest.raises(SettingsError, match=r"take?s? about \S+ MiB") as told:
+        merged(layers(61), CANVAS, flow_quality="fast", working_pixels=45_451, max_memory=1 << 20)
+    assert float(str(told.value).split("about ")[1].split()[0]) > fast
 
 
 @pytest.mark.usefixtures(small.__name__)

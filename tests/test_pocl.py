@@ -155,10 +155,12 @@ def test_a_processor_with_another_name_builds(guess: str, device: Device, tmp_pa
 
 
 _CORES_RUN = """
+import os
 import sys
 from hugin_abflow.opencl import Device, choose
 
 used = [Device(threads=int(threads)) for threads in sys.argv[1:]]
+assert "POCL_CPU_MAX_CU_COUNT" not in os.environ  # for other programs, it says nothing
 print(choose(None).platform.name, choose(None).max_compute_units, used[-1].device.max_compute_units)
 """
 
@@ -168,6 +170,7 @@ print(choose(None).platform.name, choose(None).max_compute_units, used[-1].devic
     [
         ((1,), {}, 1, 1),
         ((0, 1), {}, None, 1),  # too late for PoCL to hear: a part of the device, as far as it goes
+        ((1, 0), {}, 1, 1),  # PoCL asks once
         ((0,), {"POCL_MAX_PTHREAD_COUNT": "1"}, 1, 1),
         ((1 << 10,), {}, None, None),
     ],

@@ -66,20 +66,23 @@ def relay_cells(found: Array, other: Array, grid: Sequence[int], cell: int, nois
 
 
 def _follow(
-    found: Array, cells: Array, grid: Sequence[int], cell: int, u: Array, v: Array
+    found: Array, back: Array, cells: Array, grid: Sequence[int], cell: int, u: Array, v: Array
 ) -> tuple[Array, Array, Array]:
     """Where flow leads from chart positions, and how far it is believed."""
     inside = (u >= 0) & (v >= 0) & (u < grid[0]) & (v < grid[1])
-    total, share = bilinear(found[..., :3].astype(np.float64), grid, u, v)
-    flow = total / np.maximum(share, 1e-9)[..., None]
-    columns, rows = (np.where(inside, axis, 0).astype(int) // cell for axis in (u, v))
-    believed = np.where(inside, flow[..., 2] * cells[rows, columns, 3], 0)
-    return u + flow[..., 0], v + flow[..., 1], believed
+    weighted = np.dstack([found[..., :2] * found[..., 2:3], found[..., 2]]).astype(np.float64)
+    total, share = bilinear(weighted, grid, u, v)
+    total = total / np.maximum(share, 1e-9)[..., None]
+    columns, rows = (np.where(inside, axis, 0).astype(int) for axis in (u, v))
+    both = (found[rows, columns, 3] != 0) & (back[rows, columns, 3] != 0)
+    trust = np.where(inside & both, total[..., 2], 0)
+    flow = total[..., :2] / np.where(trust > 0, trust, 1)[..., None]
+    return u + flow[..., 0], v + flow[..., 1], trust * cells[rows // cell, columns // cell, 3]
 
 
 def relay_add(
-    first: tuple[Array, Array, Sequence[int], Numbers],
-    second: tuple[Array, Array, Sequence[int], Numbers],
+    first: tuple[Array, Array, Array, Sequence[int], Numbers],
+    second: tuple[Array, Array, Array, Sequence[int], Numbers],
     cell: int,
     grid: Sequence[int],
     chart: Numbers,
@@ -87,16 +90,16 @@ def relay_add(
     share: float,
 ) -> Array:
     """Weighted flow by way of another layer, and weights, (height, width, 4), at every step-th pixel; each
-    part is found flow, its cells, its grid and its chart.
+    part is found flow, that back, its cells, its grid and its chart.
     """
     places = [np.minimum(np.arange(-(-n // step)) * step + step // 2, n - 1) + 0.5 for n in grid[:2]]
     x, y = np.meshgrid(*places)
-    u, v = chart_position(chart_point(x, y, chart), first[3])
-    u, v, weight = _follow(*first[:3], cell, u, v)
-    u, v = chart_position(chart_point(u, v, first[3]), second[3])
-    u, v, more = _follow(*second[:3], cell, u, v)
+    u, v = chart_position(chart_point(x, y, chart), first[4])
+    u, v, weight = _follow(*first[:4], cell, u, v)
+    u, v = chart_position(chart_point(u, v, first[4]), second[4])
+    u, v, more = _follow(*second[:4], cell, u, v)
     weight = share * weight * more
-    u, v = chart_position(chart_point(u, v, second[3]), chart)
+    u, v = chart_position(chart_point(u, v, second[4]), chart)
     across, down = u - x, v - y
     period = 2 * np.pi * chart[9] if chart[13] else chart[14] * chart[9]
     if period:
@@ -104,12 +107,16 @@ def relay_add(
     return np.stack([weight * across, weight * down, weight, np.zeros_like(weight)], -1)
 
 
-def relay_take(total: Array, enough: float, own: float, found: Array) -> Array:
-    """What others say, and found flow for the rest, with their trust."""
-    taken = np.minimum(total[..., 2] / enough, 1)
-    kept = own * (1 - taken) * found[..., 2]
+def relay_take(total: Array, enough: float, agrees: float, counts: float, found: Array) -> Array:
+    """Found flow as far as it is trusted and others agree, theirs for the rest, with their trust;
+    as found where one layer is taken whole.
+    """
+    told, own = np.minimum(total[..., 2] / enough, 1), found[..., :2]
     other = total[..., :2] / np.maximum(total[..., 2], 1e-9)[..., None]
-    trust = kept + taken
-    mixed = (kept[..., None] * found[..., :2] + taken[..., None] * other) / np.maximum(trust, 1e-9)[..., None]
-    flow = np.where((taken > 0)[..., None], mixed, found[..., :2])
-    return np.dstack([flow, trust, found[..., 3]])
+    agreement = (1 + (np.linalg.norm(other - own, axis=-1) / agrees) ** 2) ** -2.0
+    kept = counts * found[..., 2] * (1 - told * (1 - agreement))
+    taken = told * (1 - kept)
+    mixed = (kept[..., None] * own + taken[..., None] * other) / np.maximum(kept + taken, 1e-9)[..., None]
+    flow = np.where((taken > 0)[..., None], mixed, own)
+    changed = np.dstack([flow, kept + taken, found[..., 3]])
+    return np.where((found[..., 3] < UNTOLD)[..., None], changed, found)
