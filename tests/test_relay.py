@@ -117,6 +117,7 @@ def test_ways_equal_their_twin(device: Device, name: str, step: int, ring: bool)
     expected = twin.relay_add(*parts, 8, grids[2], charts[2].transform, step, 0.7)
     assert 0.15 < (expected[..., 2] > 0).mean() < 1
     assert charts[2].wraps or not (ring and canvas.wraps)
+    assert np.abs(total.get() - 0.25).max() < 10  # none goes around the wrong way
     # a cell, or a chart's rim, may be missed by rounding
     assert_close(total.get() - 0.25, expected, 2e-3, decisions=0.01)
     assert_close(total.get()[..., 2] - 0.25, expected[..., 2], TRIGONOMETRY, decisions=0.01)
