@@ -11,9 +11,9 @@ that are reliable themselves, and the worse its layers fit by it,
 T is the sum of trust in its own flow, over cells of its overlap; f its mean fit; h a constant. A is the sum,
 over all other layers b, of what ways by b say for that flow, and D of what they say against it: the trust
 that both have in a cell, times the fit of the legs, r_ab r_bc, and how near to each other they lead, or how
-far. It is solved by a fixed point, from r = 1. Of doubted pairs, and of
-those of which others know much more than their own flow is sure of, what contradicts the more reliable ways
-becomes their mean, and so does what is not trusted.
+far. It is solved by a fixed point, from r = 1. Of doubted pairs, and of those of which others know much more
+than their own flow is sure of, what contradicts the more reliable ways becomes their mean, and so does what
+is not trusted.
 """
 
 from __future__ import annotations
@@ -110,7 +110,7 @@ def mend(device: Device, found: Sequence[Weighed]) -> list[Key]:
     others = dict(_all_others(device, ways))
     reliable = _reliable(ways, others)
     changed = []
-    # legs are more reliable than what is replaced by them, so that they are as they were found
+    # the least reliable first: legs of what is doubted are more so, and still as they were found
     for a, c in sorted(((pair.a, pair.b) for pair in found), key=lambda pair: (reliable[pair], pair)):
         both, doubted = ((a, c), (c, a)), reliable[a, c] < _DOUBTED
         least = min(reliable[a, c], _DOUBTED)
