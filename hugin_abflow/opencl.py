@@ -11,7 +11,7 @@ import time
 import warnings
 from collections import deque
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -76,12 +76,10 @@ def _kind(device: cl.Device) -> str:
 def _devices(threads: int = 0) -> list[cl.Device]:
     """All devices of all platforms; `DeviceError` where there is none. threads: as of `Device`."""
     pocl.find_cache()
-    found = []
+    found, platforms = [], []
     with pocl.cores(threads):
-        try:
+        with suppress(cl.Error):
             platforms = cl.get_platforms()
-        except cl.Error:
-            platforms = []
         for platform in platforms:
             try:
                 found += platform.get_devices()
@@ -117,10 +115,7 @@ def list_devices() -> list[DeviceInfo]:
 
 
 def choose(wanted: str | None, threads: int = 0) -> cl.Device:
-    """The device that --device means; None: the one used by default. Raises `DeviceError`: there is none.
-
-    threads         as of `Device`; drivers may ask for it only once.
-    """
+    """The device that --device means; None: the one used by default. Raises `DeviceError`: there is none."""
     found = _devices(threads)
     if wanted is None:
         return max(found, key=_speed)
@@ -277,8 +272,7 @@ class Device:
     """A device with its queue and built kernels.
 
     wanted      as `Settings.device`.
-    threads     cores that a processor may use; 0: all. Other devices use what they have. PoCL keeps to what
-                it is first asked for in a process, if that is less.
+    threads     cores that a processor may use; 0: all. PoCL keeps to the first number in a process.
 
     Raises `DeviceError` if there is none, none fits `wanted`, or a kernel does not build.
     """
