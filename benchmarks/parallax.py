@@ -20,13 +20,14 @@ from unittest import mock
 
 import numpy as np
 import numpy.typing as npt
+from scipy import ndimage
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
 from benchmarks.ablation import PARTS
 from benchmarks.quality import add_set_options
 from benchmarks.rigs import RIGS, make_set
-from hugin_abflow import Settings, merge_project, pairflow
+from hugin_abflow import Settings, merge_project, pairflow, projection
 from hugin_abflow.geometry import PairFlow
 from sample_projects import lens
 from sample_projects.lens import Camera
@@ -85,25 +86,18 @@ def places(width: int) -> tuple[Floats, npt.NDArray[np.float32]]:
 
 def read(flow: npt.NDArray[np.float32], positions: Floats, wraps: bool) -> Floats:
     """Flow at chart positions, (n, 2); what lies beside the chart counts as its rim."""
-    height, width = flow.shape[:2]
-    corner = np.floor(positions - 0.5).astype(int)
-    t = positions - 0.5 - corner
-    total = np.zeros(positions.shape)
-    for dy in (0, 1):
-        for dx in (0, 1):
-            column = (corner[:, 0] + dx) % width if wraps else np.clip(corner[:, 0] + dx, 0, width - 1)
-            row = np.clip(corner[:, 1] + dy, 0, height - 1)
-            share = np.abs(1 - dx - t[:, 0]) * np.abs(1 - dy - t[:, 1])
-            total += share[:, None] * flow[row, column]
-    return total
+    padded = np.pad(flow.astype(np.float64), ((0, 0), (1, 1), (0, 0)), "wrap" if wraps else "edge")
+    places = positions[:, 1] - 0.5, positions[:, 0] + 0.5
+    return np.stack(
+        [ndimage.map_coordinates(padded[..., k], places, order=1, mode="nearest") for k in (0, 1)], 1
+    )
 
 
 def points(positions: Floats, transform: npt.NDArray[np.float32]) -> Floats:
     """Unit vectors (n, 3) of a spherical chart's positions, as kernels/common.cl has it."""
     t = transform.astype(np.float64)
     lon, lat = (positions[:, 0] - t[11]) / t[9], (t[12] - positions[:, 1]) / t[10]
-    turned = np.stack([np.cos(lat) * np.sin(lon), np.cos(lat) * np.cos(lon), np.sin(lat)], 1)
-    return turned @ t[:9].reshape(3, 3)
+    return projection.directions(lon, lat) @ t[:9].reshape(3, 3)
 
 
 def ways(

@@ -55,6 +55,11 @@ class Chart:
         return grid.circumference * float(self.transform[9])
 
     @property
+    def border(self) -> tuple[int, int, int, int]:
+        """Grid as the kernels take it: (width, height, wraps, 0)."""
+        return self.width, self.height, int(self.wraps), 0
+
+    @property
     def spherical(self) -> bool:
         """Whether it is of a sphere."""
         return bool(self.transform[13])

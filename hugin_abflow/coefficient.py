@@ -110,7 +110,8 @@ def distance(
     size = grid.border[:2]
     spherical = working.lens[1] > 0
     unit = 1 / working.lens[1] if spherical else working.width / grid.width
-    table = device.upload(_table(grid, within / unit))
+    parts = _table(grid, within / unit)
+    table, furthest_step = device.upload(parts), parts[-grid.height :].max()
     seed, flooded = (device.empty(grid.shape, np.int32) for _ in range(2))
     mask = masks_.buffers[index]
     device.run("coefficient", "coefficient_seed", size, mask, cover, grid.border, seed)
@@ -119,7 +120,7 @@ def distance(
     while step:
         steps.append(step)
         step //= 2
-    for jump in [*steps, 2, 1]:
+    for jump in [jump for jump in [*steps, 2, 1] if jump <= furthest_step]:
         device.run("coefficient", "coefficient_flood", size, seed, grid.border, table, jump, flooded)
         seed, flooded = flooded, seed
     furthest = math.pi / working.lens[1] if spherical else math.hypot(*working.shape)

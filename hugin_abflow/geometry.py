@@ -108,10 +108,9 @@ def _displacement(
             other = pair.b if index == pair.a else pair.a
             flow, back = pair.between(other), pair.between(index)
             start = _GUESSED if guess else _BOTH if settings.both_flows else _THERE
-            chart_grid = (pair.chart.width, pair.chart.height, int(pair.chart.wraps), 0)
             device.run(
                 "geometry", "geometry_add", four_at_a_time, coefficients[other].blend, layers[other].box,
-                layer.pixels, layer.box, grid.border, grid.lens, flow, back, chart_grid,
+                layer.pixels, layer.box, grid.border, grid.lens, flow, back, pair.chart.border,
                 pair.chart.transform, start, guess or field, field,
             )  # fmt: skip
         guess = field

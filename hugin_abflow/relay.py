@@ -76,11 +76,6 @@ class _Way:
     fit: float
 
     @property
-    def grid(self) -> tuple[int, int, int, int]:
-        """As kernels take it."""
-        return self.chart.width, self.chart.height, int(self.chart.wraps), 0
-
-    @property
     def area(self) -> float:
         """Working px in which it is trusted."""
         return float(self.trust.sum()) * (_CELL * self.chart.coarse) ** 2
@@ -112,41 +107,42 @@ def mend(device: Device, found: Sequence[Weighed]) -> list[Key]:
     changed = []
     # the least reliable first: legs of what is doubted are more so, and still as they were found
     for a, c in sorted(((pair.a, pair.b) for pair in found), key=lambda pair: (reliable[pair], pair)):
-        both, doubted = ((a, c), (c, a)), reliable[a, c] < _DOUBTED
-        least = min(reliable[a, c], _DOUBTED)
-        better = {
-            (start, end): {
-                one.by: share
-                for one in others[start, end]
-                if (share := reliable[start, one.by] * reliable[one.by, end]) > least
-            }
-            for start, end in both
-        }
+        doubted = reliable[a, c] < _DOUBTED
+        better = {key: _better(key, others[key], reliable) for key in ((a, c), (c, a))}
         if not all(better.values()):  # both ways have to lead back
             continue
-        known = [_known(others[key], better[key]) for key in both]
-        missed, covered = (
-            min(share(ways[key], its) for key, its in zip(both, known, strict=True))
-            for share in (_missed, _covered)
-        )
-        if doubted or missed >= _MISSED:
-            counts = 0.0 if reliable[a, c] < _REFUTED and covered >= _COVERED else 1.0
-            for key, total in [(key, _sum(device, ways, key, better[key])) for key in both]:
-                way = ways[key]
+        if doubted or all(_missed(ways[key], its) >= _MISSED for key, its in better.items()):
+            covered = all(_covered(ways[key], its) >= _COVERED for key, its in better.items())
+            counts = 0.0 if reliable[a, c] < _REFUTED and covered else 1.0
+            totals = [(ways[key], _sum(device, ways, key, its, reliable)) for key, its in better.items()]
+            for way, total in totals:
+                grid = way.chart.border
                 device.run(
-                    "relay", "relay_take", way.grid[:2], total, way.grid, _SURE, _AGREES, counts,
-                    way.found,
+                    "relay", "relay_take", grid[:2], total, grid, _SURE, _AGREES, counts, way.found,
                 )  # fmt: skip
             changed.append((a, c))
     return sorted(changed)
 
 
-def _sum(device: Device, ways: dict[Key, _Way], key: Key, by: dict[int, float]) -> Buffer:
-    """The weighted sum of ways by other layers at all pixels. by: what each of them counts."""
+def _share(key: Key, by: int, reliable: dict[Key, float]) -> float:
+    """How reliable the way from a to c by another layer is."""
+    return reliable[key[0], by] * reliable[by, key[1]]
+
+
+def _better(key: Key, others: Sequence[_Other], reliable: dict[Key, float]) -> list[_Other]:
+    """The others that are more reliable than the pair, or reliable enough."""
+    least = min(reliable[key], _DOUBTED)
+    return [one for one in others if _share(key, one.by, reliable) > least]
+
+
+def _sum(
+    device: Device, ways: dict[Key, _Way], key: Key, others: Sequence[_Other], reliable: dict[Key, float]
+) -> Buffer:
+    """The weighted sum of the ways by others at all pixels."""
     chart = ways[key].chart
     total = device.zeros((chart.height, chart.width, 4))
-    for b, share in by.items():
-        _add(device, ways, (key[0], b, key[1]), 1, share, total)
+    for one in others:
+        _add(device, ways, (key[0], one.by, key[1]), 1, _share(key, one.by, reliable), total)
     return total
 
 
@@ -169,9 +165,9 @@ def _ways(device: Device, found: Sequence[Weighed]) -> Iterator[tuple[Key, _Way]
 
 
 def _way(device: Device, chart: Chart, own: Buffer, other: Buffer) -> _Way:
-    grid, size = (chart.width, chart.height, int(chart.wraps), 0), _cells(chart)
+    size = -(-chart.width // _CELL), -(-chart.height // _CELL)
     cells = device.empty((*size[::-1], 4))
-    device.run("relay", "relay_cells", size, own, other, grid, _CELL, _NOISE, size, cells)
+    device.run("relay", "relay_cells", size, own, other, chart.border, _CELL, _NOISE, size, cells)
     values = cells.get().astype(np.float64)
     inside, trust, fit = values[..., 2] >= 0, np.maximum(values[..., 2], 0), values[..., 3]
     known = trust * (fit >= 0)
@@ -179,11 +175,6 @@ def _way(device: Device, chart: Chart, own: Buffer, other: Buffer) -> _Way:
     values[..., 3] = np.where(fit >= 0, fit, mean)  # where it cannot be seen
     cells.set(values.astype(np.float32))
     return _Way(chart, own, other, cells, values[..., :2], inside, trust, mean)
-
-
-def _cells(chart: Chart) -> tuple[int, int]:
-    """Of a chart: columns, rows."""
-    return -(-chart.width // _CELL), -(-chart.height // _CELL)
 
 
 def _all_others(device: Device, ways: dict[Key, _Way]) -> Iterator[tuple[Key, list[_Other]]]:
@@ -219,9 +210,9 @@ def _add(
     first, second, own = ways[a, b], ways[b, c], ways[a, c]
     size = total.shape[1], total.shape[0]
     device.run(
-        "relay", "relay_add", size, first.found, first.back, first.cells, first.grid,
-        first.chart.transform, second.found, second.back, second.cells, second.grid,
-        second.chart.transform, _CELL, own.grid, own.chart.transform, step, size, share, total,
+        "relay", "relay_add", size, first.found, first.back, first.cells, first.chart.border,
+        first.chart.transform, second.found, second.back, second.cells, second.chart.border,
+        second.chart.transform, _CELL, own.chart.border, own.chart.transform, step, size, share, total,
     )  # fmt: skip
 
 
@@ -236,25 +227,24 @@ def _reliable(ways: dict[Key, _Way], others: dict[Key, list[_Other]]) -> dict[Ke
 
 def _told(key: Key, own: _Way, others: Sequence[_Other], reliable: dict[Key, float]) -> float:
     """How reliable a pair is, if the others are as reliable as that."""
-    a, c = key
-    weights = [reliable[a, one.by] * reliable[one.by, c] for one in others]
-    differs = sum(w * one.differs for w, one in zip(weights, others, strict=True))
-    agrees = sum(w * one.agrees for w, one in zip(weights, others, strict=True))
+    differs = sum(_share(key, one.by, reliable) * one.differs for one in others)
+    agrees = sum(_share(key, one.by, reliable) * one.agrees for one in others)
     held = _OWN * own.fit * float(own.trust.sum()) + agrees
     return held / (held + differs) if differs else 1.0
 
 
-def _known(others: Sequence[_Other], by: Iterable[int]) -> Values:
-    """How far a way is known by some of the others, by cells."""
-    return np.asarray(np.sum([one.known for one in others if one.by in by], axis=0))
+def _known(others: Sequence[_Other]) -> Values:
+    """How far a way is known by others, by cells."""
+    return np.asarray(np.sum([one.known for one in others], axis=0))
 
 
-def _missed(way: _Way, known: Values) -> float:
-    """The share of an overlap that others know, and in which its own flow is not trusted. known: by cells."""
-    return float(((1 - way.trust) * np.minimum(known, 1))[way.inside].mean()) if way.inside.any() else 0.0
+def _missed(way: _Way, others: Sequence[_Other]) -> float:
+    """The share of an overlap that others know, and in which its own flow is not trusted."""
+    missed = (1 - way.trust) * np.minimum(_known(others), 1)
+    return float(missed[way.inside].mean()) if way.inside.any() else 0.0
 
 
-def _covered(way: _Way, known: Values) -> float:
+def _covered(way: _Way, others: Sequence[_Other]) -> float:
     """The share of what own flow is trusted in that others are sure of."""
     trusted = way.trust.sum()
-    return float((way.trust * np.minimum(known / _SURE, 1)).sum() / trusted) if trusted else 1.0
+    return float((way.trust * np.minimum(_known(others) / _SURE, 1)).sum() / trusted) if trusted else 1.0

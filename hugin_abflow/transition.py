@@ -142,7 +142,7 @@ def _price(
         chart = flow.chart
         device.run(
             "transition", "transition_parallax", cells.border[:2], flow.forward, flow.backward,
-            (chart.width, chart.height, int(chart.wraps), 0), chart.transform, masks.buffers[flow.a],
+            chart.border, chart.transform, masks.buffers[flow.a],
             masks.buffers[flow.b], masks.grid.border, grid.border, grid.lens, cells.border, squared,
         )  # fmt: skip
     several = (cover.sum(0) > 1).astype(np.float64)

@@ -180,7 +180,7 @@ def test_pocl_itself_uses_as_many_cores_as_it_may(
 ) -> None:
     """The device that it offers has no more: its parts calculate on all cores of it. None: all."""
     if "PoCL" not in device.device.version:
-        pytest.skip("the device is none of PoCL's")
+        pytest.skip("the device is none of PoCL's")  # whose variables these are
     environment = {name: value for name, value in os.environ.items() if name not in pocl._CORES}
     done = subprocess.run(
         [sys.executable, "-c", _CORES_RUN, *map(str, asked)],

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from itertools import combinations, permutations
 
 import numpy as np
@@ -209,21 +209,36 @@ class Scene:
             ways.append(self.device.upload(np.stack(values, -1).astype(np.float32)))
         return Weighed(a, b, chart, *ways, False)
 
-    def spoil(self, a: int, b: int, by: float, trust: float = 1.0) -> None:
-        """Flow of a pair that leads elsewhere, and back."""
-        for buffer, sign in zip(self._buffers(a, b), (1, -1), strict=True):
+    def change(self, a: int, b: int, edit: Callable[[np.ndarray, int], None]) -> None:
+        """Edit a pair's found flow in place, that from a to b with 1, and back with -1."""
+        for buffer, sign in zip(self.buffers(a, b), (1, -1), strict=True):
             values = buffer.get()
-            values[..., 0] += sign * by
-            values[..., 2] = trust
+            edit(values, sign)
             buffer.set(values)
 
-    def _buffers(self, a: int, b: int) -> tuple:
+    def spoil(self, a: int, b: int, by: float, where: slice = slice(None)) -> None:
+        """Flow of a pair that leads elsewhere, and back, in some columns."""
+
+        def move(values: np.ndarray, sign: int) -> None:
+            values[:, where, 0] += sign * by
+
+        self.change(a, b, move)
+
+    def forget(self, a: int, b: int, where: slice) -> None:
+        """Flow of a pair that is not trusted, and wrong, in some columns."""
+
+        def lose(values: np.ndarray, _: int) -> None:
+            values[:, where, :2], values[:, where, 2] = 7, 0
+
+        self.change(a, b, lose)
+
+    def buffers(self, a: int, b: int) -> tuple:
         (pair,) = (one for one in self.found if (one.a, one.b) == (a, b))
         return pair.forward, pair.backward
 
     def off(self, a: int, b: int) -> float:
         """By how much a pair's flow is wrong, px: the median of both ways, where it is trusted."""
-        forward, backward = (buffer.get() for buffer in self._buffers(a, b))
+        forward, backward = (buffer.get() for buffer in self.buffers(a, b))
         wrong = [
             np.linalg.norm(values[..., :2] - self.flow(*way), axis=-1)[values[..., 2] > 0.3]
             for values, way in ((forward, (a, b)), (backward, (b, a)))
@@ -233,7 +248,12 @@ class Scene:
     def mend(self) -> list[tuple[int, int]]:
         return relay.mend(self.device, self.found)
 
-    def state(self) -> list[np.ndarray]:
+    def stays(self) -> bool:
+        """Whether mending it changes nothing."""
+        before = self._state()
+        return self.mend() == [] and all(map(np.array_equal, before, self._state()))
+
+    def _state(self) -> list[np.ndarray]:
         return [buffer.get() for one in self.found for buffer in (one.forward, one.backward)]
 
 
@@ -244,9 +264,7 @@ SHIFTS = (0.0, 3.0, -2.0, 5.0)
 @pytest.mark.parametrize("texture", [0.0, 0.2])
 def test_what_agrees_stays_to_the_bit(device: Device, name: str, texture: float) -> None:
     scene = Scene(device, CANVASES[name], SHIFTS, texture=texture)
-    before = scene.state()
-    assert scene.mend() == []
-    assert all(np.array_equal(*both) for both in zip(before, scene.state(), strict=True))
+    assert scene.stays()
 
 
 @pytest.mark.parametrize("name", list(CANVASES))
@@ -276,9 +294,7 @@ def test_what_nothing_decides_stays(device: Device) -> None:
     """Three layers of one colour: each pair has as much to say as the others."""
     scene = Scene(device, CANVASES["plane"], SHIFTS[:3], texture=0.0)
     scene.spoil(0, 1, 20.0)
-    before = scene.state()
-    assert scene.mend() == []
-    assert all(np.array_equal(*both) for both in zip(before, scene.state(), strict=True))
+    assert scene.stays()
 
 
 def test_small_overlaps_refute_no_large_ones(device: Device) -> None:
@@ -289,9 +305,9 @@ def test_small_overlaps_refute_no_large_ones(device: Device) -> None:
     small = dict.fromkeys(combinations(range(4), 2), columns < 24)
     scene = Scene(device, canvas, SHIFTS, small | {(0, 1): columns >= 0}, texture=0.0, shown=shown)
     scene.spoil(0, 1, 20.0)
-    before = scene._buffers(0, 1)[0].get()
+    before = scene.buffers(0, 1)[0].get()
     scene.mend()
-    assert np.array_equal(scene._buffers(0, 1)[0].get()[:, 45:], before[:, 45:])
+    assert np.array_equal(scene.buffers(0, 1)[0].get()[:, 45:], before[:, 45:])
 
 
 def test_flow_that_is_carried_on_beside_an_overlap_tells_nothing(device: Device) -> None:
@@ -302,43 +318,30 @@ def test_flow_that_is_carried_on_beside_an_overlap_tells_nothing(device: Device)
     columns = np.indices(canvas.shape)[1]
     shown = [columns >= 0, columns < 60, columns < 60, columns >= 0]
     scene = Scene(device, canvas, SHIFTS, texture=0.0, shown=shown)
-    for buffer, sign in zip(scene._buffers(0, 3), (1, -1), strict=True):
-        values = buffer.get()
-        values[:, 70:, 0] += sign * 9
-        buffer.set(values)
-    before = scene.state()
-    assert scene.mend() == []
-    assert all(np.array_equal(*both) for both in zip(before, scene.state(), strict=True))
+    scene.spoil(0, 3, 9, slice(70, None))
+    assert scene.stays()
 
 
 def test_both_ways_of_a_pair_change_or_neither(device: Device) -> None:
     """One alone would no longer lead back."""
     scene = Scene(device, CANVASES["plane"], SHIFTS, texture=0.0)
-    forward, _ = scene._buffers(1, 2)
+    forward, _ = scene.buffers(1, 2)
     values = forward.get()
     half = values.shape[1] // 2
     values[:, half:, 2] = 0
     forward.set(values)
-    before = scene.state()
-    assert scene.mend() == []
-    assert all(np.array_equal(*both) for both in zip(before, scene.state(), strict=True))
+    assert scene.stays()
 
 
 def test_exact_flow_stays_where_others_nearly_agree(device: Device) -> None:
     """Of a pair which does not know half of its overlap, and of others that are a pixel off."""
     scene = Scene(device, CANVASES["plane"], SHIFTS, texture=0.0)
     for pair in ((0, 1), (0, 3)):
-        for buffer, sign in zip(scene._buffers(*pair), (1, -1), strict=True):
-            values = buffer.get()
-            values[..., 0] += sign * 0.5
-            buffer.set(values)
-    for buffer in scene._buffers(1, 2):
-        values = buffer.get()
-        half = values.shape[1] // 2
-        values[:, half:, :2], values[:, half:, 2] = 7, 0
-        buffer.set(values)
+        scene.spoil(*pair, 0.5)
+    half = scene.charts[1, 2].width // 2
+    scene.forget(1, 2, slice(half, None))
     assert scene.mend() == [(1, 2)]
-    off = np.abs(scene._buffers(1, 2)[0].get()[..., :2] - scene.flow(1, 2))
+    off = np.abs(scene.buffers(1, 2)[0].get()[..., :2] - scene.flow(1, 2))
     assert off[:, : half - 8].max() < 0.1 and np.median(off[:, half:].max(-1)) < 0.6
 
 
@@ -362,13 +365,9 @@ def test_of_many_layers_those_with_the_largest_overlaps_are_asked(
 @pytest.mark.parametrize("name", list(CANVASES))
 def test_where_a_flow_is_not_trusted_the_others_tell_it(device: Device, name: str) -> None:
     scene = Scene(device, CANVASES[name], SHIFTS, texture=0.0)
-    for buffer in scene._buffers(1, 2):
-        values = buffer.get()
-        half = values.shape[1] // 2
-        values[:, half:, :2], values[:, half:, 2] = 7, 0
-        buffer.set(values)
+    scene.forget(1, 2, slice(scene.charts[1, 2].width // 2, None))
     assert scene.mend() == [(1, 2)]
-    assert (scene._buffers(1, 2)[0].get()[..., 2] > 0.5).mean() > 0.8
+    assert (scene.buffers(1, 2)[0].get()[..., 2] > 0.5).mean() > 0.8
     assert scene.off(1, 2) < 0.05
 
 
@@ -381,14 +380,10 @@ def test_where_others_do_not_reach_doubted_flow_stays_and_refuted_flow_does_not(
     columns = np.indices(canvas.shape)[1]
     overlaps = dict.fromkeys(combinations(range(4), 2), columns < 110) | {(0, 1): columns < 140}
     scene = Scene(device, canvas, SHIFTS, overlaps, texture=0.0)
-    wrong = scene._buffers(0, 1)
-    for buffer, sign in zip(wrong, (1, -1), strict=True):
-        values = buffer.get()
-        values[:, :spoilt, 0] += sign * 20
-        buffer.set(values)
-    before = wrong[0].get()
+    scene.spoil(0, 1, 20, slice(spoilt))
+    before = scene.buffers(0, 1)[0].get()
     assert scene.mend() == [(0, 1)]
-    after = wrong[0].get()
+    after = scene.buffers(0, 1)[0].get()
     assert np.abs(after[:, 5 : spoilt - 5, :2] - scene.flow(0, 1)[:, 5 : spoilt - 5]).max() < 0.05
     right = np.s_[:, 135:140]
     assert np.array_equal(after[right][..., :2], before[right][..., :2])
@@ -397,13 +392,8 @@ def test_where_others_do_not_reach_doubted_flow_stays_and_refuted_flow_does_not(
 
 def test_a_few_untrusted_pixels_are_left_to_what_is_around(device: Device) -> None:
     scene = Scene(device, CANVASES["plane"], SHIFTS)
-    for buffer in scene._buffers(1, 2):
-        values = buffer.get()
-        values[:, :14, 2] = 0
-        buffer.set(values)
-    before = scene.state()
-    assert scene.mend() == []
-    assert all(np.array_equal(*both) for both in zip(before, scene.state(), strict=True))
+    scene.change(1, 2, lambda values, _: values[:, :14, 2].fill(0))
+    assert scene.stays()
 
 
 def test_the_order_of_layers_does_not_matter(device: Device) -> None:
@@ -414,7 +404,7 @@ def test_the_order_of_layers_does_not_matter(device: Device) -> None:
         pair = sorted((order.index(1), order.index(2)))
         scene.spoil(*pair, 20.0 if order.index(1) < order.index(2) else -20.0)
         assert scene.mend() == [tuple(pair)]
-        forward, backward = scene._buffers(*pair)
+        forward, backward = scene.buffers(*pair)
         results.append((forward if order.index(1) < order.index(2) else backward).get())
     for other in results[1:]:
         assert np.allclose(other, results[0], atol=1e-4)
