@@ -86,8 +86,9 @@ class TiffWriter:
         self._strips: queue.Queue[Future[bytes] | None] = queue.Queue(2 * threads)
         self._encoders = ThreadPoolExecutor(threads, "encoder")
         self._error: BaseException | None = None
+        # both, of 0 too: readers that find one expect the other
         more: list[tuple[int, int, int, Any, bool]] = [
-            (tag, 5, 1, (value, 150), True) for tag, value in zip((286, 287), offset, strict=True) if value
+            (tag, 5, 1, (value, 150), True) for tag, value in zip((286, 287), offset, strict=True)
         ]
         more.append((274, 3, 1, 1, True))  # orientation, as enblend writes it
         tags: dict[str, Any] = {
