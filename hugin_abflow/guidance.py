@@ -144,6 +144,13 @@ def lead(
     return flows
 
 
+def held(image: Level, flows: Sequence[Buffer], guides: ChartGuides) -> tuple[Points, Points]:
+    """Of the guides that a pair's flows agree with, both ways, the ends on a and on b, (n, 2) px."""
+    far = [np.linalg.norm(way.residuals, axis=1) for way in _ways(image, flows, guides)]
+    agree = guides.only(np.all(np.array(far) <= GuidanceParameters().agreement, axis=0))
+    return agree.at_a, agree.at_b
+
+
 @dataclass(frozen=True)
 class _Way:
     """The guides in one direction: places, moves and what the flow there lacks to them, (n, 2) px.

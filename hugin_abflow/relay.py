@@ -13,13 +13,13 @@ over all other layers b, of what ways by b say for that flow, and D of what they
 that both have in a cell, times the fit of the legs, r_ab r_bc, and how near to each other they lead, or how
 far. It is solved by a fixed point, from r = 1. Of doubted pairs, and of those of which others know much more
 than their own flow is sure of, what contradicts the more reliable ways becomes their mean, and so does what
-is not trusted.
+is not trusted; but not around control points that their own flow agrees with.
 """
 
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -28,6 +28,7 @@ import numpy.typing as npt
 from hugin_abflow.chart import Chart
 from hugin_abflow.consistency import Weighed
 from hugin_abflow.geometry import Pair
+from hugin_abflow.guides import Points
 from hugin_abflow.opencl import Buffer, Device
 
 # Chart pixels in the side of a cell, in the middle of which ways are compared.
@@ -52,6 +53,8 @@ _SURE = 0.1
 _ROUNDS = 8
 # A way has to be known so far in so many cells.
 _KNOWN, _LEAST_CELLS = 0.05, 4
+# Chart pixels around a control point, a sigma, in which it vouches for the flow that agrees with it.
+_VOUCHED = 32.0
 # Third layers that are asked about a pair, those with the largest overlaps: where many overlap each other,
 # all triangles would be too many.
 _MOST = 4
@@ -99,8 +102,12 @@ def triangles(pairs: Iterable[Pair]) -> bool:
     return any(beside[a] & beside[b] for a, its in beside.items() for b in its)
 
 
-def mend(device: Device, found: Sequence[Weighed]) -> list[Key]:
-    """Replace, in place, flow that others contradict, or know better; returns of which pairs, as (a, b)."""
+def mend(device: Device, found: Sequence[Weighed], vouched: Mapping[Key, Points] | None = None) -> list[Key]:
+    """Replace, in place, flow that others contradict, or know better; returns of which pairs, as (a, b).
+
+    vouched     for some pairs, both ways, where they start from control points that their flow agrees with,
+                (n, 2) px of their chart. It stays around them.
+    """
     ways = dict(_ways(device, found))
     others = dict(_all_others(device, ways))
     reliable = _reliable(ways, others)
@@ -115,8 +122,13 @@ def mend(device: Device, found: Sequence[Weighed]) -> list[Key]:
             covered = all(_covered(ways[key], its) >= _COVERED for key, its in better.items())
             counts = 0.0 if reliable[a, c] < _REFUTED and covered else 1.0
             totals = [(ways[key], _sum(device, ways, key, its, reliable)) for key, its in better.items()]
-            for way, total in totals:
+            for key, (way, total) in zip(better, totals, strict=True):
                 grid = way.chart.border
+                if vouched and len(vouched.get(key, ())):
+                    points = device.upload(vouched[key], np.float32)
+                    device.run(
+                        "relay", "relay_vouch", grid[:2], points, len(vouched[key]), _VOUCHED, grid, total,
+                    )  # fmt: skip
                 device.run(
                     "relay", "relay_take", grid[:2], total, grid, _SURE, _AGREES, counts, way.found,
                 )  # fmt: skip

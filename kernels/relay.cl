@@ -133,8 +133,28 @@ __kernel void relay_add(__global const float4 *first,        /* (first_grid.y, f
     sum[y * size.x + x] += (float4)(weight * way, weight, 0.0f);
 }
 
+/* How near a control point is that found flow agrees with, 0..1, into the last of a sum. */
+__kernel void relay_vouch(__global const float2 *points, /* (count) px of the chart */
+                          int count,
+                          float sigma,                   /* px */
+                          int4 grid,                     /* run size */
+                          __global float4 *sum)          /* (grid.y, grid.x) of relay_add, with a step of 1 */
+{
+    const int x = get_global_id(0), y = get_global_id(1);
+    if (x >= grid.x || y >= grid.y)
+        return;
+    float nearest = INFINITY;
+    for (int i = 0; i < count; ++i) {
+        float2 way = (float2)(x + 0.5f, y + 0.5f) - points[i];
+        if (grid.z)
+            way.x -= grid.x * rint(way.x / grid.x);
+        nearest = LEAST(nearest, square2(way));
+    }
+    sum[y * grid.x + x].w = exp(-0.5f * nearest / (sigma * sigma));
+}
+
 /* Found flow becomes that by way of others where they know it, and it leads elsewhere or is not trusted, in place; not
-   in the place of what is taken from one photo. */
+   where a control point vouches for it, nor in the place of what is taken from one photo. */
 __kernel void relay_take(__global const float4 *sum, /* (grid.y, grid.x) of relay_add, with a step of 1 */
                          int4 grid,                  /* run size */
                          float enough,               /* weight of others from which on they are sure */
@@ -149,10 +169,10 @@ __kernel void relay_take(__global const float4 *sum, /* (grid.y, grid.x) of rela
     const float4 its = sum[at], own = found[at];
     if (own.w >= UNTOLD)
         return;
-    const float told = LEAST(its.z / enough, 1.0f);
+    const float told = (1.0f - its.w) * LEAST(its.z / enough, 1.0f);
     const float2 other = its.z > 0.0f ? its.xy / its.z : own.xy;
     const float off = 1.0f + square2(other - own.xy) / (agrees * agrees), agreement = 1.0f / (off * off);
-    const float kept = counts * own.z * (1.0f - told * (1.0f - agreement)), taken = told * (1.0f - kept);
+    const float kept = GREATEST(counts, its.w) * own.z * (1.0f - told * (1.0f - agreement)), taken = told * (1.0f - kept);
     if (taken > 0.0f)
         found[at].xy = (kept * own.xy + taken * other) / (kept + taken);
     found[at].z = kept + taken;

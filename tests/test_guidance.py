@@ -246,6 +246,14 @@ def test_guides_that_agree_change_nothing(device: Device, pair) -> None:
         assert np.array_equal(one.get(), other)
 
 
+def test_guides_that_flow_holds_to_are_those_that_agree_with_it(device: Device, pair) -> None:
+    images, alone, _ = pair("texture")
+    guides = guides_at((30, 30), (35, 160), (40, 100), move=(1, -1.5))
+    guides.at_b[1] += 4
+    at_a, at_b = guidance.held(images[0], alone, guides)
+    assert np.array_equal(at_a, guides.at_a[[0, 2]]) and np.array_equal(at_b, guides.at_b[[0, 2]])
+
+
 def test_guides_that_the_images_refute_are_ignored(device: Device, pair, caplog) -> None:
     """Two points that agree with each other, on a wall that both images show clearly at its place."""
     images, alone, _ = pair("texture")

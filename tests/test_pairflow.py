@@ -12,7 +12,9 @@ from scipy import ndimage
 from hugin_abflow import chart, consistency, flow, joint, pairflow, quality, relay, single
 from hugin_abflow.cells import Whole
 from hugin_abflow.errors import SettingsError
+from hugin_abflow.guides import Guide
 from hugin_abflow.layer import Canvas, Layer
+from hugin_abflow.merge import merge_layers
 from hugin_abflow.settings import FlowQuality, Settings
 from hugin_abflow.working import Grid, full_grid
 
@@ -153,7 +155,7 @@ def test_flow_is_compared_with_that_of_other_pairs(monkeypatch: pytest.MonkeyPat
     """Before it is filled, and where three layers overlap alone."""
     asked, filled = list[list[tuple[int, int]]](), list[int]()
     monkeypatch.setattr(
-        relay, "mend", lambda device, found: asked.append([(one.a, one.b) for one in found]) or []
+        relay, "mend", lambda device, found, _: asked.append([(one.a, one.b) for one in found]) or []
     )
     fill = consistency.mend
     monkeypatch.setattr(consistency, "mend", lambda *given: filled.append(len(asked)) or fill(*given))
@@ -164,3 +166,22 @@ def test_flow_is_compared_with_that_of_other_pairs(monkeypatch: pytest.MonkeyPat
     merged([*two, Layer.from_array("c", pixels, 61)], CANVAS, relay=wanted)
     assert asked == ([[(0, 1), (0, 2), (1, 2)]] if wanted else [])
     assert filled[1:] == [int(wanted)] * 3
+
+
+@pytest.mark.usefixtures(small.__name__)
+def test_control_points_vouch_for_flow_on_the_chart_that_it_has(
+    weighed: list[tuple[Any, ...]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Both ways, where flow agrees with them; before other pairs are asked."""
+    told: list[dict[tuple[int, int], np.ndarray]] = []
+    monkeypatch.setattr(relay, "triangles", lambda pairs: True)
+    monkeypatch.setattr(relay, "mend", lambda device, found, vouched: told.append(vouched) or [])
+    guides = [Guide(1, 0, (150.5, 70.5), (147.5, 70.5)), Guide(0, 1, (149.5, 30.5), (172.5, 30.5))]
+    settings = Settings(working_pixels=CANVAS.width * CANVAS.height)
+    merge_layers(layers(31), CANVAS, settings, guides=guides)
+    ((pair, _, _, _),), (vouched,) = weighed, told
+    assert pair.chart.coarse == 1 and set(vouched) == {(0, 1), (1, 0)}
+    grid = full_grid(CANVAS, layers(31))
+    for way, end in (((0, 1), (147.5, 70.5)), ((1, 0), (150.5, 70.5))):
+        place = pair.chart.positions(grid.points(np.array([end])))
+        assert vouched[way] == pytest.approx(place, abs=0.01)

@@ -123,11 +123,22 @@ def test_ways_equal_their_twin(device: Device, name: str, step: int, ring: bool)
     assert_close(total.get()[..., 2] - 0.25, expected[..., 2], TRIGONOMETRY, decisions=0.01)
 
 
+@pytest.mark.parametrize("wraps", [False, True])
+def test_vouching_equals_its_twin(device: Device, wraps: bool) -> None:
+    points = np.array([[1.5, 40.2], [70.0, 8.0], [90.0, -3.0]], np.float32)
+    total = device.upload(np.ones((53, 77, 4), np.float32))
+    grid = (77, 53, int(wraps), 0)
+    device.run("relay", "relay_vouch", grid[:2], device.upload(points), 3, 6.0, grid, total)
+    assert_close(total.get()[..., 3], twin.relay_vouch(points, 6.0, grid), TRIGONOMETRY)
+    assert (total.get()[..., :3] == 1).all()
+
+
 @pytest.mark.parametrize("counts", [0.0, 1.0])
 def test_taking_equals_its_twin(device: Device, counts: float) -> None:
     random = np.random.default_rng(5)
     total = random.normal(size=(53, 77, 4)).astype(np.float32)
     total[..., 2] = random.random((53, 77)) * 0.5 * patches(4, 77, 53, 0.7)
+    total[..., 3] = random.random((53, 77)) * patches(7, 77, 53, 0.4)
     found = random_found(6, 77, 53)
     result = device.upload(found)
     device.run(
@@ -245,8 +256,8 @@ class Scene:
         ]
         return float(np.median(np.concatenate(wrong)))
 
-    def mend(self) -> list[tuple[int, int]]:
-        return relay.mend(self.device, self.found)
+    def mend(self, vouched: dict[tuple[int, int], np.ndarray] | None = None) -> list[tuple[int, int]]:
+        return relay.mend(self.device, self.found, vouched)
 
     def stays(self) -> bool:
         """Whether mending it changes nothing."""
@@ -388,6 +399,25 @@ def test_where_others_do_not_reach_doubted_flow_stays_and_refuted_flow_does_not(
     right = np.s_[:, 135:140]
     assert np.array_equal(after[right][..., :2], before[right][..., :2])
     assert np.array_equal(after[right][..., 2], before[right][..., 2] * kept)
+
+
+@pytest.mark.parametrize("refuted", [False, True])
+def test_control_points_vouch_for_the_flow_around_them(
+    device: Device, monkeypatch: pytest.MonkeyPatch, refuted: bool
+) -> None:
+    """They are the user's; elsewhere in the overlap the others are believed, for they know more of it."""
+    monkeypatch.setattr(relay, "_VOUCHED", 5.0)
+    monkeypatch.setattr(relay, "_REFUTED", 1.0 if refuted else 0.0)
+    scene = Scene(device, CANVASES["plane"], SHIFTS, texture=0.0)
+    scene.spoil(1, 2, 20.0)
+    places = {(1, 2): np.array([[60.0, 40.0]]), (2, 1): np.array([[75.0, 40.0]])}
+    assert scene.mend(places) == [(1, 2)]
+    for buffer, column, sign in zip(scene.buffers(1, 2), (60, 75), (1, -1), strict=True):
+        after, true = buffer.get(), scene.flow(1, 2) if sign == 1 else scene.flow(2, 1)
+        off = np.linalg.norm(after[..., :2] - true, axis=-1)
+        assert off[39:41, column - 1 : column + 1] == pytest.approx(20, abs=0.5)
+        assert off[39:41, column - 45 : column - 25] == pytest.approx(0, abs=0.05)
+        assert after[39:41, column - 1 : column + 1, 2].min() > 0.9
 
 
 def test_a_few_untrusted_pixels_are_left_to_what_is_around(device: Device) -> None:
