@@ -7,15 +7,15 @@ import os
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import closing
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from hugin_abflow import joint, sequential
-from hugin_abflow.errors import LayersMissingError, OutputError
+from hugin_abflow import joint, sequential, trace
+from hugin_abflow.errors import DeviceError, LayersMissingError, OutputError
 from hugin_abflow.exif import Metadata
 from hugin_abflow.guides import Guide
 from hugin_abflow.images import ENDINGS, ImageWriter, check_target, use_threads
@@ -62,7 +62,7 @@ def merge_project(
     compression, jpeg_quality    of the file, see `images.ImageWriter`; default: the project's, if the output
                     has the project's format.
     metadata        write EXIF and, for viewers of 360-degree panoramas, GPano; see `metadata.describe`.
-    open_device     gives the device that `settings.device` and `.threads` mean; default: `Device`, a new one.
+    open_device     gives the device that `settings.device` and `.threads` mean; default: `kept_device`.
 
     The file appears when it is complete; inputs are never touched. Raises the `AbflowError` family:
     what the project, its layers, the device or the output can get wrong.
@@ -167,22 +167,40 @@ def _bands(
 ) -> Iterator[npt.NDArray[Any]]:
     """The panorama's rows from top to bottom."""
     use_threads(settings.cores)
-    device = (open_device or Device)(settings.device, settings.threads)
+    device = (open_device or kept_device)(settings.device, settings.threads)
     method = method or {"joint": joint.merge, "sequential": sequential.merge}[settings.merge]
     visible = False
-    with (
-        spooled(layers) as layers,
-        # ended first: its threads read the layers
-        closing(method(device, layers, canvas, settings, progress, guides)) as bands,
-    ):
-        for rows in bands:
-            visible = visible or bool(rows[..., -1].any())
-            yield rows
+    try:
+        with (
+            spooled(layers) as layers,
+            # ended first: its threads read the layers
+            closing(method(device, layers, canvas, settings, progress, guides)) as bands,
+        ):
+            for rows in bands:
+                visible = visible or bool(rows[..., -1].any())
+                yield rows
+        device.give_back()
+    except DeviceError:
+        _device.cache_clear()  # a lost device does not come back; its successor may
+        raise
     if not visible:
         _log.warning(
             "the panorama is wholly transparent: no layer shows anything inside the crop; "
             "check crop and masks in Hugin"
         )
+
+
+def kept_device(wanted: str | None, threads: int) -> Device:
+    """The device, with its kernels, for all merges of this process: drivers keep some of the memory of one
+    that is gone.
+    """
+    return _device(wanted, threads, trace.is_recording())
+
+
+@cache
+def _device(wanted: str | None, threads: int, timed: bool) -> Device:
+    """timed: one that tells its times."""
+    return Device(wanted, threads)
 
 
 def guides_between(plan: Plan, layers: Sequence[Layer], settings: Settings) -> list[Guide]:

@@ -18,8 +18,8 @@ DTYPES = [np.uint8, np.uint16, np.float16, np.float32]
 
 @pytest.fixture
 def one_device(device: Device, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Merges share the session's device, whose kernels are built; by itself each merge builds its own."""
-    monkeypatch.setattr(pipeline, "Device", lambda *wanted: device)
+    """Merges share the session's device, whose kernels are built; else they would share one of their own."""
+    monkeypatch.setattr(pipeline, "kept_device", lambda *wanted: device)
 
 
 def noise(height: int, width: int, dtype: type = np.uint8, channels: int = 3, seed: int = 0) -> np.ndarray:

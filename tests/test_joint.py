@@ -145,7 +145,7 @@ few_examples = settings(max_examples=8, deadline=None, derandomize=True)
 def one_device_for_all(device: Device):
     """As `one_device`, for hypothesis, which keeps a fixture for all its examples."""
     patch = pytest.MonkeyPatch()
-    patch.setattr(merge, "Device", lambda *wanted: device)
+    patch.setattr(merge, "kept_device", lambda *wanted: device)
     yield
     patch.undo()
 

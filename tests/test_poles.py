@@ -102,7 +102,7 @@ def four() -> tuple[list[Layer], list[np.ndarray]]:
 def whole(device: Device) -> np.ndarray:
     """The four fisheyes merged."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(pipeline, "Device", lambda *wanted: device)
+        patch.setattr(pipeline, "kept_device", lambda *wanted: device)
         return merged(four()[0], CANVAS)
 
 

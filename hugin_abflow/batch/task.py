@@ -17,7 +17,8 @@ from typing import Any, Protocol
 from hugin_abflow import memory, nona, trace
 from hugin_abflow.batch.record import Record
 from hugin_abflow.batch.state import State
-from hugin_abflow.errors import AbflowError, DeviceError
+from hugin_abflow.errors import AbflowError
+from hugin_abflow.merge import kept_device
 from hugin_abflow.metadata import version
 from hugin_abflow.opencl import Device
 from hugin_abflow.progress import Advance
@@ -99,8 +100,6 @@ def perform(task: Task, listener: Listener, level: int = logging.WARNING, turn: 
                     state.save(record)
         except Exception as error:
             record.result = "failed"
-            if isinstance(error, DeviceError):
-                _device.cache_clear()  # a lost device does not come back; its successor may
             if is_bug(error):
                 _log.info("%s", traceback.format_exc().rstrip())
             record.message, record.exit_code = explain(str(task.project), error)
@@ -132,7 +131,7 @@ def _stitch(task: Task, record: Record, listener: Listener, turn: Turn | None) -
 
     def open_device(wanted: str | None, threads: int) -> Device:
         nonlocal shared
-        device = _device(wanted, threads, trace.is_recording())
+        device = kept_device(wanted, threads)
         record.device, shared = device.name, device.kind != "CPU"
         return device
 
@@ -173,12 +172,6 @@ def _plain(value: Any) -> Any:
 def _sizes(files: list[Path]) -> list[dict[str, Any]]:
     """Files, and how large they are."""
     return [{"file": str(file), "bytes": file.stat().st_size if file.is_file() else 0} for file in files]
-
-
-@cache
-def _device(wanted: str | None, threads: int, timed: bool) -> Device:
-    """The device, with its kernels, for all projects of this process; `timed`: one that tells its times."""
-    return Device(wanted, threads)
 
 
 @cache
