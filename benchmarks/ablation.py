@@ -33,7 +33,6 @@ PARTS: dict[str, Mapping[str, Any]] = {
     "transition as published": {"transition_strain": 0.0},
     "no flow magnitude": {"flow_magnitude": 0.0},
     "average instead of softmax": {"softmax_sharpness": 0.0},
-    "no border feather": {"border_feather": 0.0},
     "flow of the others alone": {"both_flows": False},
     "two fixed-point steps": {"fixed_point_steps": 2},
     "no large motion": {"large_motion": "off"},

@@ -15,26 +15,12 @@ import numpy as np
 import numpy.typing as npt
 
 from hugin_abflow.opencl import Buffer, Device
-from hugin_abflow.settings import Settings
 from hugin_abflow.working import Grid, WorkingLayer
 
 # Distances are smooth: a mask grid of this many pixels is fine enough, and four times faster.
 _FINE_PIXELS = 600_000
 
 _Kind = TypeVar("_Kind", bound=np.generic)
-
-
-@dataclass(frozen=True)
-class Coefficients:
-    """Of one layer, on its box of the working grid.
-
-    blend   float32, w_k, the blend coefficient; 0 outside the layer, 1 where it is alone.
-    rim     uint8, 255ths of m_k = min(1, D_k / feather), which takes the layer's colour weight to 0 at its
-            border.
-    """
-
-    blend: Buffer
-    rim: Buffer
 
 
 @dataclass(frozen=True)
@@ -78,40 +64,22 @@ def masks(device: Device, layers: Sequence[WorkingLayer], grid: Grid) -> Masks:
     return Masks(mask_grid, tuple(buffers), np.stack([b.get() for b in buffers]).astype(bool))
 
 
-def _table(grid: Grid, within: float = math.inf) -> npt.NDArray[np.float32]:
-    """Parts of the distance between two pixels of the mask grid, and how far seeds are looked for, as
-    coefficient.cl takes them. within: the distance that matters, in mask px, on the sphere in radians; one
-    pixel more is read to interpolate.
-    """
+def _table(grid: Grid) -> npt.NDArray[np.float32]:
+    """Parts of the distance between two pixels of the mask grid, as coefficient.cl takes them."""
     rows, columns = np.arange(grid.height), np.arange(grid.width)
     if not grid.lens[1]:
-        parts = [rows, columns, np.ones(grid.height), np.full(grid.height, within + 1)]
-        return np.concatenate(parts).astype(np.float32)
+        return np.concatenate([rows, columns, np.ones(grid.height)]).astype(np.float32)
     _, dlon, lat, dlat = grid.lens
-    latitudes, within = lat - (rows + 0.5) * dlat, within + dlat
-    # so far they reach to the side from the row nearest to a pole that they come past
-    nearest = np.cos(np.minimum(np.abs(latitudes) + within, math.pi / 2))
-    sines = math.sin(min(within, math.pi / 2)) / np.maximum(nearest, 1e-9)
-    aside = np.where(sines < 1, np.arcsin(np.minimum(sines, 1)) / dlon, math.inf)
-    reach = np.maximum(aside, within / dlat)
-    parts = [np.sin(rows * dlat / 2), np.sin(columns * dlon / 2), np.cos(latitudes), reach]
+    latitudes = lat - (rows + 0.5) * dlat
+    parts = [np.sin(rows * dlat / 2), np.sin(columns * dlon / 2), np.cos(latitudes)]
     return np.concatenate(parts).astype(np.float32)
 
 
-def distance(
-    device: Device, masks_: Masks, index: int, cover: Buffer, working: Grid, within: float = math.inf
-) -> Buffer:
-    """D_k of layer `index` in working pixels, float32 on the mask grid; `cover` is the union's mask.
-
-    within          working px up to which distances matter; to find no longer ones takes less time. Those may
-                    be told as longer than they are.
-    """
+def distance(device: Device, masks_: Masks, index: int, cover: Buffer, working: Grid) -> Buffer:
+    """D_k of layer `index` in working pixels, float32 on the mask grid; `cover` is the union's mask."""
     grid = masks_.grid
     size = grid.border[:2]
-    spherical = working.lens[1] > 0
-    unit = 1 / working.lens[1] if spherical else working.width / grid.width
-    parts = _table(grid, within / unit)
-    table, furthest_step = device.upload(parts), parts[-grid.height :].max()
+    table = device.upload(_table(grid))
     seed, flooded = (device.empty(grid.shape, np.int32) for _ in range(2))
     mask = masks_.buffers[index]
     device.run("coefficient", "coefficient_seed", size, mask, cover, grid.border, seed)
@@ -120,9 +88,11 @@ def distance(
     while step:
         steps.append(step)
         step //= 2
-    for jump in [jump for jump in [*steps, 2, 1] if jump <= furthest_step]:
+    for jump in [*steps, 2, 1]:
         device.run("coefficient", "coefficient_flood", size, seed, grid.border, table, jump, flooded)
         seed, flooded = flooded, seed
+    spherical = working.lens[1] > 0
+    unit = 1 / working.lens[1] if spherical else working.width / grid.width
     furthest = math.pi / working.lens[1] if spherical else math.hypot(*working.shape)
     result = device.empty(grid.shape)
     device.run(
@@ -133,32 +103,26 @@ def distance(
 
 
 def coefficients(
-    device: Device,
-    layers: Sequence[WorkingLayer],
-    masks_: Masks,
-    grid: Grid,
-    settings: Settings,
-    within: float = math.inf,
-) -> list[Coefficients]:
-    """The blend coefficients of all layers. within: as of `distance`; at least the settings' feather."""
+    device: Device, layers: Sequence[WorkingLayer], masks_: Masks, grid: Grid, even: bool = False
+) -> list[Buffer]:
+    """The blend coefficients w_k of all layers, float32 on their boxes of the working grid: 0 outside the
+    layer, 1 where it is alone.
+
+    even    where several are, the same for all of them, which takes less time.
+    """
     cover = device.upload(np.logical_or.reduce(masks_.host, 0), np.uint8)
     total = device.zeros(grid.shape)
     ratio = (masks_.grid.width / grid.width, masks_.grid.height / grid.height)
-    expanded = []
+    same = device.empty(masks_.grid.shape).fill(1) if even else None
+    result = []
     for index, layer in enumerate(layers):
         blend = device.empty(layer.pixels.shape[:2])
-        on_masks = distance(device, masks_, index, cover, grid, within)
+        on_masks = same or distance(device, masks_, index, cover, grid)
         device.run(
             "coefficient", "coefficient_expand", layer.box[2:], on_masks, masks_.grid.border, ratio,
             layer.pixels, layer.box, grid.border, blend, total,
         )  # fmt: skip
-        expanded.append(blend)
-    result = []
-    for layer, blend in zip(layers, expanded, strict=True):
-        rim = device.empty(blend.shape, np.uint8)
-        device.run(
-            "coefficient", "coefficient_ratio", layer.box[2:], blend, layer.box, grid.border, total,
-            settings.border_feather, rim,
-        )  # fmt: skip
-        result.append(Coefficients(blend, rim))
+        result.append(blend)
+    for layer, blend in zip(layers, result, strict=True):
+        device.run("coefficient", "coefficient_ratio", layer.box[2:], blend, layer.box, grid.border, total)
     return result

@@ -15,7 +15,6 @@ import numpy as np
 import numpy.typing as npt
 
 from hugin_abflow.chart import Chart
-from hugin_abflow.coefficient import Coefficients
 from hugin_abflow.opencl import Buffer, Device
 from hugin_abflow.settings import Settings
 from hugin_abflow.working import Grid, WorkingLayer
@@ -54,7 +53,7 @@ class PairFlow(Pair):
 def fields(
     device: Device,
     layers: Sequence[WorkingLayer],
-    coefficients: Sequence[Coefficients],
+    coefficients: Sequence[Buffer],
     flows: list[PairFlow],
     grid: Grid,
     settings: Settings,
@@ -74,14 +73,14 @@ def fields(
     for layer, field, coefficient in zip(layers, result, coefficients, strict=True):
         device.run(
             "geometry", "geometry_activation", layer.box[2:],
-            field, coefficient.blend, layer.box, grid.border,
+            field, coefficient, layer.box, grid.border,
             settings.softmax_sharpness, settings.flow_magnitude, float(grid.circumference),
             furthest, highest,
         )  # fmt: skip
     for layer, field, coefficient in zip(layers, result, coefficients, strict=True):
         device.run(
-            "geometry", "geometry_softmax", layer.box[2:], field, coefficient.blend, coefficient.rim,
-            layer.box, grid.border, highest,
+            "geometry", "geometry_softmax", layer.box[2:], field, coefficient, layer.box, grid.border,
+            highest,
         )  # fmt: skip
     return result
 
@@ -90,7 +89,7 @@ def _displacement(
     device: Device,
     index: int,
     layers: Sequence[WorkingLayer],
-    coefficients: Sequence[Coefficients],
+    coefficients: Sequence[Buffer],
     flows: Sequence[PairFlow],
     grid: Grid,
     settings: Settings,
@@ -109,7 +108,7 @@ def _displacement(
             flow, back = pair.between(other), pair.between(index)
             start = _GUESSED if guess else _BOTH if settings.both_flows else _THERE
             device.run(
-                "geometry", "geometry_add", four_at_a_time, coefficients[other].blend, layers[other].box,
+                "geometry", "geometry_add", four_at_a_time, coefficients[other], layers[other].box,
                 layer.pixels, layer.box, grid.border, grid.lens, flow, back, pair.chart.border,
                 pair.chart.transform, start, guess or field, field,
             )  # fmt: skip

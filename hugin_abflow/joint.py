@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import importlib
 import logging
-import math
 import threading
 from collections import Counter
 from collections.abc import Callable, Generator, Iterator, Sequence
@@ -55,10 +54,10 @@ _unused_log = logging.getLogger("hugin_abflow.unused")
 _LEAST_OVERLAP = 64
 # What only one layer shows first passes for exposure in part: its region grows to its size in a few rounds.
 _SEAM_ROUNDS = 2
-# Bytes that are to come for each working pixel of a layer: a field, an array of coefficients, a rim, offsets
+# Bytes that are to come for each working pixel of a layer: a field, an array of coefficients, offsets
 # and what they are made from; for each pixel of charts: flow both ways, and before that as it was found; and
 # of the largest, to solve it.
-_STEP_BYTES, _FLOW_BYTES, _FOUND_BYTES, _SOLVER_BYTES = 16 + 4 + 1 + 9, 16, 32, 250
+_STEP_BYTES, _FLOW_BYTES, _FOUND_BYTES, _SOLVER_BYTES = 16 + 4 + 9, 16, 32, 250
 # What libraries take that are still being loaded (`_making_ready`).
 _LIBRARY_BYTES = 50 << 20
 # Below this a working canvas is too small to be worth another attempt.
@@ -224,8 +223,7 @@ def _align(
     regions: npt.NDArray[np.bool_] | None = None
     whole: npt.NDArray[np.bool_] | None = None
     settled = transition.wanted(flows, settings)
-    within = settings.border_feather if settled else math.inf
-    coefficients = coefficient.coefficients(device, layers, masks, grid, settings, within)
+    coefficients = coefficient.coefficients(device, layers, masks, grid, even=settled)
     clipped = highlights.excess(device, layers, masks, grid, settings)
     if settled:
         transition.settle(device, layers, coefficients, flows, masks, grid, settings, clipped.max(0))

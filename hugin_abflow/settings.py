@@ -50,8 +50,6 @@ class Settings:
     interpolation       how layers are sampled; "nearest" is for comparison with the paper's own code.
     working_pixels      upper bound of the pixels of the working canvas (flow, coefficients, colour), at least
                         1024; 0: chosen by flow_quality.
-    border_feather      width of the ramp that brings a layer's weight to 0 at its own border, in working
-                        pixels; 0: none, as published.
     both_flows          where layer k is sampled is told by F_kj(p), too, by each as far as the flows at the
                         ends of its way say the same; else by F_jk(p) alone, as published.
     fixed_point_steps   times that x_k <- p - sum_j w_j F_kj(x_k) is iterated from there; 0: flow is read at
@@ -81,7 +79,6 @@ class Settings:
     guides: bool = True
     interpolation: Interpolation = "bicubic"
     working_pixels: int = 0
-    border_feather: float = 6.0
     both_flows: bool = True
     fixed_point_steps: int = 0
     band_rows: int = 0
@@ -95,7 +92,6 @@ class Settings:
             ("flow_magnitude", 0, 10_000),
             ("working_pixels", _LEAST_WORKING_PIXELS if self.working_pixels else 0, 1 << 28),
             ("transition_strain", 0, 1),
-            ("border_feather", 0, 1000),
             ("fixed_point_steps", 0, 20),
             ("band_rows", 0, 1 << 20),
             ("max_memory", 0, MOST_MEMORY),

@@ -29,7 +29,7 @@ import numpy.typing as npt
 import scipy
 
 from hugin_abflow.cells import Mask
-from hugin_abflow.coefficient import Coefficients, Masks, on_cells
+from hugin_abflow.coefficient import Masks, on_cells
 from hugin_abflow.geometry import PairFlow
 from hugin_abflow.opencl import Buffer, Device
 from hugin_abflow.settings import Settings
@@ -80,7 +80,7 @@ def wanted(flows: Sequence[PairFlow], settings: Settings) -> bool:
 def settle(
     device: Device,
     layers: Sequence[WorkingLayer],
-    coefficients: Sequence[Coefficients],
+    coefficients: Sequence[Buffer],
     flows: Sequence[PairFlow],
     masks: Masks,
     grid: Grid,
@@ -222,7 +222,7 @@ def relax(device: Device, shares: Shares, system: tuple[Buffer, ...], depth: flo
 def _expand(
     device: Device,
     layers: Sequence[WorkingLayer],
-    coefficients: Sequence[Coefficients],
+    coefficients: Sequence[Buffer],
     shares: Shares,
     grid: Grid,
 ) -> None:
@@ -230,8 +230,8 @@ def _expand(
     total = device.zeros(grid.shape)
     for index, (layer, one) in enumerate(zip(layers, coefficients, strict=True)):
         device.run(
-            "transition", "transition_expand", layer.box[2:], one.blend, one.rim, layer.box, grid.border,
+            "transition", "transition_expand", layer.box[2:], one, layer.box, grid.border,
             shares.share, shares.first, shares.owner, shares.cells.border, index, total,
         )  # fmt: skip
     for layer, one in zip(layers, coefficients, strict=True):
-        device.run("transition", "transition_ratio", layer.box[2:], one.blend, layer.box, grid.border, total)
+        device.run("transition", "transition_ratio", layer.box[2:], one, layer.box, grid.border, total)

@@ -34,9 +34,9 @@ __kernel void coefficient_seed(__global const uchar *mask,  /* (grid.y, grid.x) 
 }
 
 /* A measure that grows with the distance of two mask pixels; coefficient_distance makes it one. The table holds
-   a vertical part by |dy| (grid.y), a horizontal part by |dx| (grid.x), a factor per row (grid.y), and how far seeds
-   are looked for from each row (grid.y), in mask px. On a plane: dy, dx, 1, hence the squared distance. On the sphere:
-   sin(dlat / 2), sin(dlon / 2), cos(lat), hence the haversine, which is exact for small angles. */
+   a vertical part by |dy| (grid.y), a horizontal part by |dx| (grid.x) and a factor per row (grid.y). On a
+   plane: dy, dx, 1, hence the squared distance. On the sphere: sin(dlat / 2), sin(dlon / 2), cos(lat), hence the
+   haversine, which is exact for small angles. */
 static inline float coefficient_measure(int2 p, int2 q, int4 grid, __global const float *table) {
     int dx = MAGNITUDE(p.x - q.x);
     if (grid.z)
@@ -55,10 +55,8 @@ __kernel void coefficient_flood(__global const int *seed,    /* (grid.y, grid.x)
     const int x = get_global_id(0), y = get_global_id(1);
     if (x >= grid.x || y >= grid.y)
         return;
-    const int known = seed[y * grid.x + x];
-    /* a seed itself, nothing is nearer; or nothing that far matters */
-    if (known == x + (y << 16) || step > table[2 * grid.y + grid.x + y]) {
-        flooded[y * grid.x + x] = known;
+    if (seed[y * grid.x + x] == x + (y << 16)) { /* a seed itself: nothing is nearer */
+        flooded[y * grid.x + x] = x + (y << 16);
         return;
     }
     const bool inner = x >= step && y >= step && x + step < grid.x && y + step < grid.y;
@@ -132,16 +130,12 @@ __kernel void coefficient_expand(__global const float *distance, /* (grid.y, gri
 __kernel void coefficient_ratio(__global float *distance,     /* (box.w, box.z) D_k, becomes w_k */
                                 int4 box,                     /* place on the working grid; run size */
                                 int4 working,                 /* working grid */
-                                __global const float *total,  /* (working.y, working.x) */
-                                float feather,                /* working px, 0: none */
-                                __global uchar *rim)          /* (box.w, box.z) m_k = min(1, D_k / feather), in 255ths */
+                                __global const float *total)  /* (working.y, working.x) */
 {
     const int x = get_global_id(0), y = get_global_id(1);
     if (x >= box.z || y >= box.w)
         return;
     const int at = y * box.z + x;
     const float d = distance[at];
-    /* rounded up: what nothing else shows is not lost */
-    rim[at] = d < feather ? LEAST((int)(255.0f * d / feather) + (d > 0.0f ? 1 : 0), 255) : (d > 0.0f ? 255 : 0);
     distance[at] = d > 0.0f ? d / total[(y + box.y) * working.x + x + box.x] : 0.0f;
 }

@@ -162,10 +162,9 @@ __kernel void geometry_activation(__global float4 *field,        /* (box.w, box.
     highest[top] = GREATEST(highest[top], a);
 }
 
-/* s_k (not yet normalised) = m_k * exp(a_k - max a). */
+/* s_k (not yet normalised) = exp(a_k - max a). */
 __kernel void geometry_softmax(__global float4 *field,       /* (box.w, box.z); s_k replaces a_k */
                                __global const float *blend,  /* (box.w, box.z) w_k */
-                               __global const uchar *rim,    /* (box.w, box.z) m_k in 255ths */
                                int4 box, int4 border,        /* place on the working grid, run size */
                                __global const float *highest) /* (border.y, border.x) */
 {
@@ -174,9 +173,7 @@ __kernel void geometry_softmax(__global float4 *field,       /* (box.w, box.z); 
         return;
     const int at = y * box.z + x;
     const float a = field[at].w - highest[(y + box.y) * border.x + x + box.x];
-    field[at].w = blend[at] > 0.0f
-                      ? rim[at] / 255.0f * exponential(GREATEST(a, -87.0f))
-                      : 0.0f;
+    field[at].w = blend[at] > 0.0f ? exponential(GREATEST(a, -87.0f)) : 0.0f;
 }
 
 /* The longest displacement of each row, and how many rows it leads up or down at most: how many rows a band needs

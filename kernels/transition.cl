@@ -147,9 +147,8 @@ __kernel void transition_relax(__global float *share,       /* in place */
     transition_project(share, begin, end);
 }
 
-/* w_k from the shares, where several layers are, and less towards the layer's border. They still have to sum to 1. */
+/* w_k from the shares, where several layers are. They still have to sum to 1. */
 __kernel void transition_expand(__global float *blend,            /* (box.w, box.z) w_k, in place */
-                                __global const uchar *rim,        /* (box.w, box.z) m_k in 255ths */
                                 int4 box, int4 border,            /* place on the working grid, run size; the grid */
                                 __global const float *share, __global const int *first,
                                 __global const int *owner,
@@ -166,7 +165,7 @@ __kernel void transition_expand(__global float *blend,            /* (box.w, box
         const float2 ratio = (float2)((float)cells.x / border.x, (float)cells.y / border.y);
         const float2 q = ((float2)(x + box.x, y + box.y) + 0.5f) * ratio;
         w = transition_read(share, first, owner, q, cells, layer);
-        w = GREATEST(w, TRANSITION_TRACE) * rim[at] / 255.0f;
+        w = GREATEST(w, TRANSITION_TRACE);
     }
     blend[at] = w;
     total[(y + box.y) * border.x + x + box.x] += w;

@@ -10,12 +10,11 @@ from grids import GRIDS, on_device, patches, plane, random_layer, sphere
 from reference import coefficient as twin
 from reference.common import grid_border
 from scipy import ndimage
-from tolerances import DECISIONS, POSITION, SUM, TRIGONOMETRY, assert_close
+from tolerances import POSITION, SUM, TRIGONOMETRY, assert_close
 
 from hugin_abflow import coefficient
 from hugin_abflow.coefficient import Masks
 from hugin_abflow.opencl import Buffer, Device
-from hugin_abflow.settings import Settings
 from hugin_abflow.working import Grid
 
 NAMES = list(GRIDS)
@@ -49,12 +48,10 @@ def brute_force(mask: np.ndarray, cover: np.ndarray, grid: Grid) -> np.ndarray:
     return result
 
 
-def kernel_distance(
-    device: Device, masks: list[np.ndarray], index: int, grid: Grid, within: float = math.inf
-) -> np.ndarray:
+def kernel_distance(device: Device, masks: list[np.ndarray], index: int, grid: Grid) -> np.ndarray:
     cover = np.maximum.reduce(masks)
     covers = cover_masks(device, masks, grid)
-    return coefficient.distance(device, covers, index, device.upload(cover, np.uint8), grid, within).get()
+    return coefficient.distance(device, covers, index, device.upload(cover, np.uint8), grid).get()
 
 
 def unit(grid: Grid) -> float:
@@ -120,19 +117,6 @@ def test_flood_equals_its_twin(device: Device, name: str, step: int) -> None:
     assert 0.05 < (kernel >= 0).mean() < 1
     if not grid.lens[1]:
         assert np.array_equal(kernel, expected)
-    near = device.empty(grid.shape, np.int32)
-    reach = random.choice([1.0, 7.5, 31.9, 32.0], grid.height)
-    parts = coefficient._table(grid)
-    parts[-grid.height :] = reach
-    device.run(
-        "coefficient", "coefficient_flood", grid.border[:2],
-        device.upload(seed), grid.border, device.upload(parts), step, near,
-    )  # fmt: skip
-    assert np.array_equal(near.get(), np.where(step > reach[:, None], seed, kernel))
-    assert np.array_equal(
-        twin.coefficient_flood(seed, grid.border, grid.lens, step, reach),
-        np.where(step > reach[:, None], seed, expected),
-    )
     full = np.ones(grid.shape)
     seeds = (kernel, expected)
     far = [twin.coefficient_distance(s, full, grid.border, grid.lens, unit(grid), 0.0) for s in seeds]
@@ -151,28 +135,6 @@ def test_distances_are_those_of_brute_force(device: Device, name: str, index: in
     assert expected.max() > 10
     assert (off > 1e-3).mean() < 0.02
     assert off.max() < 1
-
-
-@pytest.mark.parametrize("name", [*NAMES, "poles"])
-@pytest.mark.parametrize("within", [0.0, 0.4, 1.0, 2.5, 6.0, 11.0])
-def test_short_distances_are_the_same_if_only_they_matter(device: Device, name: str, within: float) -> None:
-    """To one pixel more, which is read to interpolate; also near the poles, where columns are narrow. Long
-    ones may be anything that is longer.
-    """
-    grid = sphere(256, 128) if name == "poles" else GRIDS[name]
-    masks = two_masks(2, grid)
-    if name == "poles":  # borders all around both of them, at any distance
-        masks[0][: grid.height // 9], masks[1][-grid.height // 9 :] = 1, 1
-        masks[0] &= patches(8, grid.width, grid.height, 0.97, 2).astype(np.uint8)
-    exact = brute_force(masks[0], np.maximum(*masks), grid)
-    near, covered = kernel_distance(device, masks, 0, grid, within), masks[0] > 0
-    matters = covered & (exact <= within + 0.999)
-    assert matters.any() == (exact[covered].min() <= within + 0.999)
-    off = np.abs(near - exact)[matters]
-    assert (off > 1e-3).sum() <= 0.02 * off.size  # as of the test above
-    assert off.max(initial=0) < 1
-    assert (near >= exact * (1 - 1e-4) - 1e-3)[covered].all()
-    assert (near[~covered] == 0).all()
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -271,18 +233,12 @@ def test_expand_and_ratio_equal_their_twins(device: Device, name: str) -> None:
     assert 1e-3 in expected
     assert_close(expanded.get(), expected, POSITION)
     assert_close(sums.get(), expected_sums, POSITION)
-    for feather in (6.0, 0.0):
-        blend, rim = device.upload(expected.astype(np.float32)), device.empty((19, 51), np.uint8)
-        device.run(
-            "coefficient", "coefficient_ratio", box[2:], blend, box, grid.border,
-            device.upload(expected_sums.astype(np.float32)), feather, rim,
-        )  # fmt: skip
-        ratios, rims = twin.coefficient_ratio(expected, box, expected_sums, feather)
-        assert_close(blend.get(), ratios, SUM)
-        # a step more or less where rounding decides
-        assert np.abs(rim.get() - rims).max() <= 1
-        assert_close(rim.get(), rims, SUM, DECISIONS)
-        assert np.array_equal(rim.get() > 0, rims > 0)
+    blend = device.upload(expected.astype(np.float32))
+    device.run(
+        "coefficient", "coefficient_ratio", box[2:], blend, box, grid.border,
+        device.upload(expected_sums.astype(np.float32)),
+    )  # fmt: skip
+    assert_close(blend.get(), twin.coefficient_ratio(expected, box, expected_sums), SUM)
 
 
 def test_twin_of_expand_is_linear_interpolation() -> None:
@@ -300,8 +256,8 @@ def test_twin_of_expand_is_linear_interpolation() -> None:
 
 
 @pytest.mark.parametrize("name", NAMES)
-@pytest.mark.parametrize("factor", [1, 2])
-def test_coefficients_sum_to_one(device: Device, name: str, factor: int) -> None:
+@pytest.mark.parametrize(("factor", "even"), [(1, False), (2, False), (1, True)])
+def test_coefficients_sum_to_one(device: Device, name: str, factor: int, even: bool) -> None:
     grid = GRIDS[name]
     layers = [
         on_device(device, random_layer(11, 41, grid.height), 0, 0),
@@ -311,11 +267,11 @@ def test_coefficients_sum_to_one(device: Device, name: str, factor: int) -> None
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(coefficient, "_FINE_PIXELS", 10**6 if factor == 1 else 0)
         masks = coefficient.masks(device, layers, grid)
-        result = coefficient.coefficients(device, layers, masks, grid, Settings())
+        result = coefficient.coefficients(device, layers, masks, grid, even)
     total, count = np.zeros(grid.shape), np.zeros(grid.shape)
     for layer, one in zip(layers, result, strict=True):
         left, top, width, height = layer.box
-        blend, valid = one.blend.get(), layer.pixels.get()[..., 3] > 0
+        blend, valid = one.get(), layer.pixels.get()[..., 3] > 0
         assert np.array_equal(blend > 0, valid)
         total[top : top + height, left : left + width] += blend
         count[top : top + height, left : left + width] += valid
@@ -329,8 +285,8 @@ def test_a_lone_layer_has_coefficient_one(device: Device) -> None:
     grid = plane()
     layer = on_device(device, random_layer(14, 50, 40), 7, 5)
     masks = coefficient.masks(device, [layer], grid)
-    (result,) = coefficient.coefficients(device, [layer], masks, grid, Settings())
-    assert np.array_equal(result.blend.get(), layer.pixels.get()[..., 3])
+    (result,) = coefficient.coefficients(device, [layer], masks, grid)
+    assert np.array_equal(result.get(), layer.pixels.get()[..., 3])
 
 
 def test_two_layers_are_blended_as_published(device: Device) -> None:
@@ -339,12 +295,13 @@ def test_two_layers_are_blended_as_published(device: Device) -> None:
     left, right = np.ones((53, 50, 4), np.float32), np.ones((53, 47, 4), np.float32)
     layers = [on_device(device, left, 0), on_device(device, right, 30)]
     masks = coefficient.masks(device, layers, grid)
-    blends = coefficient.coefficients(device, layers, masks, grid, Settings(border_feather=4.0))
+    blends = coefficient.coefficients(device, layers, masks, grid)
     x = np.arange(30, 50)
     to_area1, to_area2 = x - 29, 50 - x
-    assert np.allclose(blends[1].blend.get()[:, :20], to_area1 / (to_area1 + to_area2), atol=1e-6)
-    assert np.allclose(blends[0].blend.get()[:, 30:], to_area2 / (to_area1 + to_area2), atol=1e-6)
-    assert np.allclose(blends[1].rim.get()[:, :20] / 255, np.minimum(1, to_area1 / 4), atol=1 / 255)
+    assert np.allclose(blends[1].get()[:, :20], to_area1 / (to_area1 + to_area2), atol=1e-6)
+    assert np.allclose(blends[0].get()[:, 30:], to_area2 / (to_area1 + to_area2), atol=1e-6)
+    halves = coefficient.coefficients(device, layers, masks, grid, even=True)
+    assert all((one.get()[:, both] == 0.5).all() for one, both in zip(halves, (x, x - 30), strict=True))
 
 
 @pytest.mark.parametrize("shift", [1, 20, 39])

@@ -14,15 +14,14 @@ from tolerances import POSITION, SUM, TRIGONOMETRY, assert_close
 
 from hugin_abflow import geometry
 from hugin_abflow.chart import Chart, pair_chart
-from hugin_abflow.coefficient import Coefficients
 from hugin_abflow.geometry import PairFlow
 from hugin_abflow.layer import Box
-from hugin_abflow.opencl import Device
+from hugin_abflow.opencl import Buffer, Device
 from hugin_abflow.settings import Settings
 from hugin_abflow.working import Grid, WorkingLayer
 
 NAMES = list(GRIDS)
-PUBLISHED = Settings(both_flows=False, fixed_point_steps=0, border_feather=0.0)
+PUBLISHED = Settings(both_flows=False, fixed_point_steps=0)
 
 
 def smooth_flow(seed: int, found: Chart, strength: float = 3.0) -> np.ndarray:
@@ -99,7 +98,6 @@ def test_activation_and_softmax_equal_their_twins(device: Device, name: str) -> 
     field = random.normal(size=(29, 51, 4)).astype(np.float32)
     blend = (random.random((29, 51)) * patches(6, 51, 29, 0.8)).astype(np.float32)
     blend[3, 5:9] = 1
-    rim = random.integers(0, 256, (29, 51)).astype(np.uint8)
     before = (random.random(grid.shape) * 12).astype(np.float32)
     highest, out = device.upload(before), device.upload(field)
     device.run(
@@ -112,10 +110,10 @@ def test_activation_and_softmax_equal_their_twins(device: Device, name: str) -> 
     field[..., 3] = expected[..., 3]
     out.set(field)
     device.run(
-        "geometry", "geometry_softmax", box[2:], out, device.upload(blend), device.upload(rim), box,
-        grid.border, device.upload(top, np.float32),
+        "geometry", "geometry_softmax", box[2:], out, device.upload(blend), box, grid.border,
+        device.upload(top, np.float32),
     )  # fmt: skip
-    weights = twin.geometry_softmax(field, blend, rim, box, top)
+    weights = twin.geometry_softmax(field, blend, box, top)
     assert_close(out.get(), weights, TRIGONOMETRY)
     assert weights[..., 3].max() > 0.5
     assert np.array_equal(out.get()[..., 3] == 0, weights[..., 3] < 1e-45)
@@ -133,7 +131,7 @@ def test_twins_of_the_softmax_are_the_formulas() -> None:
         )
         fields.append(field)
     weights = [
-        twin.geometry_softmax(f, np.array([[b]]), np.full((1, 1), 255), (0, 0, 1, 1), top)[0, 0, 3]
+        twin.geometry_softmax(f, np.array([[b]]), (0, 0, 1, 1), top)[0, 0, 3]
         for f, b in zip(fields, blends, strict=True)
     ]
     activations = [
@@ -248,11 +246,11 @@ def pair(device: Device, a: int, b: int, found: Chart, forward: np.ndarray, back
     return PairFlow(a, b, found, device.upload(forward), device.upload(backward))
 
 
-def whole(device: Device, grid: Grid, blend: float | np.ndarray) -> tuple[WorkingLayer, Coefficients]:
+def whole(device: Device, grid: Grid, blend: float | np.ndarray) -> tuple[WorkingLayer, Buffer]:
     """A layer that covers the grid, with a coefficient."""
     layer = on_device(device, np.ones((*grid.shape, 4)))
     blends = np.broadcast_to(np.float32(blend), grid.shape)
-    return layer, Coefficients(device.upload(blends), device.empty(grid.shape, np.uint8).fill(255))
+    return layer, device.upload(blends)
 
 
 def whole_chart(grid: Grid) -> Chart:

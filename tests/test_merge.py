@@ -288,8 +288,8 @@ def test_settings_of_a_wrong_type(values):
 
 def test_numbers_become_what_kernels_take():
     """An integer's bits would be read as those of a tiny float."""
-    settings = Settings(softmax_sharpness=np.float32(3), border_feather=7, working_pixels=np.int64(5000))
-    numbers = settings.softmax_sharpness, settings.border_feather, settings.working_pixels
+    settings = Settings(softmax_sharpness=np.float32(3), flow_magnitude=7, working_pixels=np.int64(5000))
+    numbers = settings.softmax_sharpness, settings.flow_magnitude, settings.working_pixels
     assert numbers == (3, 7, 5000) and list(map(type, numbers)) == [float, float, int]
 
 
@@ -299,7 +299,7 @@ def test_numbers_become_what_kernels_take():
         {"softmax_sharpness": -1},
         {"flow_magnitude": 1e5},
         {"working_pixels": 1},
-        {"border_feather": float("nan")},
+        {"flow_magnitude": float("nan")},
         {"band_rows": -1},
         {"merge": "average"},
         {"interpolation": "sinc"},

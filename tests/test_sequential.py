@@ -16,12 +16,11 @@ pytestmark = pytest.mark.usefixtures(one_device.__name__)
 PLANE = Canvas.plane(157, 83)
 CYLINDER = Canvas.plane(157, 83, wraps=True)
 
-# Code 1 as published: nearest-neighbour sampling, no feather, no exposure.
+# Code 1 as published: nearest-neighbour sampling, no exposure.
 AS_PUBLISHED = {
     "merge": "sequential",
     "interpolation": "nearest",
     "exposure": False,
-    "border_feather": 0.0,
     "highlights": False,
     "transition_strain": 0.0,
     "both_flows": False,

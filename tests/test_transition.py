@@ -14,9 +14,9 @@ from tolerances import POSITION, SUM, TRIGONOMETRY, assert_close
 
 from hugin_abflow import highlights, transition
 from hugin_abflow.chart import pair_chart
-from hugin_abflow.coefficient import Coefficients, Masks
+from hugin_abflow.coefficient import Masks
 from hugin_abflow.geometry import PairFlow
-from hugin_abflow.opencl import Device
+from hugin_abflow.opencl import Buffer, Device
 from hugin_abflow.settings import Settings
 from hugin_abflow.transition import Shares
 from hugin_abflow.working import Grid, WorkingLayer
@@ -150,14 +150,13 @@ def test_expanding_equals_its_twins(device: Device, name: str) -> None:
     shares = upload(device, cells, cover, values)
     random = np.random.default_rng(3)
     blend = np.clip(1.4 * random.random((box[3], box[2])) - 0.2, 0, 1).astype(np.float32)
-    rim = random.integers(1, 256, blend.shape).astype(np.uint8)
     total = random.random(grid.shape).astype(np.float32)
     expanded, sums = device.upload(blend), device.upload(total)
     device.run(
-        "transition", "transition_expand", box[2:], expanded, device.upload(rim), box, grid.border,
+        "transition", "transition_expand", box[2:], expanded, box, grid.border,
         shares.share, shares.first, shares.owner, cells.border, 1, sums,
     )  # fmt: skip
-    expected = twin.transition_expand(blend, rim, box, grid.border, values[1], cells.border)
+    expected = twin.transition_expand(blend, box, grid.border, values[1], cells.border)
     assert 0.5 < ((blend > 0) & (blend < 1)).mean() < 1
     assert_close(expanded.get(), expected, 10 * SUM)
     expected_sums = total.astype(np.float64)
@@ -226,7 +225,7 @@ def test_links_lead_along_the_union_alone() -> None:
     assert around[:, 3].tolist() == [1, 1, 1]
 
 
-Scene = tuple[list[WorkingLayer], list[Coefficients], list[PairFlow], Masks]
+Scene = tuple[list[WorkingLayer], list[Buffer], list[PairFlow], Masks]
 
 
 def scene(device: Device, grid: Grid, covers: Sequence[np.ndarray], shift: np.ndarray) -> Scene:
@@ -238,10 +237,7 @@ def scene(device: Device, grid: Grid, covers: Sequence[np.ndarray], shift: np.nd
     ]
     distances = [ndimage.distance_transform_edt(np.pad(one, 1, mode="edge"))[1:-1, 1:-1] for one in covers]
     blends = np.stack(distances) / np.maximum(np.sum(distances, 0), 1e-9)
-    coefficients = [
-        Coefficients(device.upload(w.astype(np.float32)), device.empty(grid.shape, np.uint8).fill(255))
-        for w in blends
-    ]
+    coefficients = [device.upload(w.astype(np.float32)) for w in blends]
     masks = Masks(
         grid, tuple(device.upload(one.astype(np.uint8)) for one in covers), np.stack(covers).astype(bool)
     )
@@ -265,7 +261,7 @@ def settled(
     layers, coefficients, flows, masks = made
     everywhere = np.full(highlights.highlights_grid(grid).shape, unlike, np.float32)
     transition.settle(device, layers, coefficients, flows, masks, grid, settings or Settings(), everywhere)
-    return [one.blend.get() for one in coefficients]
+    return [one.get() for one in coefficients]
 
 
 def left_and_right(grid: Grid, border: int) -> list[np.ndarray]:
@@ -294,14 +290,14 @@ def test_a_transition_strains_as_wanted_in_a_wide_overlap(device: Device, flow: 
 @pytest.mark.parametrize("flow", [25.0, 100.0])
 def test_a_transition_takes_the_overlap_if_that_is_narrow(device: Device, flow: float) -> None:
     made = scene(device, WIDE, left_and_right(WIDE, 130), np.full(WIDE.shape, flow))
-    before = made[1][1].blend.get()
+    before = made[1][1].get()
     second = settled(device, WIDE, made)[1]
     assert second == pytest.approx(before, abs=0.08)
 
 
 def test_layers_that_are_not_alike_change_over_across_the_overlap(device: Device) -> None:
     made = scene(device, WIDE, left_and_right(WIDE, 20), np.full(WIDE.shape, 1.0))
-    before = made[1][1].blend.get()
+    before = made[1][1].get()
     assert settled(device, WIDE, made, unlike=1.0)[1] == pytest.approx(before, abs=0.03)
 
 
@@ -312,7 +308,7 @@ def test_a_near_thing_within_the_overlap_is_one_photo_s(device: Device) -> None:
     shift = np.zeros(WIDE.shape)
     shift[20:, 120:200] = 20
     made = scene(device, WIDE, left_and_right(WIDE, 20), shift)
-    assert (np.ptp(made[1][0].blend.get()[25:, 120:200], axis=1) > 0.25).all()
+    assert (np.ptp(made[1][0].get()[25:, 120:200], axis=1) > 0.25).all()
     first = settled(device, WIDE, made)[0][25:, 124:196]
     assert min(first.max(), (1 - first).max()) < 0.03
 
@@ -321,7 +317,7 @@ def test_what_crosses_the_overlap_bends_little_more_than_wanted(device: Device) 
     shift = np.zeros(WIDE.shape)
     shift[30:] = 15
     made = scene(device, WIDE, left_and_right(WIDE, 20), shift)
-    before = np.diff(made[1][1].blend.get()[34:], axis=1).max()
+    before = np.diff(made[1][1].get()[34:], axis=1).max()
     assert before < np.diff(settled(device, WIDE, made)[1][34:], axis=1).max() < 1.4 * STRAIN / 15
 
 

@@ -44,12 +44,8 @@ def between(x: Array, y: Array, place: Array, grid: Sequence[int], lens: Numbers
     return 2 * np.arcsin(np.minimum(1, chord / 2))
 
 
-def coefficient_flood(
-    seed: Array, grid: Sequence[int], lens: Numbers, step: int, reach: Array | None = None
-) -> Array:
-    """Each pixel's nearest seed among those that it and its eight neighbours at `step` know; what it knows
-    itself in rows that look less far. reach: px, by row; default: all look as far.
-    """
+def coefficient_flood(seed: Array, grid: Sequence[int], lens: Numbers, step: int) -> Array:
+    """Each pixel's nearest seed among those that it and its eight neighbours at `step` know."""
     x, y = pixels(grid[0], grid[1])
     best, nearest = np.full(seed.shape, -1), np.full(seed.shape, np.inf)
     for dy in (-step, 0, step):
@@ -59,8 +55,6 @@ def coefficient_flood(
             far = np.where(found >= 0, between(x, y, np.maximum(found, 0), grid, lens), np.inf)
             closer = (far < nearest) | ((far == nearest) & (found >= 0) & (found < best))
             best, nearest = np.where(closer, found, best), np.where(closer, far, nearest)
-    if reach is not None:
-        best = np.where(step > reach[:, None], seed, best)
     return best.astype(np.int32)
 
 
@@ -90,11 +84,8 @@ def coefficient_expand(
     return expanded, total
 
 
-def coefficient_ratio(
-    distance: Array, box: Sequence[int], total: Array, feather: float
-) -> tuple[Array, Array]:
-    """w_k and 255 m_k, rounded up, on the layer's box."""
+def coefficient_ratio(distance: Array, box: Sequence[int], total: Array) -> Array:
+    """w_k on the layer's box."""
     summed = total[box[1] : box[1] + box[3], box[0] : box[0] + box[2]]
     outside = distance <= 0
-    rim = np.minimum(1, distance / feather) if feather > 0 else np.where(outside, 0.0, 1.0)
-    return np.where(outside, 0.0, distance / np.where(outside, 1, summed)), np.ceil(255 * rim)
+    return np.where(outside, 0.0, distance / np.where(outside, 1, summed))

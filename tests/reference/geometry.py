@@ -103,11 +103,11 @@ def geometry_activation(
     return result, highest
 
 
-def geometry_softmax(field: Array, blend: Array, rim: Array, box: Sequence[int], highest: Array) -> Array:
+def geometry_softmax(field: Array, blend: Array, box: Sequence[int], highest: Array) -> Array:
     """s_k, not normalised, in the field's last channel."""
     result = field.astype(np.float64)
     top = highest[box[1] : box[1] + box[3], box[0] : box[0] + box[2]]
-    result[..., 3] = np.where(blend > 0, rim / 255 * np.exp(np.minimum(field[..., 3] - top, 0)), 0.0)
+    result[..., 3] = np.where(blend > 0, np.exp(np.minimum(field[..., 3] - top, 0)), 0.0)
     return result
 
 

@@ -86,12 +86,12 @@ def transition_relax(
 
 
 def transition_expand(
-    blend: Array, rim: Array, box: Sequence[int], border: Sequence[int], share: Array, cells: Sequence[int]
+    blend: Array, box: Sequence[int], border: Sequence[int], share: Array, cells: Sequence[int]
 ) -> Array:
     """w_k of a layer on its box from its share (height, width), where it is neither 0 nor 1."""
     columns, rows = pixels(box[2], box[3], box[0], box[1])
     x, y = (columns + 0.5) * cells[0] / border[0], (rows + 0.5) * cells[1] / border[1]
-    w = np.maximum(bilinear(share, cells, x, y)[0], TRACE) * rim / 255
+    w = np.maximum(bilinear(share, cells, x, y)[0], TRACE)
     return np.where((blend > 0) & (blend < 1), w, blend.astype(np.float64))
 
 
