@@ -168,6 +168,7 @@ def _bands(
     """The panorama's rows from top to bottom."""
     use_threads(settings.cores)
     device = (open_device or kept_device)(settings.device, settings.threads)
+    _log.info("device: %s", device.name)
     method = method or {"joint": joint.merge, "sequential": sequential.merge}[settings.merge]
     visible = False
     try:

@@ -291,7 +291,6 @@ class Device:
         self._building = threading.Lock()
         self._repeated: dict[tuple[str, str, str], list[cl.Kernel]] = {}
         self._arguments = threading.Lock()  # a kernel keeps its arguments from when they are set to its start
-        _log.info("device: %s", self.name)
 
     @property
     def name(self) -> str:

@@ -46,18 +46,8 @@ def test_cells_equal_their_twin(device: Device, wraps: bool, size: tuple[int, in
     found, other = (random_found(seed, *size) for seed in (1, 20))
     cells = -(-size[0] // 8), -(-size[1] // 8)
     result = device.empty((*cells[::-1], 4))
-    device.run(
-        "relay",
-        "relay_cells",
-        cells,
-        device.upload(found),
-        device.upload(other),
-        grid,
-        8,
-        0.03,
-        cells,
-        result,
-    )
+    images = device.upload(found), device.upload(other)
+    device.run("relay", "relay_cells", cells, *images, grid, 8, 0.03, cells, result)
     expected = twin.relay_cells(found, other, grid, 8, 0.03)
     if size == (77, 53):
         assert all(-1 in part and part.max() > 0 for part in (expected[..., 2], expected[..., 3]))
