@@ -108,7 +108,8 @@ def coefficients(
     """The blend coefficients w_k of all layers, float32 on their boxes of the working grid: 0 outside the
     layer, 1 where it is alone.
 
-    even    where several are, the same for all of them, which takes less time.
+    even    where several are, the same for all of them: enough where `transition.settle` then tells what
+            they are, and without distances, which take time.
     """
     cover = device.upload(np.logical_or.reduce(masks_.host, 0), np.uint8)
     total = device.zeros(grid.shape)

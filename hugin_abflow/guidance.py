@@ -1,6 +1,6 @@
 """Flow that guides lead where it cannot find its way alone (kernels/guidance.cl).
 
-The flow is found without them first; guides that agree with it change nothing. Around the others the flow
+The flow is found without them first; guides that agree with it hold it (relay.py). Around the others the flow
 starts once more, on a coarse level, from where they send it, held there by a spring that slackens from level
 to level and is gone on the finest. Then each pixel keeps the flow that explains the images better: guides
 decide only where the images do not.
@@ -27,6 +27,7 @@ from hugin_abflow.working import Grid
 _log = logging.getLogger(__name__)
 
 Values = npt.NDArray[np.float64]
+Pixels = npt.NDArray[np.intp]
 
 # Guides are on one thing if their moves differ by less than this share of what the flow lacks.
 _ALIKE = 0.3
@@ -144,11 +145,18 @@ def lead(
     return flows
 
 
-def held(image: Level, flows: Sequence[Buffer], guides: ChartGuides) -> tuple[Points, Points]:
-    """Of the guides that a pair's flows agree with, both ways, the ends on a and on b, (n, 2) px."""
-    far = [np.linalg.norm(way.residuals, axis=1) for way in _ways(image, flows, guides)]
-    agree = guides.only(np.all(np.array(far) <= GuidanceParameters().agreement, axis=0))
-    return agree.at_a, agree.at_b
+def held(images: tuple[Level, Level], flows: Sequence[Buffer], guides: ChartGuides) -> tuple[Values, Values]:
+    """The guides that both images show and both flows agree with: their places and moves, (n, 4) px, from a
+    to b and back.
+    """
+    ways = _ways(images[0], flows, guides)
+    agree = np.ones(len(guides), bool)
+    for image, way in zip(images, ways, strict=True):
+        column, row, inside = _pixels(image, way.places)
+        agree &= inside & (image.mask.get()[row, column] > 0)
+        agree &= np.linalg.norm(way.residuals, axis=1) <= GuidanceParameters().agreement
+    there, back = (np.hstack([way.places, way.moves])[agree] for way in ways)
+    return there, back
 
 
 @dataclass(frozen=True)
@@ -167,19 +175,25 @@ class _Way:
 
 
 def _ways(image: Level, flows: Sequence[Buffer], guides: ChartGuides) -> tuple[_Way, _Way]:
-    width, height, wraps, _ = image.grid
+    width, _, wraps, _ = image.grid
     moves = guides.at_b - guides.at_a
     if wraps:
         moves[:, 0] -= width * np.rint(moves[:, 0] / width)
     ways = []
     for field, places, way in zip(flows, (guides.at_a, guides.at_b), (moves, -moves), strict=True):
-        values = field.get()
-        column, row = np.floor(places).astype(int).T
-        column = column % width if wraps else column
-        inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
-        found = values[np.where(inside, row, 0), np.where(inside, column, 0)]
+        column, row, inside = _pixels(image, places)
+        found = field.get()[row, column]
         ways.append(_Way(places, way, np.where(inside[:, None], way - found, 0.0)))
     return ways[0], ways[1]
+
+
+def _pixels(image: Level, places: Points) -> tuple[Pixels, Pixels, npt.NDArray[np.bool_]]:
+    """Columns and rows of the pixels in which places lie, and which lie on the chart; 0 for the others."""
+    width, height, wraps, _ = image.grid
+    column, row = np.floor(places).astype(int).T
+    column = column % width if wraps else column
+    inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
+    return np.where(inside, column, 0), np.where(inside, row, 0), inside
 
 
 class _Springs:

@@ -6,23 +6,24 @@ import logging
 import os
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import closing
-from functools import cache, partial
+from contextlib import closing, suppress
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from hugin_abflow import joint, sequential, trace
+from hugin_abflow import joint, sequential
 from hugin_abflow.errors import DeviceError, LayersMissingError, OutputError
 from hugin_abflow.exif import Metadata
 from hugin_abflow.guides import Guide
 from hugin_abflow.images import ENDINGS, ImageWriter, check_target, use_threads
+from hugin_abflow.kept import forget, kept_device
 from hugin_abflow.layer import Canvas, Layer, check_layers
 from hugin_abflow.metadata import describe
 from hugin_abflow.nona import Remap, open_layers
-from hugin_abflow.opencl import Device, choose
+from hugin_abflow.opencl import Device, DeviceMemoryError, choose
 from hugin_abflow.pano_trafo import images_of, read_guides
 from hugin_abflow.progress import Progress, silent
 from hugin_abflow.project import Plan, read_plan
@@ -180,28 +181,19 @@ def _bands(
             for rows in bands:
                 visible = visible or bool(rows[..., -1].any())
                 yield rows
-        device.give_back()
-    except DeviceError:
-        _device.cache_clear()  # a lost device does not come back; its successor may
+    except DeviceMemoryError:
         raise
+    except DeviceError:
+        forget(device)
+        raise
+    finally:
+        with suppress(DeviceError):  # of which was told, if it is lost
+            device.give_back()
     if not visible:
         _log.warning(
             "the panorama is wholly transparent: no layer shows anything inside the crop; "
             "check crop and masks in Hugin"
         )
-
-
-def kept_device(wanted: str | None, threads: int) -> Device:
-    """The device, with its kernels, for all merges of this process: drivers keep some of the memory of one
-    that is gone.
-    """
-    return _device(wanted, threads, trace.is_recording())
-
-
-@cache
-def _device(wanted: str | None, threads: int, timed: bool) -> Device:
-    """timed: one that tells its times."""
-    return Device(wanted, threads)
 
 
 def guides_between(plan: Plan, layers: Sequence[Layer], settings: Settings) -> list[Guide]:

@@ -20,7 +20,7 @@ from hugin_abflow.cells import View, Whole
 from hugin_abflow.chart import Chart
 from hugin_abflow.consistency import Weighed
 from hugin_abflow.geometry import Pair, PairFlow
-from hugin_abflow.guides import Guide, Points
+from hugin_abflow.guides import Guide
 from hugin_abflow.opencl import Device
 from hugin_abflow.progress import Progress
 from hugin_abflow.pyramid import Level
@@ -77,7 +77,7 @@ def solve(
     ends = finest(drawn, grid, settings)
     weighed, singles, shifts = list[Weighed](), list[Whole | None](), list[figures.Parallax]()
     waiting: list[tuple[PairFlow, tuple[Level, Level], Future[Whole | None] | None]] = []
-    held: dict[tuple[int, int], Points] = {}
+    held: dict[tuple[int, int], guidance.Values] = {}
 
     def weigh() -> None:
         while waiting:  # one at most: a pair's images are large
@@ -98,8 +98,8 @@ def solve(
             placed = guidance.on_chart(its_guides, first, its_chart, grid)
             if its_guides:
                 found = guidance.lead(device, images, found, placed, its_chart.around(grid))
-                scale, at_ends = its_finest.width / its_chart.width, guidance.held(images[0], found, placed)
-                held[pair.a, pair.b], held[pair.b, pair.a] = (scale * end for end in at_ends)
+                scale, ways = its_finest.width / its_chart.width, guidance.held(images, found, placed)
+                held[pair.a, pair.b], held[pair.b, pair.a] = (scale * way for way in ways)
             weigh()
             job = None
             if settings.seam and (settings.foreground or (settings.movers and its_chart.eye)):

@@ -13,7 +13,7 @@ over all other layers b, of what ways by b say for that flow, and D of what they
 that both have in a cell, times the fit of the legs, r_ab r_bc, and how near to each other they lead, or how
 far. It is solved by a fixed point, from r = 1. Of doubted pairs, and of those of which others know much more
 than their own flow is sure of, what contradicts the more reliable ways becomes their mean, and so does what
-is not trusted; but not around control points that their own flow agrees with.
+is not trusted; but not around control points that own flow agrees with, on what moves as they do.
 """
 
 from __future__ import annotations
@@ -28,7 +28,6 @@ import numpy.typing as npt
 from hugin_abflow.chart import Chart
 from hugin_abflow.consistency import Weighed
 from hugin_abflow.geometry import Pair
-from hugin_abflow.guides import Points
 from hugin_abflow.opencl import Buffer, Device
 
 # Chart pixels in the side of a cell, in the middle of which ways are compared.
@@ -53,8 +52,9 @@ _SURE = 0.1
 _ROUNDS = 8
 # A way has to be known so far in so many cells.
 _KNOWN, _LEAST_CELLS = 0.05, 4
-# Chart pixels around a control point, a sigma, in which it vouches for the flow that agrees with it.
-_VOUCHED = 32.0
+# Working pixels around a control point, a sigma, in which it holds flow that is as far from its own move as
+# ways that agree.
+_HELD = 64.0
 # Third layers that are asked about a pair, those with the largest overlaps: where many overlap each other,
 # all triangles would be too many.
 _MOST = 4
@@ -102,11 +102,11 @@ def triangles(pairs: Iterable[Pair]) -> bool:
     return any(beside[a] & beside[b] for a, its in beside.items() for b in its)
 
 
-def mend(device: Device, found: Sequence[Weighed], vouched: Mapping[Key, Points] | None = None) -> list[Key]:
+def mend(device: Device, found: Sequence[Weighed], held: Mapping[Key, Values] | None = None) -> list[Key]:
     """Replace, in place, flow that others contradict, or know better; returns of which pairs, as (a, b).
 
-    vouched     for some pairs, both ways, where they start from control points that their flow agrees with,
-                (n, 2) px of their chart. It stays around them.
+    held        for some pairs, both ways, control points that hold their flow: places and moves, (n, 4) px of
+                their chart.
     """
     ways = dict(_ways(device, found))
     others = dict(_all_others(device, ways))
@@ -124,10 +124,11 @@ def mend(device: Device, found: Sequence[Weighed], vouched: Mapping[Key, Points]
             totals = [(ways[key], _sum(device, ways, key, its, reliable)) for key, its in better.items()]
             for key, (way, total) in zip(better, totals, strict=True):
                 grid = way.chart.border
-                if vouched and len(vouched.get(key, ())):
-                    points = device.upload(vouched[key], np.float32)
+                if held and len(held.get(key, ())):
+                    points = device.upload(held[key], np.float32)
                     device.run(
-                        "relay", "relay_vouch", grid[:2], points, len(vouched[key]), _VOUCHED, grid, total,
+                        "relay", "relay_hold", grid[:2], points, len(held[key]), _HELD / way.chart.coarse,
+                        _AGREES, way.found, grid, total,
                     )  # fmt: skip
                 device.run(
                     "relay", "relay_take", grid[:2], total, grid, _SURE, _AGREES, counts, way.found,

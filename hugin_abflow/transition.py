@@ -15,7 +15,8 @@ this well Blowey and Elliott 1991). Near things that end within an overlap are l
 layers cannot be brought to one brightness there is no well, and transitions of layers that reach beyond each
 other are as wide as the overlap. Layers of one and the same mask share it evenly.
 
-It is relaxed on a pyramid of cells. On the coarsest the well is added by and by, since there is one least
+Layers end hard at their borders in overlaps that are thinner than a cell, as in holes of their masks. It is
+relaxed on a pyramid of cells. On the coarsest the well is added by and by, since there is one least
 without it; the finer ones start from what the coarser ones have found.
 """
 

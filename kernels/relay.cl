@@ -133,28 +133,39 @@ __kernel void relay_add(__global const float4 *first,        /* (first_grid.y, f
     sum[y * size.x + x] += (float4)(weight * way, weight, 0.0f);
 }
 
-/* How near a control point is that found flow agrees with, 0..1, into the last of a sum. */
-__kernel void relay_vouch(__global const float2 *points, /* (count) px of the chart */
-                          int count,
-                          float sigma,                   /* px */
-                          int4 grid,                     /* run size */
-                          __global float4 *sum)          /* (grid.y, grid.x) of relay_add, with a step of 1 */
+/* How two ways agree that lie so far apart: 1, or 1/4 where it is `agrees` px. */
+static inline float relay_agreement(float2 off, float agrees) {
+    const float a = 1.0f + square2(off) / (agrees * agrees);
+    return 1.0f / (a * a);
+}
+
+/* How far control points hold found flow, 0..1, into the last of a sum: how near one is, and how flow agrees with its
+   move. */
+__kernel void relay_hold(__global const float4 *points, /* (count) place, move, px of the chart */
+                         int count,
+                         float sigma,                   /* px */
+                         float agrees,                  /* px */
+                         __global const float4 *found,  /* (grid.y, grid.x) */
+                         int4 grid,                     /* run size */
+                         __global float4 *sum)          /* (grid.y, grid.x) of relay_add, with a step of 1 */
 {
     const int x = get_global_id(0), y = get_global_id(1);
     if (x >= grid.x || y >= grid.y)
         return;
-    float nearest = INFINITY;
+    const int at = y * grid.x + x;
+    float most = 0.0f;
     for (int i = 0; i < count; ++i) {
-        float2 way = (float2)(x + 0.5f, y + 0.5f) - points[i];
+        float2 way = (float2)(x + 0.5f, y + 0.5f) - points[i].xy;
         if (grid.z)
             way.x -= grid.x * rint(way.x / grid.x);
-        nearest = LEAST(nearest, square2(way));
+        const float near = exp(-0.5f * square2(way) / (sigma * sigma));
+        most = GREATEST(most, near * relay_agreement(found[at].xy - points[i].zw, agrees));
     }
-    sum[y * grid.x + x].w = exp(-0.5f * nearest / (sigma * sigma));
+    sum[at].w = most;
 }
 
 /* Found flow becomes that by way of others where they know it, and it leads elsewhere or is not trusted, in place; not
-   where a control point vouches for it, nor in the place of what is taken from one photo. */
+   where control points hold it, as far as it is trusted, nor in the place of what is taken from one photo. */
 __kernel void relay_take(__global const float4 *sum, /* (grid.y, grid.x) of relay_add, with a step of 1 */
                          int4 grid,                  /* run size */
                          float enough,               /* weight of others from which on they are sure */
@@ -169,9 +180,9 @@ __kernel void relay_take(__global const float4 *sum, /* (grid.y, grid.x) of rela
     const float4 its = sum[at], own = found[at];
     if (own.w >= UNTOLD)
         return;
-    const float told = (1.0f - its.w) * LEAST(its.z / enough, 1.0f);
+    const float held = its.w * own.z, told = (1.0f - held) * LEAST(its.z / enough, 1.0f);
     const float2 other = its.z > 0.0f ? its.xy / its.z : own.xy;
-    const float off = 1.0f + square2(other - own.xy) / (agrees * agrees), agreement = 1.0f / (off * off);
+    const float agreement = relay_agreement(other - own.xy, agrees);
     const float kept = GREATEST(counts, its.w) * own.z * (1.0f - told * (1.0f - agreement)), taken = told * (1.0f - kept);
     if (taken > 0.0f)
         found[at].xy = (kept * own.xy + taken * other) / (kept + taken);

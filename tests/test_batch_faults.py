@@ -21,7 +21,7 @@ from conftest import names_in, on_small_disk
 from shoots import HEIGHT, WIDTH, write_project
 from test_batch_pool import Watch, perform, posix, stand_in, tasks_in
 
-from hugin_abflow import merge, opencl
+from hugin_abflow import kept, opencl
 from hugin_abflow.batch import pool, task, worker
 from hugin_abflow.errors import ExitCode
 
@@ -171,15 +171,16 @@ def test_lost_device_costs_an_attempt(tmp_path: Path, monkeypatch: pytest.Monkey
 
 def test_lost_device_is_told_and_not_used_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(opencl.cl, "enqueue_nd_range_kernel", opencl.cl.enqueue_nd_range_kernel)
-    merge._device.cache_clear()
+    kept._kept.clear()
     first, second = tasks_in(tmp_path, "a", "b")
     lose_device(after=4)
     listener = Watch().began(first)
     record = task.perform(first, listener)
     assert record.exit_code == ExitCode.DEVICE and "the OpenCL device failed" in record.message
     assert temporary(tmp_path) == [] and not (tmp_path / "a.tif").exists()
-    assert merge._device.cache_info().currsize == 0
+    assert not kept._kept
     assert task.perform(second, listener).result == "made"
+    assert len(kept._kept) == 1
 
 
 def started(*arguments: object) -> subprocess.Popen[str]:

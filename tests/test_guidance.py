@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -246,12 +247,18 @@ def test_guides_that_agree_change_nothing(device: Device, pair) -> None:
         assert np.array_equal(one.get(), other)
 
 
-def test_guides_that_flow_holds_to_are_those_that_agree_with_it(device: Device, pair) -> None:
+def test_flow_is_held_by_guides_that_agree_with_it_and_that_both_images_show(device: Device, pair) -> None:
     images, alone, _ = pair("texture")
-    guides = guides_at((30, 30), (35, 160), (40, 100), move=(1, -1.5))
+    guides = guides_at((30, 30), (35, 160), (40, 100), (35, 60), (-50, 50), (250, 20), move=(1, -1.5))
     guides.at_b[1] += 4
-    at_a, at_b = guidance.held(images[0], alone, guides)
-    assert np.array_equal(at_a, guides.at_a[[0, 2]]) and np.array_equal(at_b, guides.at_b[[0, 2]])
+    backward = alone[1].get()
+    backward[50:70, 20:50] += 4  # the fourth agrees with flow one way only
+    mask = images[1].mask.get()
+    mask[:40, 240:] = 0
+    masked = images[0], replace(images[1], mask=device.upload(mask))
+    there, back = guidance.held(masked, (alone[0], device.upload(backward)), guides)
+    for way, at, sign in ((there, guides.at_a, 1), (back, guides.at_b, -1)):
+        assert np.array_equal(way[:, :2], at[[0, 2]]) and np.allclose(way[:, 2:], [[sign, -1.5 * sign]])
 
 
 def test_guides_that_the_images_refute_are_ignored(device: Device, pair, caplog) -> None:

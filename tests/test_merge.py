@@ -211,26 +211,6 @@ def test_bands_read_only_rows_near_them():
     assert 16 <= max(longest) <= 16 + 2 * 10  # motion of 4 px, three more for taps
 
 
-def test_merges_of_one_process_share_a_device_until_it_is_lost(monkeypatch):
-    """Drivers keep some of the memory of each device that is gone."""
-    canvas, opened = CANVASES["plane"], []
-    monkeypatch.setattr(merge, "Device", lambda *wanted: opened.append(wanted) or opencl.Device(*wanted))
-    merge._device.cache_clear()
-    layers = with_parallax(canvas)
-    first, again = (merged(layers, canvas, flow=False) for _ in range(2))
-    assert opened == [(None, 0)] and np.array_equal(first, again)
-
-    def lost(*_, **__):
-        raise DeviceError("the device is lost")
-
-    with monkeypatch.context() as patch, pytest.raises(DeviceError, match="is lost"):
-        patch.setattr(opencl.Device, "run", lost)
-        merged(layers, canvas, flow=False)
-    assert np.array_equal(merged(layers, canvas, flow=False), first)
-    assert opened == [(None, 0)] * 2
-    merge._device.cache_clear()
-
-
 # What merge_layers refuses
 
 

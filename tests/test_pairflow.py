@@ -9,7 +9,7 @@ import pytest
 from pictures import merged, one_device
 from scipy import ndimage
 
-from hugin_abflow import chart, consistency, flow, joint, pairflow, quality, relay, single
+from hugin_abflow import chart, consistency, flow, guidance, joint, pairflow, quality, relay, single
 from hugin_abflow.cells import Whole
 from hugin_abflow.errors import SettingsError
 from hugin_abflow.guides import Guide
@@ -169,19 +169,23 @@ def test_flow_is_compared_with_that_of_other_pairs(monkeypatch: pytest.MonkeyPat
 
 
 @pytest.mark.usefixtures(small.__name__)
-def test_control_points_vouch_for_flow_on_the_chart_that_it_has(
+def test_control_points_hold_flow_on_the_chart_that_it_has(
     weighed: list[tuple[Any, ...]], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Both ways, where flow agrees with them; before other pairs are asked."""
-    told: list[dict[tuple[int, int], np.ndarray]] = []
+    """Both ways, where flow agrees with them when they have led it; before other pairs are asked."""
+    told, led = list[dict[tuple[int, int], np.ndarray]](), list[object]()
+    lead, held = guidance.lead, guidance.held
+    monkeypatch.setattr(guidance, "lead", lambda *given: led.append(lead(*given)) or led[-1])
+    monkeypatch.setattr(guidance, "held", lambda *given: led.append(given[1]) or held(*given))
     monkeypatch.setattr(relay, "triangles", lambda pairs: True)
-    monkeypatch.setattr(relay, "mend", lambda device, found, vouched: told.append(vouched) or [])
+    monkeypatch.setattr(relay, "mend", lambda device, found, held: told.append(held) or [])
     guides = [Guide(1, 0, (150.5, 70.5), (147.5, 70.5)), Guide(0, 1, (149.5, 30.5), (172.5, 30.5))]
     settings = Settings(working_pixels=CANVAS.width * CANVAS.height)
     merge_layers(layers(31), CANVAS, settings, guides=guides)
-    ((pair, _, _, _),), (vouched,) = weighed, told
-    assert pair.chart.coarse == 1 and set(vouched) == {(0, 1), (1, 0)}
+    ((pair, _, _, _),), (its,) = weighed, told
+    assert led[0] is led[1]
+    assert pair.chart.coarse == 1 and set(its) == {(0, 1), (1, 0)}
     grid = full_grid(CANVAS, layers(31))
-    for way, end in (((0, 1), (147.5, 70.5)), ((1, 0), (150.5, 70.5))):
-        place = pair.chart.positions(grid.points(np.array([end])))
-        assert vouched[way] == pytest.approx(place, abs=0.01)
+    ends = pair.chart.positions(grid.points(np.array([(147.5, 70.5), (150.5, 70.5)])))
+    for way, (start, end) in (((0, 1), ends), ((1, 0), ends[::-1])):
+        assert its[way] == pytest.approx(np.hstack([start, end - start])[None], abs=0.02)

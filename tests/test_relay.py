@@ -98,11 +98,9 @@ def test_ways_equal_their_twin(device: Device, name: str, step: int, ring: bool)
         parts.append((found, back, cells.astype(np.float32), grid, chart.transform))
     size = -(-grids[2][0] // step), -(-grids[2][1] // step)
     total = device.upload(np.full((*size[::-1], 4), 0.25, np.float32))
+    given = (device.upload(one) if np.ndim(one) > 1 else one for part in parts for one in part)
     device.run(
-        "relay", "relay_add", size,
-        *(device.upload(one) if isinstance(one, np.ndarray) and one.ndim > 1 else one for one in parts[0]),
-        *(device.upload(one) if isinstance(one, np.ndarray) and one.ndim > 1 else one for one in parts[1]),
-        8, grids[2], charts[2].transform, step, size, 0.7, total,
+        "relay", "relay_add", size, *given, 8, grids[2], charts[2].transform, step, size, 0.7, total,
     )  # fmt: skip
     expected = twin.relay_add(*parts, 8, grids[2], charts[2].transform, step, 0.7)
     assert 0.15 < (expected[..., 2] > 0).mean() < 1
@@ -114,12 +112,16 @@ def test_ways_equal_their_twin(device: Device, name: str, step: int, ring: bool)
 
 
 @pytest.mark.parametrize("wraps", [False, True])
-def test_vouching_equals_its_twin(device: Device, wraps: bool) -> None:
-    points = np.array([[1.5, 40.2], [70.0, 8.0], [90.0, -3.0]], np.float32)
+@pytest.mark.parametrize("count", [0, 3])
+def test_holding_equals_its_twin(device: Device, wraps: bool, count: int) -> None:
+    points = np.array([[1.5, 40.2, 1, -1], [70, 8, -2, 0.5], [90, -3, 0, 0]], np.float32)[:count]
+    found, grid = random_found(8, 77, 53), (77, 53, int(wraps), 0)
     total = device.upload(np.ones((53, 77, 4), np.float32))
-    grid = (77, 53, int(wraps), 0)
-    device.run("relay", "relay_vouch", grid[:2], device.upload(points), 3, 6.0, grid, total)
-    assert_close(total.get()[..., 3], twin.relay_vouch(points, 6.0, grid), TRIGONOMETRY)
+    held = device.upload(points) if count else total, count, 9.0, 3.0
+    device.run("relay", "relay_hold", grid[:2], *held, device.upload(found), grid, total)
+    expected = twin.relay_hold(points, 9.0, 3.0, found, grid)
+    assert count == 0 or expected.max() > 0.5
+    assert_close(total.get()[..., 3], expected, TRIGONOMETRY)
     assert (total.get()[..., :3] == 1).all()
 
 
@@ -246,8 +248,8 @@ class Scene:
         ]
         return float(np.median(np.concatenate(wrong)))
 
-    def mend(self, vouched: dict[tuple[int, int], np.ndarray] | None = None) -> list[tuple[int, int]]:
-        return relay.mend(self.device, self.found, vouched)
+    def mend(self, held: dict[tuple[int, int], np.ndarray] | None = None) -> list[tuple[int, int]]:
+        return relay.mend(self.device, self.found, held)
 
     def stays(self) -> bool:
         """Whether mending it changes nothing."""
@@ -392,22 +394,25 @@ def test_where_others_do_not_reach_doubted_flow_stays_and_refuted_flow_does_not(
 
 
 @pytest.mark.parametrize("refuted", [False, True])
-def test_control_points_vouch_for_the_flow_around_them(
+def test_control_points_hold_flow_that_moves_as_they_do(
     device: Device, monkeypatch: pytest.MonkeyPatch, refuted: bool
 ) -> None:
-    """They are the user's; elsewhere in the overlap the others are believed, for they know more of it."""
-    monkeypatch.setattr(relay, "_VOUCHED", 5.0)
+    """They are the user's; the others are believed elsewhere, and where flow moves otherwise or is lost."""
+    assert 20 < relay._HELD < 200
+    monkeypatch.setattr(relay, "_HELD", 5.0)
     monkeypatch.setattr(relay, "_REFUTED", 1.0 if refuted else 0.0)
     scene = Scene(device, CANVASES["plane"], SHIFTS, texture=0.0)
     scene.spoil(1, 2, 20.0)
-    places = {(1, 2): np.array([[60.0, 40.0]]), (2, 1): np.array([[75.0, 40.0]])}
-    assert scene.mend(places) == [(1, 2)]
-    for buffer, column, sign in zip(scene.buffers(1, 2), (60, 75), (1, -1), strict=True):
-        after, true = buffer.get(), scene.flow(1, 2) if sign == 1 else scene.flow(2, 1)
-        off = np.linalg.norm(after[..., :2] - true, axis=-1)
-        assert off[39:41, column - 1 : column + 1] == pytest.approx(20, abs=0.5)
-        assert off[39:41, column - 45 : column - 25] == pytest.approx(0, abs=0.05)
-        assert after[39:41, column - 1 : column + 1, 2].min() > 0.9
+    scene.change(1, 2, lambda values, _: values[:36, :, 2].fill(0))
+    scene.change(1, 2, lambda values, sign: values[44:, :, 0].__iadd__(9 * sign))
+    held = {(1, 2): np.array([[60.0, 40.0, 15, 0]]), (2, 1): np.array([[75.0, 40.0, -15, 0]])}
+    assert scene.mend(held) == [(1, 2)]
+    for way, buffer in zip(((1, 2), (2, 1)), scene.buffers(1, 2), strict=True):
+        after, column = buffer.get(), int(held[way][0, 0])
+        off = np.linalg.norm(after[..., :2] - scene.flow(*way), axis=-1)[:, column - 45 : column + 1]
+        assert off[39:41, 44:] == pytest.approx(20, abs=0.5)
+        assert max(off[39:41, :20].max(), off[34:36, 44:].max(), off[44:46, 44:].max()) < 0.5
+        assert after[34:46, column - 1 : column + 1, 2].min() > 0.6
 
 
 def test_a_few_untrusted_pixels_are_left_to_what_is_around(device: Device) -> None:

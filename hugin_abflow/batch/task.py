@@ -18,7 +18,7 @@ from hugin_abflow import memory, nona, trace
 from hugin_abflow.batch.record import Record
 from hugin_abflow.batch.state import State
 from hugin_abflow.errors import AbflowError
-from hugin_abflow.merge import kept_device
+from hugin_abflow.kept import kept_device
 from hugin_abflow.metadata import version
 from hugin_abflow.opencl import Device
 from hugin_abflow.progress import Advance

@@ -107,24 +107,31 @@ def relay_add(
     return np.stack([weight * across, weight * down, weight, np.zeros_like(weight)], -1)
 
 
-def relay_vouch(points: Array, sigma: float, grid: Sequence[int]) -> Array:
-    """How near a control point is, (height, width)."""
+def _agreement(off: Array, agrees: float) -> Array:
+    """How ways agree that lie so far apart, (..., 2) px."""
+    return (1 + (np.linalg.norm(off, axis=-1) / agrees) ** 2) ** -2.0
+
+
+def relay_hold(points: Array, sigma: float, agrees: float, found: Array, grid: Sequence[int]) -> Array:
+    """How far control points hold flow, (height, width)."""
     x, y = np.meshgrid(np.arange(grid[0]) + 0.5, np.arange(grid[1]) + 0.5)
-    across, down = np.stack([x, y])[:, None] - np.asarray(points, np.float64).T[:, :, None, None]
-    if grid[2]:
-        across = (across + grid[0] / 2) % grid[0] - grid[0] / 2
-    return np.exp(-0.5 * (across**2 + down**2) / sigma**2).max(0)
+    holds = [np.zeros(x.shape)]
+    for u, v, *move in np.asarray(points, np.float64):
+        across = (x - u + grid[0] / 2) % grid[0] - grid[0] / 2 if grid[2] else x - u
+        near = np.exp(-0.5 * (across**2 + (y - v) ** 2) / sigma**2)
+        holds.append(near * _agreement(found[..., :2] - move, agrees))
+    return np.max(holds, axis=0)
 
 
 def relay_take(total: Array, enough: float, agrees: float, counts: float, found: Array) -> Array:
     """Found flow as far as it is trusted and others agree, theirs for the rest, with their trust;
-    as found where a control point vouches for it, or one layer is taken whole.
+    as found where control points hold it, or one layer is taken whole.
     """
-    vouched = total[..., 3]
-    told, own = (1 - vouched) * np.minimum(total[..., 2] / enough, 1), found[..., :2]
+    held = total[..., 3]
+    told, own = (1 - held * found[..., 2]) * np.minimum(total[..., 2] / enough, 1), found[..., :2]
     other = total[..., :2] / np.maximum(total[..., 2], 1e-9)[..., None]
-    agreement = (1 + (np.linalg.norm(other - own, axis=-1) / agrees) ** 2) ** -2.0
-    kept = np.maximum(counts, vouched) * found[..., 2] * (1 - told * (1 - agreement))
+    agreement = _agreement(other - own, agrees)
+    kept = np.maximum(counts, held) * found[..., 2] * (1 - told * (1 - agreement))
     taken = told * (1 - kept)
     mixed = (kept[..., None] * own + taken[..., None] * other) / np.maximum(kept + taken, 1e-9)[..., None]
     flow = np.where((taken > 0)[..., None], mixed, own)
