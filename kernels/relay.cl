@@ -183,7 +183,8 @@ __kernel void relay_take(__global const float4 *sum, /* (grid.y, grid.x) of rela
     const float held = its.w * own.z, told = (1.0f - held) * LEAST(its.z / enough, 1.0f);
     const float2 other = its.z > 0.0f ? its.xy / its.z : own.xy;
     const float agreement = relay_agreement(other - own.xy, agrees);
-    const float kept = GREATEST(counts, its.w) * own.z * (1.0f - told * (1.0f - agreement)), taken = told * (1.0f - kept);
+    const float kept = GREATEST(counts, its.w) * own.z * (1.0f - told * (1.0f - agreement));
+    const float taken = told * (1.0f - kept);
     if (taken > 0.0f)
         found[at].xy = (kept * own.xy + taken * other) / (kept + taken);
     found[at].z = kept + taken;
