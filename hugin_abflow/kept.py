@@ -25,7 +25,9 @@ def kept_device(wanted: str | None, threads: int) -> Device:
 
 
 def forget(lost: Device) -> None:
-    """Keep a device no longer that failed: it does not come back, but its successor may."""
+    """No longer keep a device that is lost: it does not come back, but its successor may. One whose memory
+    was too small is not lost.
+    """
     with _opening:
         for key in [key for key, device in _kept.items() if device is lost]:
             del _kept[key]

@@ -6,7 +6,7 @@ import logging
 import os
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import closing, suppress
+from contextlib import closing
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -187,8 +187,10 @@ def _bands(
         forget(device)
         raise
     finally:
-        with suppress(DeviceError):  # of which was told, if it is lost
+        try:
             device.give_back()
+        except DeviceError:
+            forget(device)  # whatever was told: it does not even finish
     if not visible:
         _log.warning(
             "the panorama is wholly transparent: no layer shows anything inside the crop; "

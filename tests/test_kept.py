@@ -27,13 +27,18 @@ def test_merges_of_one_process_share_a_device_until_it_is_lost(monkeypatch):
     merged(LAYERS, CANVAS, flow=False, threads=1)
     assert opened == [(None, 0), (None, 1)]
 
-    def failing(error):
+    def failing(error, last=None):
         def fail(*_, **__):
             raise error
 
+        def give_back():
+            given_back.append(error)
+            if last:
+                raise last
+
         with monkeypatch.context() as patch, pytest.raises(DeviceError, match="is"):
             patch.setattr(opencl.Device, "run", fail)
-            patch.setattr(kept._kept[None, 0, False], "give_back", lambda: given_back.append(error))
+            patch.setattr(kept._kept[None, 0, False], "give_back", give_back)
             merged(LAYERS, CANVAS, flow=False, working_pixels=1024)
         assert given_back[-1] is error
         assert np.array_equal(merged(LAYERS, CANVAS, flow=False), first)
@@ -42,6 +47,10 @@ def test_merges_of_one_process_share_a_device_until_it_is_lost(monkeypatch):
     assert opened == [(None, 0), (None, 1)]
     failing(DeviceError("the device is lost"))
     assert opened == [(None, 0), (None, 1), (None, 0)]
+    failing(opencl.DeviceMemoryError("it is lost, says its memory is too small"), DeviceError("it is lost"))
+    assert opened == [(None, 0), (None, 1), (None, 0), (None, 0)]
+    merged(LAYERS, CANVAS, flow=False, threads=1)
+    assert len(opened) == 4  # others are kept
 
 
 def test_merges_at_a_time_open_one_device(monkeypatch):
