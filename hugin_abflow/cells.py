@@ -109,7 +109,7 @@ class Way:
         flow = at_centres(flows[index]).astype(np.float64)
         rows, columns = np.indices(flow.shape[:2])
         starts = np.stack([columns, rows], -1).astype(np.float64) * CELL + CELL // 2 + 0.5
-        inside, (row, column) = _pixels(starts + flow, chart)
+        inside, (row, column) = pixels_at(starts + flow, chart.border)
         there = np.where(inside, row, 0), np.where(inside, column, 0)
         shown = inside & (at_centres(views[index].mask) > 0) & (views[1 - index].mask[there] > 0)
         believed = shown & (np.linalg.norm(flow + flows[1 - index][there], axis=-1) < gap)
@@ -159,13 +159,16 @@ def cells_at(
     places: Places, shape: tuple[int, ...], chart: Chart
 ) -> tuple[Mask, tuple[npt.NDArray[np.intp], npt.NDArray[np.intp]]]:
     """Which places (n, 2) px lie on the chart, and the rows and columns of the cells of those."""
-    inside, pixels = _pixels(places, chart)
+    inside, pixels = pixels_at(places, chart.border)
     at = (np.minimum(n[inside] // CELL, most - 1) for n, most in zip(pixels, shape, strict=True))
     return inside, (next(at), next(at))
 
 
-def _pixels(places: Places, chart: Chart) -> tuple[Mask, tuple[npt.NDArray[np.intp], npt.NDArray[np.intp]]]:
-    """Which places (..., 2) px lie on the chart, and the rows and columns of all."""
+def pixels_at(
+    places: Places, border: tuple[int, int, int, int]
+) -> tuple[Mask, tuple[npt.NDArray[np.intp], npt.NDArray[np.intp]]]:
+    """Which places (..., 2) px lie on a grid (width, height, wraps, 0), and the rows and columns of all."""
+    width, height, wraps, _ = border
     column, row = np.moveaxis(np.floor(places).astype(int), -1, 0)
-    column = column % chart.width if chart.wraps else column
-    return (row >= 0) & (row < chart.height) & (column >= 0) & (column < chart.width), (row, column)
+    column = column % width if wraps else column
+    return (row >= 0) & (row < height) & (column >= 0) & (column < width), (row, column)

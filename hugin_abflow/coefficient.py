@@ -7,8 +7,9 @@ angle; w_k = D_k / sum_j D_j. For two layers this is Eq. 1 of Meng & Liu 2020.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from itertools import repeat
 from typing import TypeVar
 
 import numpy as np
@@ -102,6 +103,13 @@ def distance(device: Device, masks_: Masks, index: int, cover: Buffer, working: 
     return result
 
 
+def _distances(device: Device, masks_: Masks, grid: Grid) -> Iterator[Buffer]:
+    """D_k of each layer in turn."""
+    cover = device.upload(np.logical_or.reduce(masks_.host, 0), np.uint8)
+    for index in range(len(masks_.buffers)):
+        yield distance(device, masks_, index, cover, grid)
+
+
 def coefficients(
     device: Device, layers: Sequence[WorkingLayer], masks_: Masks, grid: Grid, even: bool = False
 ) -> list[Buffer]:
@@ -111,14 +119,15 @@ def coefficients(
     even    where several are, the same for all of them: enough where `transition.settle` then tells what
             they are, and without distances, which take time.
     """
-    cover = device.upload(np.logical_or.reduce(masks_.host, 0), np.uint8)
     total = device.zeros(grid.shape)
     ratio = (masks_.grid.width / grid.width, masks_.grid.height / grid.height)
-    same = device.empty(masks_.grid.shape).fill(1) if even else None
+    if even:
+        maps: Iterable[Buffer] = repeat(device.empty(masks_.grid.shape).fill(1), len(layers))
+    else:
+        maps = _distances(device, masks_, grid)
     result = []
-    for index, layer in enumerate(layers):
+    for layer, on_masks in zip(layers, maps, strict=True):
         blend = device.empty(layer.pixels.shape[:2])
-        on_masks = same or distance(device, masks_, index, cover, grid)
         device.run(
             "coefficient", "coefficient_expand", layer.box[2:], on_masks, masks_.grid.border, ratio,
             layer.pixels, layer.box, grid.border, blend, total,

@@ -17,6 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from hugin_abflow import flow
+from hugin_abflow.cells import pixels_at
 from hugin_abflow.chart import Chart
 from hugin_abflow.flow import Board, FlowParameters, Start
 from hugin_abflow.guides import Guide, Points, doubts
@@ -27,7 +28,6 @@ from hugin_abflow.working import Grid
 _log = logging.getLogger(__name__)
 
 Values = npt.NDArray[np.float64]
-Pixels = npt.NDArray[np.intp]
 
 # Guides are on one thing if their moves differ by less than this share of what the flow lacks.
 _ALIKE = 0.3
@@ -152,8 +152,8 @@ def held(images: tuple[Level, Level], flows: Sequence[Buffer], guides: ChartGuid
     ways = _ways(images[0], flows, guides)
     agree = np.ones(len(guides), bool)
     for image, way in zip(images, ways, strict=True):
-        column, row, inside = _pixels(image, way.places)
-        agree &= inside & (image.mask.get()[row, column] > 0)
+        inside, (row, column) = pixels_at(way.places, image.grid)
+        agree &= inside & (image.mask.get()[row * inside, column * inside] > 0)
         agree &= np.linalg.norm(way.residuals, axis=1) <= GuidanceParameters().agreement
     there, back = (np.hstack([way.places, way.moves])[agree] for way in ways)
     return there, back
@@ -181,19 +181,10 @@ def _ways(image: Level, flows: Sequence[Buffer], guides: ChartGuides) -> tuple[_
         moves[:, 0] -= width * np.rint(moves[:, 0] / width)
     ways = []
     for field, places, way in zip(flows, (guides.at_a, guides.at_b), (moves, -moves), strict=True):
-        column, row, inside = _pixels(image, places)
-        found = field.get()[row, column]
+        inside, (row, column) = pixels_at(places, image.grid)
+        found = field.get()[row * inside, column * inside]
         ways.append(_Way(places, way, np.where(inside[:, None], way - found, 0.0)))
     return ways[0], ways[1]
-
-
-def _pixels(image: Level, places: Points) -> tuple[Pixels, Pixels, npt.NDArray[np.bool_]]:
-    """Columns and rows of the pixels in which places lie, and which lie on the chart; 0 for the others."""
-    width, height, wraps, _ = image.grid
-    column, row = np.floor(places).astype(int).T
-    column = column % width if wraps else column
-    inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
-    return np.where(inside, column, 0), np.where(inside, row, 0), inside
 
 
 class _Springs:

@@ -15,15 +15,15 @@ import numpy as np
 import numpy.typing as npt
 
 from hugin_abflow import joint, sequential
-from hugin_abflow.errors import DeviceError, LayersMissingError, OutputError
+from hugin_abflow.errors import LayersMissingError, OutputError
 from hugin_abflow.exif import Metadata
 from hugin_abflow.guides import Guide
 from hugin_abflow.images import ENDINGS, ImageWriter, check_target, use_threads
-from hugin_abflow.kept import forget, kept_device
+from hugin_abflow.kept import in_use, kept_device
 from hugin_abflow.layer import Canvas, Layer, check_layers
 from hugin_abflow.metadata import describe
 from hugin_abflow.nona import Remap, open_layers
-from hugin_abflow.opencl import Device, DeviceMemoryError, choose
+from hugin_abflow.opencl import Device, choose
 from hugin_abflow.pano_trafo import images_of, read_guides
 from hugin_abflow.progress import Progress, silent
 from hugin_abflow.project import Plan, read_plan
@@ -172,25 +172,15 @@ def _bands(
     _log.info("device: %s", device.name)
     method = method or {"joint": joint.merge, "sequential": sequential.merge}[settings.merge]
     visible = False
-    try:
-        with (
-            spooled(layers) as layers,
-            # ended first: its threads read the layers
-            closing(method(device, layers, canvas, settings, progress, guides)) as bands,
-        ):
-            for rows in bands:
-                visible = visible or bool(rows[..., -1].any())
-                yield rows
-    except DeviceMemoryError:
-        raise
-    except DeviceError:
-        forget(device)
-        raise
-    finally:
-        try:
-            device.give_back()
-        except DeviceError:
-            forget(device)  # whatever was told: it does not even finish
+    with (
+        in_use(device),
+        spooled(layers) as layers,
+        # ended first: its threads read the layers
+        closing(method(device, layers, canvas, settings, progress, guides)) as bands,
+    ):
+        for rows in bands:
+            visible = visible or bool(rows[..., -1].any())
+            yield rows
     if not visible:
         _log.warning(
             "the panorama is wholly transparent: no layer shows anything inside the crop; "

@@ -78,6 +78,7 @@ def solve(
     weighed, singles, shifts = list[Weighed](), list[Whole | None](), list[figures.Parallax]()
     waiting: list[tuple[PairFlow, tuple[Level, Level], Future[Whole | None] | None]] = []
     held: dict[tuple[int, int], guidance.Values] = {}
+    compared = settings.relay and relay.triangles(pairs)
 
     def weigh() -> None:
         while waiting:  # one at most: a pair's images are large
@@ -98,6 +99,7 @@ def solve(
             placed = guidance.on_chart(its_guides, first, its_chart, grid)
             if its_guides:
                 found = guidance.lead(device, images, found, placed, its_chart.around(grid))
+            if its_guides and compared:
                 scale, ways = its_finest.width / its_chart.width, guidance.held(images, found, placed)
                 held[pair.a, pair.b], held[pair.b, pair.a] = (scale * way for way in ways)
             weigh()
@@ -116,7 +118,7 @@ def solve(
             waiting.append((its_flow, images, job))
             advance(1)
         weigh()
-        if settings.relay and relay.triangles(pairs):
+        if compared:
             for a, b in relay.mend(device, weighed, held):
                 _log.info(
                     "flow of %s and %s: by way of other layers, which contradict it or know more",

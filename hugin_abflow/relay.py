@@ -102,7 +102,7 @@ def triangles(pairs: Iterable[Pair]) -> bool:
     return any(beside[a] & beside[b] for a, its in beside.items() for b in its)
 
 
-def mend(device: Device, found: Sequence[Weighed], held: Mapping[Key, Values] | None = None) -> list[Key]:
+def mend(device: Device, found: Sequence[Weighed], held: Mapping[Key, Values]) -> list[Key]:
     """Replace, in place, flow that others contradict, or know better; returns of which pairs, as (a, b).
 
     held        for some pairs, both ways, control points that hold their flow: places and moves, (n, 4) px of
@@ -121,20 +121,22 @@ def mend(device: Device, found: Sequence[Weighed], held: Mapping[Key, Values] | 
         if doubted or all(_missed(ways[key], its) >= _MISSED for key, its in better.items()):
             covered = all(_covered(ways[key], its) >= _COVERED for key, its in better.items())
             counts = 0.0 if reliable[a, c] < _REFUTED and covered else 1.0
-            totals = [(ways[key], _sum(device, ways, key, its, reliable)) for key, its in better.items()]
-            for key, (way, total) in zip(better, totals, strict=True):
-                grid = way.chart.border
-                if held and len(held.get(key, ())):
-                    points = device.upload(held[key], np.float32)
-                    device.run(
-                        "relay", "relay_hold", grid[:2], points, len(held[key]), _HELD / way.chart.coarse,
-                        _AGREES, way.found, grid, total,
-                    )  # fmt: skip
-                device.run(
-                    "relay", "relay_take", grid[:2], total, grid, _SURE, _AGREES, counts, way.found,
-                )  # fmt: skip
+            totals = {key: _sum(device, ways, key, its, reliable) for key, its in better.items()}
+            for key, total in totals.items():  # all of them are known before one is taken
+                _take(device, ways[key], total, counts, held.get(key))
             changed.append((a, c))
     return sorted(changed)
+
+
+def _take(device: Device, way: _Way, total: Buffer, counts: float, held: Values | None) -> None:
+    """Make a way's flow that of others, in place. counts: what its own trust does, 0 or 1."""
+    grid = way.chart.border
+    if held is not None and len(held):
+        device.run(
+            "relay", "relay_hold", grid[:2], device.upload(held, np.float32), len(held),
+            _HELD / way.chart.coarse, _AGREES, way.found, grid, total,
+        )  # fmt: skip
+    device.run("relay", "relay_take", grid[:2], total, grid, _SURE, _AGREES, counts, way.found)
 
 
 def _share(key: Key, by: int, reliable: dict[Key, float]) -> float:

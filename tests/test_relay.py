@@ -249,7 +249,7 @@ class Scene:
         return float(np.median(np.concatenate(wrong)))
 
     def mend(self, held: dict[tuple[int, int], np.ndarray] | None = None) -> list[tuple[int, int]]:
-        return relay.mend(self.device, self.found, held)
+        return relay.mend(self.device, self.found, held or {})
 
     def stays(self) -> bool:
         """Whether mending it changes nothing."""
