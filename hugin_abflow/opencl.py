@@ -288,6 +288,7 @@ class Device:
         self.buffers: WeakSet[Buffer] = WeakSet()
         self.spare = Spare()
         self._kernels: dict[tuple[str, str], dict[str, cl.Kernel]] = {}
+        self._programs: dict[tuple[str, str], cl.Program] = {}  # Intel's driver does not keep a kernel's own
         self._building = threading.Lock()
         self._repeated: dict[tuple[str, str, str], list[cl.Kernel]] = {}
         self._arguments = threading.Lock()  # a kernel keeps its arguments from when they are set to its start
@@ -355,6 +356,7 @@ class Device:
                 f"kernels/{module}.cl does not build on {self.device.name.strip()}: {error}; "
                 "update the OpenCL driver or choose another --device"
             ) from error
+        self._programs[module, options] = program
         kernels = {kernel.function_name: kernel for kernel in program.all_kernels()}
         if not kernels:  # some drivers call that a success
             raise DeviceError(
@@ -413,7 +415,7 @@ class Device:
         """Objects of one kernel, each with arguments of its own; they are slow to make."""
         first = self.kernel(module, name, options)
         made = self._repeated.setdefault((module, name, options), [first])
-        made += [cl.Kernel(first.program, name) for _ in range(count - len(made))]
+        made += [cl.Kernel(self._programs[module, options], name) for _ in range(count - len(made))]
         return made[:count]
 
     def give_back(self) -> None:

@@ -266,6 +266,18 @@ def test_running_over_nothing_does_nothing(device: Device) -> None:
     device.finish()
 
 
+def test_kernels_are_repeated_where_a_driver_keeps_no_program(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As Intel's for processors, whose kernels had programs that could not be used."""
+    monkeypatch.delattr(cl.Kernel, "program")
+    device = Device()
+    image, mask = device.upload(np.arange(16, dtype=np.float32).reshape(4, 4)), device.empty((4, 4)).fill(1)
+    results = [(device.empty((2, 2)), device.empty((2, 2))) for _ in range(3)]
+    calls = [(image, mask, (4, 4, 0, 0), *result, (2, 2)) for result in results]
+    device.repeat("pyramid", "pyramid_reduce", (2, 2), calls, 2)
+    means = [mean.get() for mean, _ in results]
+    assert all(np.allclose(mean, 15 - mean[::-1, ::-1]) for mean in means)
+
+
 def test_memory_of_buffers_that_are_gone_is_used_again() -> None:
     """By one of the same size, and of no other; up to a bound; until it is given back."""
     device = Device()
