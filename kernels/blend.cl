@@ -190,15 +190,12 @@ static inline blend_between blend_columns(blend_real q) {
 
 /* The same in an array of the columns from span.x on, span.y of them; beyond it, its rim. */
 static inline blend_between blend_within(blend_between at, int2 span, int4 border) {
-    at.left -= span.x;
-    at.right -= span.x;
+    blend_int left = at.left - span.x, right = at.right - span.x; /* Mesa 22 would change the caller's at */
     if (border.z && span.y == border.x) {
-        at.left += at.left < 0 ? border.x : 0;
-        at.right -= at.right >= border.x ? border.x : 0;
+        left += left < 0 ? border.x : 0;
+        right -= right >= border.x ? border.x : 0;
     }
-    at.left = LIMITED(at.left, 0, span.y - 1);
-    at.right = LIMITED(at.right, 0, span.y - 1);
-    return at;
+    return (blend_between){LIMITED(left, 0, span.y - 1), LIMITED(right, 0, span.y - 1), at.t};
 }
 
 /* Which rows of a coarse array a line of pixels lies between, and how far. */

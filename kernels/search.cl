@@ -314,10 +314,10 @@ __kernel void search_choose(__global const float4 *a,     /* (grid.y, grid.x) de
     float2 best = own;
     if (a[at].w > 0.0f) {
         float weights[SEARCH_WINDOW], total = 0.0f, least = INFINITY;
-        const int2 beside[5] = {(int2)(0, 0), (int2)(-1, 0), (int2)(1, 0), (int2)(0, -1), (int2)(0, 1)};
         const int count = other == flow ? 5 : 10;
         for (int k = 0; k < count; ++k) {
-            int2 p = (int2)(x, y) + step * beside[k % 5];
+            const int side = k % 5; /* itself, left, right, above, below; Mesa 22 misreads a table of vectors */
+            int2 p = (int2)(x, y) + step * (int2)((side == 2) - (side == 1), (side == 4) - (side == 3));
             if (!grid_border(&p, grid))
                 continue;
             const float2 f = k < 5 ? flow[p.y * grid.x + p.x] : other[p.y * grid.x + p.x];
