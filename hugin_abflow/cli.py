@@ -16,14 +16,15 @@ from hugin_abflow.batch.run import Run, default_jobs, run, show
 from hugin_abflow.batch.task import Task
 from hugin_abflow.batch.watch import watch
 from hugin_abflow.choices import OF_THE_RUN, choose, config_text, for_several, words
+from hugin_abflow.devices import list_devices
 from hugin_abflow.errors import AbflowError, ExitCode
 from hugin_abflow.images import COMPRESSIONS
 from hugin_abflow.metadata import PROGRAM, version
 from hugin_abflow.nona import Remap
-from hugin_abflow.opencl import list_devices
 from hugin_abflow.options import ARGUMENTS, Command, Compression, NewFile, Option, Size
 from hugin_abflow.settings import FlowQuality, LargeMotion, MergeMode, Settings
-from hugin_abflow.terminal import complain, interruptible, print_result, say
+from hugin_abflow.signals import interruptible
+from hugin_abflow.terminal import complain, print_result, say
 
 EXIT_CODES = {
     ExitCode.OK: "every panorama was written",

@@ -15,6 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from hugin_abflow import joint, sequential
+from hugin_abflow.devices import choose
 from hugin_abflow.errors import LayersMissingError, OutputError
 from hugin_abflow.exif import Metadata
 from hugin_abflow.guides import Guide
@@ -23,7 +24,7 @@ from hugin_abflow.kept import in_use, kept_device
 from hugin_abflow.layer import Canvas, Layer, check_layers
 from hugin_abflow.metadata import describe
 from hugin_abflow.nona import Remap, open_layers
-from hugin_abflow.opencl import Device, choose
+from hugin_abflow.opencl import Device
 from hugin_abflow.pano_trafo import images_of, read_guides
 from hugin_abflow.progress import Progress, silent
 from hugin_abflow.project import Plan, read_plan

@@ -1,18 +1,14 @@
-"""The OpenCL device: choose, build, run. With `launch` the only module that uses pyopencl."""
+"""The OpenCL device: build, run. With `devices` and `launch` the only module that uses pyopencl."""
 
 from __future__ import annotations
 
-import logging
 import math
-import os
-import sys
 import threading
 import time
 import warnings
 from collections import deque
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager, suppress
-from dataclasses import dataclass
+from contextlib import contextmanager
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -22,36 +18,13 @@ import numpy as np
 import numpy.typing as npt
 import pyopencl as cl
 
-from hugin_abflow import launch, memory, pocl, trace
+from hugin_abflow import launch, memory, pocl, signals, trace
+from hugin_abflow.devices import choose, kind_of, limited
 from hugin_abflow.errors import DeviceError
 from hugin_abflow.spare import Spare
 
-_log = logging.getLogger(__name__)
-
 # Work-group: rows suit both a GPU's wavefronts and the vector units of a CPU.
 _GROUP = 256
-
-_INSTALL = {
-    "linux": "install a CPU runtime with `pip install 'pyopencl[pocl]'` (or Debian's pocl-opencl-icd), "
-    "or your graphics card's OpenCL driver",
-    "win32": "install your graphics card's driver, or Intel's CPU runtime for OpenCL",
-    "darwin": "use a macOS with Apple's OpenCL, or install pocl from conda-forge",
-}
-
-# Where drivers are looked for, which devices PoCL offers, where it keeps kernels: a wrong one hides them all.
-_HIDING = ("OCL_ICD_VENDORS", "POCL_DEVICES", "POCL_CACHE_DIR")
-
-
-@dataclass(frozen=True)
-class DeviceInfo:
-    """One line of ``--list-devices``. memory: bytes; kind: "GPU", "CPU" or "other"."""
-
-    index: int
-    name: str
-    platform: str
-    kind: str
-    memory: int
-    default: bool
 
 
 @cache
@@ -65,83 +38,6 @@ def _kernel_files() -> dict[str, str]:
 def kernel_source(module: str) -> str:
     """Source of ``kernels/<module>.cl`` with common.cl in front; #line keeps messages true."""
     return "".join(f'#line 1 "{name}.cl"\n{_kernel_files()[name]}\n' for name in ("common", module))
-
-
-def _kind(device: cl.Device) -> str:
-    if device.type & cl.device_type.GPU:
-        return "GPU"
-    return "CPU" if device.type & cl.device_type.CPU else "other"
-
-
-def _devices(threads: int = 0) -> list[cl.Device]:
-    """All devices of all platforms; `DeviceError` where there is none. threads: as of `Device`."""
-    pocl.find_cache()
-    found, platforms = [], []
-    with pocl.cores(threads):
-        with suppress(cl.Error):
-            platforms = cl.get_platforms()
-        for platform in platforms:
-            try:
-                found += platform.get_devices()
-            except cl.Error as error:  # a platform without devices must not hide the others
-                _log.debug("%s: %s", platform.name, error)
-    if not found:
-        remedy = _INSTALL.get(sys.platform, _INSTALL["linux"])
-        raise DeviceError(f"no OpenCL device found; {_hidden()}{remedy}")
-    return found
-
-
-def _hidden() -> str:
-    """What the environment says that may hide devices, with what to do about it; empty: nothing."""
-    found = [f"{name} is {os.environ[name]!r}" for name in _HIDING if name in os.environ]
-    return f"in the environment {' and '.join(found)}: if that is wrong, unset it; else " if found else ""
-
-
-def _speed(device: cl.Device) -> tuple[bool, int]:
-    """Sort key: GPUs first, then by units x clock. Vendors count units differently; it is a guess."""
-    return _kind(device) == "GPU", device.max_compute_units * max(device.max_clock_frequency, 1)
-
-
-def list_devices() -> list[DeviceInfo]:
-    """All OpenCL devices, at least one; the one that is used by default is marked.
-
-    Raises `DeviceError`, which says what to install, where there is none.
-    """
-    found, best = _devices(), choose(None)
-    return [
-        DeviceInfo(i, d.name.strip(), d.platform.name.strip(), _kind(d), d.global_mem_size, d == best)
-        for i, d in enumerate(found)
-    ]
-
-
-def choose(wanted: str | None, threads: int = 0) -> cl.Device:
-    """The device that --device means; None: the one used by default. Raises `DeviceError`: there is none."""
-    found = _devices(threads)
-    if wanted is None:
-        return max(found, key=_speed)
-    if wanted.isdecimal():
-        if int(wanted) < len(found):
-            return found[int(wanted)]
-    else:
-        for device in found:
-            if wanted.lower() in f"{device.name} {device.platform.name}".lower():
-                return device
-    names = ", ".join(f"{i}: {d.name.strip()}" for i, d in enumerate(found))
-    raise DeviceError(f"no OpenCL device fits --device {wanted}; there are {names}")
-
-
-def _part(device: cl.Device, threads: int) -> cl.Device:
-    """As many of a processor's cores as are allowed, where its driver can be told."""
-    by_counts = cl.device_partition_property.BY_COUNTS
-    if (
-        not threads
-        or _kind(device) != "CPU"
-        or threads >= device.max_compute_units
-        or by_counts not in device.partition_properties
-    ):
-        return device
-    (part,) = device.create_sub_devices([by_counts, threads, 0])
-    return part
 
 
 class DeviceMemoryError(DeviceError):
@@ -278,12 +174,13 @@ class Device:
     """
 
     def __init__(self, wanted: str | None = None, threads: int = 0) -> None:
-        chosen = choose(wanted, threads)
-        pocl.name_processor(chosen.version, chosen.int_ptr)
-        self.device = _part(chosen, threads)
-        self.context = cl.Context([self.device])
         timing = cl.command_queue_properties.PROFILING_ENABLE if trace.is_recording() else 0
-        self.queue = cl.CommandQueue(self.context, properties=timing)
+        with signals.held():  # the driver starts its threads, from which PoCL starts its linker
+            chosen = choose(wanted, threads)
+            pocl.name_processor(chosen.version, chosen.int_ptr)
+            self.device = limited(chosen, threads)
+            self.context = cl.Context([self.device])
+            self.queue = cl.CommandQueue(self.context, properties=timing)
         self._times = _Times(self.queue) if timing else None
         self.buffers: WeakSet[Buffer] = WeakSet()
         self.spare = Spare()
@@ -312,7 +209,7 @@ class Device:
     @property
     def kind(self) -> str:
         """ "GPU", "CPU" or "other"."""
-        return _kind(self.device)
+        return kind_of(self.device)
 
     def empty(self, shape: Sequence[int], dtype: npt.DTypeLike = np.float32) -> Buffer:
         """An uninitialised array."""
@@ -347,7 +244,8 @@ class Device:
 
     def _build(self, module: str, options: str) -> dict[str, cl.Kernel]:
         try:
-            with warnings.catch_warnings():  # compilers chat; errors come with the exception
+            # compilers chat; errors come with the exception
+            with warnings.catch_warnings(), signals.held():
                 warnings.simplefilter("ignore", cl.CompilerWarning)
                 program = cl.Program(self.context, kernel_source(module))
                 program.build(["-cl-std=CL1.2", *options.split()])

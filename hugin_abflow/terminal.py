@@ -1,4 +1,4 @@
-"""The terminal: messages, results, progress bars, and the signals that end a run.
+"""The terminal: messages, results, and progress bars.
 
 Only results go to stdout; messages and progress go to stderr.
 """
@@ -7,16 +7,13 @@ from __future__ import annotations
 
 import logging
 import os
-import signal
 import sys
-import threading
 import time
 import traceback
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager, suppress
 from functools import partial
 from pathlib import Path
-from types import FrameType
 from typing import TYPE_CHECKING, Any, TextIO, cast
 
 import click
@@ -211,33 +208,3 @@ def _bars(heading: str) -> Iterator[Progress]:
             display.stop_task(task)
 
         yield phase_bar
-
-
-@contextmanager
-def interruptible() -> Iterator[None]:
-    """Let SIGTERM and SIGHUP unwind the program as Ctrl-C does, so that temporary files go."""
-    if threading.current_thread() is not threading.main_thread():
-        yield  # only the main thread may set handlers
-        return
-    last = -float("inf")
-
-    def interrupt(number: int, frame: FrameType | None) -> None:
-        nonlocal last
-        if time.monotonic() - last < 2.0:
-            return  # an impatient second Ctrl-C would break off the tidying up
-        last = time.monotonic()
-        sys.unraisablehook = lambda unraisable: None  # what was being made may complain as it goes, at length
-        raise KeyboardInterrupt
-
-    names = ("SIGINT", "SIGTERM", "SIGHUP")  # Windows has no SIGHUP
-    numbers = [getattr(signal, name) for name in names if hasattr(signal, name)]
-    # What is ignored stays ignored: that is how nohup works.
-    before = {number: signal.getsignal(number) for number in numbers}
-    changed = [number for number in numbers if before[number] is not signal.SIG_IGN]
-    for number in changed:
-        signal.signal(number, interrupt)
-    try:
-        yield
-    finally:
-        for number in changed:
-            signal.signal(number, before[number])

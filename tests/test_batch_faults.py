@@ -256,7 +256,7 @@ def test_a_process_that_an_interruption_does_not_end_is_ended_and_leaves_nothing
 import multiprocessing, pathlib, queue, time
 from hugin_abflow import scratch
 from hugin_abflow.batch import worker
-from hugin_abflow.terminal import interruptible
+from hugin_abflow.signals import interruptible
 
 worker.GRACE = 0.3
 pipe, other = multiprocessing.Pipe()

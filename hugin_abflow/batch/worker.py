@@ -18,7 +18,7 @@ from typing import Any
 
 from hugin_abflow import memory, scratch, trace
 from hugin_abflow.batch.task import Task, perform
-from hugin_abflow.terminal import interruptible
+from hugin_abflow.signals import interruptible
 
 # Time that a process has to end by itself once the pool is gone, seconds.
 GRACE = 10.0

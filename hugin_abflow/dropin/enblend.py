@@ -22,11 +22,11 @@ from hugin_abflow.metadata import describe, version
 from hugin_abflow.progress import Progress
 from hugin_abflow.project import read_plan
 from hugin_abflow.settings import Settings
+from hugin_abflow.signals import interruptible
 from hugin_abflow.terminal import (
     catching,
     complain,
     display_progress,
-    interruptible,
     messages,
     print_message,
     print_result,
