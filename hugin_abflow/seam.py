@@ -7,9 +7,8 @@ borders, where they show least. This is a labelling of least energy,
 
     sum_cells r (1 - s_k)  +  sum_neighbours c (t + t') / 2 [k != k']  +  sum_borders c t
 
-with r the residual of low frequencies, t that of all, s_k the share of the softmax and c the price of a cut,
-found by graph cuts (alpha expansion: Boykov, Veksler, Zabih, "Fast approximate energy minimization via graph
-cuts", 2001). A cut through somebody who is as bright as what is behind shows in t alone. Regions keep to
+with r the residual of low frequencies, t that of all, s_k the share of the softmax and c the price of a cut
+(labelling.py). A cut through somebody who is as bright as what is behind shows in t alone. Regions keep to
 themselves: elsewhere the softmax stays as it is, and the transition lies where the layers agree. What is
 clipped in one photo only is no such difference: it is brighter in the other by an unknown amount, and changes
 over best where it does so slowly.
@@ -23,7 +22,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import cv2
@@ -34,6 +33,7 @@ import scipy
 from hugin_abflow.coefficient import Masks, on_cells
 from hugin_abflow.colour import Correction, clipping
 from hugin_abflow.geometry import Pair
+from hugin_abflow.labelling import Graph, energy, least
 from hugin_abflow.opencl import Buffer, Device
 from hugin_abflow.working import Grid, WorkingLayer, connected
 
@@ -59,8 +59,6 @@ _SHORTER = 0.005
 _FORBIDDEN = 1e4
 # How much more a region may cost if that shows things once and whole, from a layer that has most of it.
 _ONCE, _MOSTLY = 2.0, 0.5
-# Capacities are integers; residuals are around 1.
-_UNIT = 1000
 
 
 Cells = npt.NDArray[np.bool_]  # (height, width) on the seam grid
@@ -339,30 +337,16 @@ def label(
             linked = np.flatnonzero(inside & (number[there] >= 0))
             links.append(np.stack([linked, number[there][linked]]))
     first, second = np.concatenate(links, 1)
-    between = cut_price * (rough[first] + rough[second]) / 2
-    current = np.full(rows.size, np.argmin(price.sum(1)))
-    for _ in range(1 if candidates.size == 2 else 2):
-        for alpha in range(candidates.size):
-            current = _expand(current, alpha, price, first, second, between)
+    cuts = cut_price * (rough[first] + rough[second]) / 2
+    graph = Graph(rows, columns, price, present, first, second, cuts)
+    labels = least(graph)
     if once:
-        somewhere = np.where(present.any(0), price, 0.0)
-        alone = [np.where(one, k, current) for k, one in enumerate(present) if one.mean() > _MOSTLY]
-        energies = [_energy(one, somewhere, first, second, between) for one in (current, *alone)]
+        somewhere = replace(graph, price=np.where(present.any(0), price, 0.0))
+        alone = [np.where(one, k, labels) for k, one in enumerate(present) if one.mean() > _MOSTLY]
+        energies = [energy(somewhere, one) for one in (labels, *alone)]
         if alone and min(energies[1:]) <= _ONCE * energies[0]:
-            current = alone[int(np.argmin(energies[1:]))]
-    return candidates[current]
-
-
-def _energy(
-    labels: npt.NDArray[np.intp],
-    price: npt.NDArray[np.float64],
-    first: npt.NDArray[np.intp],
-    second: npt.NDArray[np.intp],
-    between: npt.NDArray[np.float64],
-) -> float:
-    """What a labelling costs."""
-    own = np.take_along_axis(price, labels[None], 0).sum()
-    return float(own + between[labels[first] != labels[second]].sum())
+            labels = alone[int(np.argmin(energies[1:]))]
+    return candidates[labels]
 
 
 def _neighbours(
@@ -373,41 +357,6 @@ def _neighbours(
     if not wraps:
         inside &= (columns >= 0) & (columns < shape[1])
     return inside, (np.clip(rows, 0, shape[0] - 1), columns % shape[1])
-
-
-def _expand(
-    current: npt.NDArray[np.intp],
-    alpha: int,
-    price: npt.NDArray[np.float64],
-    first: npt.NDArray[np.intp],
-    second: npt.NDArray[np.intp],
-    between: npt.NDArray[np.float64],
-) -> npt.NDArray[np.intp]:
-    """The best of all labellings in which each cell keeps its label or takes `alpha`: a minimal cut."""
-    count = current.size
-    if (current == alpha).all():
-        return current
-    each = np.arange(count)
-    take = price[alpha] - price[current, each]  # cost of x = 1, "takes alpha", over x = 0
-    now = between * (current[first] != current[second])
-    only_second = between * (current[first] != alpha)  # first keeps, second takes alpha
-    only_first = between * (current[second] != alpha)
-    np.add.at(take, first, only_first - now)
-    np.add.at(take, second, -only_first)
-    edge = only_second + only_first - now
-    source, sink = count, count + 1
-    starts = np.concatenate([first, np.full(count, source), each])
-    ends = np.concatenate([second, each, np.full(count, sink)])
-    capacities = np.concatenate([edge, np.maximum(take, 0), np.maximum(-take, 0)])
-    whole = np.minimum(np.rint(capacities * _UNIT), 2**30 - 1).astype(np.int32)
-    graph = scipy.sparse.csr_array((whole, (starts, ends)), shape=(count + 2, count + 2))
-    left = graph - scipy.sparse.csgraph.maximum_flow(graph, source, sink).flow
-    left.data = np.maximum(left.data, 0)
-    left.eliminate_zeros()
-    keeps = scipy.sparse.csgraph.breadth_first_order(left, source, return_predecessors=False)
-    takes = np.ones(count + 2, bool)
-    takes[keeps] = False
-    return np.where(takes[:count], alpha, current)
 
 
 def _at_centres(

@@ -15,7 +15,7 @@ from reference.seam import seam_difference, seam_yield
 from scipy import ndimage
 from tolerances import POSITION, SUM, assert_close
 
-from hugin_abflow import seam
+from hugin_abflow import labelling, seam
 from hugin_abflow.coefficient import on_cells
 from hugin_abflow.opencl import Device
 from hugin_abflow.working import Grid
@@ -104,7 +104,7 @@ def least_and_found(problem, layers: int) -> tuple[float, float, float]:
     everything = np.array(list(product(range(layers), repeat=rows.size)))
     assert max(residual.mean.max(), residual.rms.max()) <= 3  # so that _FORBIDDEN forbids
     least = energies(everything, *problem).min()
-    return least, energies(found[None], *problem)[0], 5 * rows.size / seam._UNIT
+    return least, energies(found[None], *problem)[0], 5 * rows.size / labelling._UNIT
 
 
 @many

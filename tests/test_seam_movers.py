@@ -10,7 +10,7 @@ from grids import plane
 from hypothesis import given
 from labels import alike, energies, many, problems
 
-from hugin_abflow import seam
+from hugin_abflow import labelling, seam
 
 WRAPS = [False, True]
 
@@ -69,7 +69,7 @@ def test_one_layer_of_two_is_taken_if_it_costs_no_more_than_twice_as_much(proble
         assert np.array_equal(found, cut)
         return
     costs, least = energies(alone, *problem), energies(cut[None], *problem)[0]
-    rounding = 5 * rows.size / seam._UNIT
+    rounding = 5 * rows.size / labelling._UNIT
     if costs.min() < seam._ONCE * least - rounding:
         assert np.isclose(energies(found[None], *problem)[0], costs.min())
         assert (found == alone).all(1).any()
