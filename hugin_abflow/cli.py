@@ -18,9 +18,9 @@ from hugin_abflow.batch.watch import watch
 from hugin_abflow.choices import OF_THE_RUN, choose, config_text, for_several, words
 from hugin_abflow.devices import list_devices
 from hugin_abflow.errors import AbflowError, ExitCode
+from hugin_abflow.found import Remap
 from hugin_abflow.images import COMPRESSIONS
 from hugin_abflow.metadata import PROGRAM, version
-from hugin_abflow.nona import Remap
 from hugin_abflow.options import ARGUMENTS, Command, Compression, NewFile, Option, Size
 from hugin_abflow.settings import FlowQuality, LargeMotion, MergeMode, Settings
 from hugin_abflow.signals import interruptible
@@ -53,6 +53,7 @@ EXAMPLES = (
 )
 
 _DEFAULTS = Settings()
+_COMPRESSIONS = "; ".join(f"{kind}: {', '.join(names)}" for kind, names in COMPRESSIONS.items())
 
 
 def _print_devices(context: click.Context, parameter: click.Parameter, wanted: bool) -> None:
@@ -63,11 +64,6 @@ def _print_devices(context: click.Context, parameter: click.Parameter, wanted: b
         kind = f"{device.kind}, {device.memory / 2**30:.1f} GiB, {device.platform}"
         print_result(f"{device.index}: {device.name} ({kind}{', default' if device.default else ''})")
     context.exit(ExitCode.OK)
-
-
-def _names_of_compressions() -> str:
-    """``TIFF: none, lzw ...; EXR: ...``."""
-    return "; ".join(f"{kind}: {', '.join(names)}" for kind, names in COMPRESSIONS.items())
 
 
 _file, _new_file, _new_image = click.Path(path_type=Path), NewFile(), NewFile(image=True)
@@ -93,8 +89,7 @@ _information = partial(click.option, cls=Option, group="Information")
     "--compression",
     metavar="NAME",
     type=Compression(),
-    help=f"Compression of the file. {_names_of_compressions()}. "
-    "[default: the project's; TIFF: else lzw; EXR: else zip]",
+    help=f"Compression of the file. {_COMPRESSIONS}. [default: the project's; TIFF: else lzw; EXR: else zip]",
 )
 @_result(
     "--jpeg-quality",

@@ -57,6 +57,7 @@ _JPEG_LIMIT = 65500  # pixels a side, of libjpeg
 _JPEG_WORST, _JPEG_LEAST = 2, 1 << 16  # bytes that noise takes for each sample, and a file beside them
 _JPEG_BLANK = 1 / 64  # bytes that nothing takes for each sample
 _CLASSIC_LIMIT = 0xFFFFFFFF - (16 << 20)  # bytes of a classic TIFF, with room for tags and metadata
+_OVERSHOOT = 1.2  # of white, beside edges that were sampled by cubic and longer filters
 _LZW_WORST = 1.5  # LZW codes of up to 12 bits may stand for a byte each
 
 
@@ -258,7 +259,7 @@ class ImageWriter:
     def _convert(self, rows: Pixels) -> Pixels:
         """To the stored depth and the format's kind of alpha."""
         if self.dtype.kind == "f" and self.stored.kind == "u" and not self._clipped:
-            self._clipped = bool((rows[..., :-1] > 1).any())
+            self._clipped = bool((rows[..., :-1] > _OVERSHOOT).any())
             if self._clipped:
                 log.warning("%s: values above 1.0 are clipped; choose .exr or .tif to keep them", self.path)
         rows = _to_depth(rows, self.stored)

@@ -363,11 +363,8 @@ def _check_memory(
 
     charts: on which flow is found; none if there is no flow.
     """
-    pixels = sum(layer.box[2] * layer.box[3] for layer in layers)
-    sizes = [chart.width * chart.height for chart in pairflow.finest(charts, grid, settings)]
-    at_last, meanwhile = _STEP_BYTES * pixels, _SOLVER_BYTES * max(sizes, default=0)
     there = memory.resident() + device.own_memory + _LIBRARY_BYTES
-    needed = there + max(_FLOW_BYTES * sum(sizes) + at_last, _FOUND_BYTES * sum(sizes) + meanwhile)
+    needed = there + _working_bytes(layers, charts, grid, settings)
     limit = memory.limit(settings.max_memory)
     _log.info("memory: about %s of %s at working resolution", memory.size(needed), memory.size(limit))
     if needed <= limit:
@@ -376,6 +373,17 @@ def _check_memory(
     what = "whose flow takes" if settings.flow else "which take"
     said = f"{given} is too little for these layers, {what} about {memory.size(needed)}"
     if settings.max_memory:
-        less = ", or choose --flow-quality fast" if settings.flow and settings.flow_quality != "fast" else ""
+        fast = there + _working_bytes(layers, charts, grid, replace(settings, flow_quality="fast"))
+        less = ", or choose --flow-quality fast" if fast <= limit else ""
         raise SettingsError(f"{said}; {remedy}{less}")
     _log.warning("%s; going on with that", said)
+
+
+def _working_bytes(
+    layers: Sequence[WorkingLayer], charts: Sequence[Chart], grid: Grid, settings: Settings
+) -> int:
+    """What flow, and what is found from it, take at working resolution."""
+    pixels = sum(layer.box[2] * layer.box[3] for layer in layers)
+    sizes = [chart.width * chart.height for chart in pairflow.finest(charts, grid, settings)]
+    at_last, meanwhile = _STEP_BYTES * pixels, _SOLVER_BYTES * max(sizes, default=0)
+    return max(_FLOW_BYTES * sum(sizes) + at_last, _FOUND_BYTES * sum(sizes) + meanwhile)

@@ -73,21 +73,28 @@ def _in_blocks(graph: Graph) -> tuple[Graph, npt.NDArray[np.intp]]:
     """The graph for labellings that are the same within blocks of 2 x 2 places; the block of each node."""
     width = int(graph.columns.max()) // 2 + 1
     places, block = np.unique(graph.rows // 2 * width + graph.columns // 2, return_inverse=True)
-    price = np.stack([np.bincount(block, one, places.size) for one in graph.price])
+    price = np.stack([_summed(block, one, places.size) for one in graph.price])
     possible = np.stack([np.bincount(block, ~one, places.size) == 0 for one in graph.possible])
     ends = np.sort([block[graph.first], block[graph.second]], 0)
     apart = ends[0] != ends[1]
     links, link = np.unique(ends[0, apart] * places.size + ends[1, apart], return_inverse=True)
     whole = Graph(
         places // width, places % width, price, possible,
-        links // places.size, links % places.size, np.bincount(link, graph.cut[apart], links.size),
+        links // places.size, links % places.size, _summed(link, graph.cut[apart], links.size),
     )  # fmt: skip
     return whole, block
 
 
+def _summed(
+    places: npt.NDArray[np.intp], values: npt.NDArray[np.float64], count: int
+) -> npt.NDArray[np.float64]:
+    """Sums of the values at each of `count` places."""
+    return np.asarray(np.bincount(places, values, count), np.float64)
+
+
 def _band(graph: Graph, labels: Labels) -> npt.NDArray[np.bool_]:
     """Nodes near cuts, and near those with labels that they cannot have."""
-    near = ~np.take_along_axis(graph.possible, labels[None], 0)[0]
+    near: npt.NDArray[np.bool_] = ~np.take_along_axis(graph.possible, labels[None], 0)[0]
     apart = labels[graph.first] != labels[graph.second]
     near[graph.first[apart]] = near[graph.second[apart]] = True
     for _ in range(_BAND - 1):
@@ -114,8 +121,8 @@ def _expand(graph: Graph, labels: Labels, label: int, free: npt.NDArray[np.bool_
     only_first, only_second = cut * (labels[second] != label), cut * (labels[first] != label)
     both = free[first] & free[second]
     take = graph.price[label] - graph.price[labels, np.arange(labels.size)]  # to take it over to keep it
-    take += np.bincount(first, only_first - now, labels.size)
-    take += np.bincount(second, np.where(both, -only_first, only_second - now), labels.size)
+    take += _summed(first, only_first - now, labels.size)
+    take += _summed(second, np.where(both, -only_first, only_second - now), labels.size)
     edge = (only_second + only_first - now)[both]
     must = graph.possible[label, nodes] & ~graph.possible[labels[nodes], nodes]
     own = np.where(must, 0, take[nodes])

@@ -11,11 +11,10 @@ import subprocess
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal, get_args
+from typing import get_args
 
-from hugin_abflow import pto, tifftags
+from hugin_abflow import pto
 from hugin_abflow.errors import (
     ImageReadError,
     LayersMissingError,
@@ -24,6 +23,15 @@ from hugin_abflow.errors import (
     OutputError,
     PhotoMissingError,
     SettingsError,
+)
+from hugin_abflow.found import (
+    Found,
+    Remap,
+    find,
+    layer_path,
+    layers_by_prefix,
+    named_files,
+    none_there,
 )
 from hugin_abflow.images import read_layers
 from hugin_abflow.layer import Layer, check_layers
@@ -34,9 +42,6 @@ from hugin_abflow.scratch import work_folder
 
 log = logging.getLogger("hugin_abflow.nona")
 
-Remap = Literal["auto", "always", "never"]
-
-_STALE_SECONDS = 2.0  # file times closer than this say nothing (FAT counts in steps of 2 s)
 _LAST_LINES = 8  # of nona's output, in the message of a failure
 _STEPS = ("remapping ", "saving ")  # what nona -v says at the end of a photo's loading and remapping
 _LOADING = "loading "  # and at its beginning
@@ -65,8 +70,9 @@ def open_layers(
     prefix          layers named PREFIX0000.tif ..., as given or relative to the project's folder; taken
                     as they are. Without both, the project's stem and Hugin's default prefix are tried.
     remap           "never": only what is there. "always": nona makes all layers. "auto": nona makes all
-                    that are missing, and all if one is more than 2 s older than the project or its
-                    photo and they can be made again (else they are used, with a warning).
+                    that are missing, and all if one cannot be read, or is more than 2 s older than the
+                    project or its photo, and they can be made again (else those are used, with a
+                    warning).
     keep_layers     layers that nona made are moved beside the project, named as Hugin does.
 
     Layers are made in a folder under TMPDIR that is removed in the end. Raises `LayersMissingError`,
@@ -77,9 +83,9 @@ def open_layers(
     _check_request(remap, named=bool(prefix or layers))
     with work_folder() as folder:
         if layers:
-            files = _named_files(layers)
+            files = named_files(layers)
         elif prefix:
-            files = _layers_by_prefix(plan, prefix).in_order()
+            files = layers_by_prefix(plan, prefix).in_order()
         else:
             files = _find_or_make(plan, folder, remap, keep_layers, progress).in_order()
         opened = [layer for file in files for layer in read_layers(file)]
@@ -96,196 +102,35 @@ def _check_request(remap: str, named: bool) -> None:
         )
 
 
-# ------------------------------------------------------------------------------------- finding
-
-
-@dataclass(frozen=True)
-class _Found:
-    """Layers on disk: one file per image index, or one file of many pages (then `files` is empty).
-
-    The prefix is what comes before the numbers, folder included; it may end in a slash.
-    """
-
-    prefix: str
-    files: dict[int, Path]
-    pages: Path | None = None
-
-    def missing(self, plan: Plan) -> list[PlannedImage]:
-        """Active images without a layer; of a file of pages nobody can tell."""
-        return [] if self.pages else [image for image in plan.images if image.index not in self.files]
-
-    def stale(self, plan: Plan) -> list[Path]:
-        """Layers older than the project or their photo."""
-        project = _time(plan.file)
-        photos = {image.index: _time(image.photo) for image in plan.images}
-        newest = {file: max(project, photos[index]) for index, file in self.files.items()}
-        if self.pages:
-            newest[self.pages] = max(project, *photos.values())
-        return [file for file, time in newest.items() if _time(file) < time - _STALE_SECONDS]
-
-    def in_order(self) -> list[Path]:
-        """The files by image index."""
-        return [self.pages] if self.pages else [self.files[index] for index in sorted(self.files)]
-
-
-def layer_name(prefix: str, index: int, ending: str) -> str:
-    """What nona calls the layer of image `index`; numbers of unused images are left out."""
-    return f"{prefix}{index:04d}{ending}"
-
-
-def _layer_path(prefix: str, index: int, ending: str) -> Path:
-    return Path(layer_name(prefix, index, ending)).absolute()
-
-
-def _find_under(plan: Plan, prefix: str) -> _Found | None:
-    """Layers that begin with `prefix`, if any."""
-    endings = (".exr", ".tif", ".tiff") if plan.hdr else (".tif", ".tiff", ".exr")
-    photos = set(plan.photos)  # may be named alike: img0000.tif of img.pto
-    for ending in endings:
-        paths = {image.index: _layer_path(prefix, image.index, ending) for image in plan.images}
-        files = {index: path for index, path in paths.items() if path.is_file() and path not in photos}
-        if files:
-            return _Found(prefix, files)
-    for ending in (".tif", ".tiff"):
-        pages = Path(prefix + ending).absolute()
-        if _is_multilayer(pages):
-            return _Found(prefix, {}, pages)
-    return None
-
-
-def _is_multilayer(path: Path) -> bool:
-    """Whether a file is nona's TIFF_multilayer: a finished panorama may have the same name."""
-    try:
-        return path.is_file() and any(place.paged for place in tifftags.read_places(path))
-    except ImageReadError:
-        return False
-
-
-def _find(plan: Plan) -> _Found | None:
-    """Layers under the project's stem or Hugin's default prefix; complete and fresh ones first."""
-    other = plan.folder / f"{plan.hugin_prefix}.pto"  # layers of its name are its own
-    shared = not other.is_file() or other.samefile(plan.file)
-    stems = [plan.stem, plan.hugin_prefix] if shared else [plan.stem]
-    names = [plan.layer_prefix(name) for name in stems]
-    names += stems if plan.hdr else []
-    found = [layers for name in names if (layers := _find_under(plan, str(plan.folder / name)))]
-    if plan.hdr:  # what is linear; layers of the other panorama may lie there too
-        found = [layers for layers in found if all(path.suffix == ".exr" for path in layers.in_order())]
-    return min(found, key=lambda f: (bool(f.missing(plan)), bool(f.stale(plan))), default=None)
-
-
-def layers_there(
-    plan: Plan, prefix: str | Path | None, layers: Sequence[str | Path] | None, remap: Remap
-) -> list[Path]:
-    """The files that `open_layers` would find with these arguments; they may be stale, or not be there."""
-    if layers:
-        return [Path(path) for path in layers]
-    if prefix:
-        under = (_find_under(plan, place) for place in _places(plan, os.fspath(prefix)))
-        found = next((layers for layers in under if layers), None)
-    else:
-        found = None if remap == "always" else _find(plan)
-    return found.in_order() if found else []
-
-
-def _layers_by_prefix(plan: Plan, prefix: str | Path) -> _Found:
-    """Layers that the user named by their prefix."""
-    prefix = os.fspath(prefix)
-    for place in _places(plan, prefix):
-        found = _find_under(plan, place)
-        if found:
-            for image in found.missing(plan):
-                # nona makes none for a photo that misses the crop, but one that was lost leaves a hole
-                log.warning(
-                    "no layer of image %d (%s) under %s: it is left out", image.index, image.name, prefix
-                )
-            return found
-    first = layer_name(prefix, plan.images[0].index, ".tif")
-    raise LayersMissingError(
-        f"no layer {first} (nor .exr, nor of another active image) here or in {plan.folder}; "
-        f"{_better_prefix(plan, prefix)}"
-    )
-
-
-def _places(plan: Plan, name: str) -> tuple[str, str]:
-    """Where a name may lie. Joined as text: pathlib drops a slash at the end."""
-    return name, os.path.join(plan.folder, name)  # noqa: PTH118
-
-
-def _better_prefix(plan: Plan, prefix: str) -> str:
-    """What to do about a prefix that no layer has: it may be the name of one."""
-    for pattern in (r"\d{4}(\.\w+)?$", r"\.\w+$"):
-        shorter = re.sub(pattern, "", prefix)
-        if shorter not in ("", prefix) and any(_find_under(plan, p) for p in _places(plan, shorter)):
-            return f"the prefix is what comes before the numbers: --prefix {shorter}"
-    if any(Path(place).is_file() for place in _places(plan, prefix)):
-        return f"{prefix} is a file: name all layers with --layers"
-    return "check --prefix, or leave it out to have nona make the layers"
-
-
-def _named_files(layers: Sequence[str | Path]) -> list[Path]:
-    for path in map(Path, layers):
-        if not path.is_file():
-            raise LayersMissingError(f"{path}: no such layer; check --layers")
-    return [Path(path) for path in layers]
-
-
-def _find_or_make(plan: Plan, folder: Path, remap: Remap, keep: bool, progress: Progress) -> _Found:
+def _find_or_make(plan: Plan, folder: Path, remap: Remap, keep: bool, progress: Progress) -> Found:
     """Layers that nobody named: what is there, what nona makes, or both."""
-    found = None if remap == "always" else _find(plan)
+    found = None if remap == "always" else find(plan)
     if remap == "never":
         if found is None:
-            raise _none_there(plan)
+            raise none_there(plan)
         _report_used(plan, found)
         return found
     stale = found.stale(plan) if found else []
-    if found is None or (stale and _can_make(plan)):
-        if stale:
+    broken = found.broken() if found else None
+    if found is None or ((stale or broken) and _can_make(plan)):
+        if broken:
+            log.warning("all layers are made again, as this one is broken: %s", broken)
+        elif stale:
             log.info("%s is older than the project or its photo: layers are made again", stale[0])
         return _make_all(plan, folder, keep, progress)
     if stale:
         reason = "nona is not installed" if shutil.which("nona") is None else "photos are missing"
         log.warning("%s is older than the project or its photo; used as it is, since %s", stale[0], reason)
     made = _make_missing(plan, folder, found, keep, progress)
-    return _Found(found.prefix, found.files | made, found.pages)
+    return Found(found.prefix, found.files | made, found.pages)
 
 
-def find_layers(plan: Plan, remap: Remap) -> str | None:
-    """The prefix of layers that `open_layers` takes without making any; None if there are none.
-
-    Raises `LayersMissingError` as it does.
-    """
-    found = None if remap == "always" else _find(plan)
-    if found is None and remap == "never":
-        raise _none_there(plan)
-    usable = found and (remap == "never" or not (found.missing(plan) or found.stale(plan)))
-    return Path(found.prefix).name if found and usable else None
-
-
-def _none_there(plan: Plan) -> LayersMissingError:
-    return LayersMissingError(
-        f"no layers {plan.stem}0000.tif ... or {plan.hugin_prefix}0000.tif ... beside {plan.file}; "
-        "name them with --prefix or --layers, or let nona make them (--remap auto)"
-    )
-
-
-def _report_used(plan: Plan, found: _Found) -> None:
+def _report_used(plan: Plan, found: Found) -> None:
     """Warn of what --remap never leaves as it is."""
     for image in found.missing(plan):
         log.warning("no layer of image %d (%s): it is left out", image.index, image.name)
     for file in found.stale(plan)[:1]:
         log.warning("%s is older than the project or its photo; used as it is (--remap never)", file)
-
-
-def _time(path: Path) -> float:
-    """Time of the last change; 0 for what is not there, which makes nothing stale."""
-    try:
-        return path.stat().st_mtime
-    except OSError:
-        return 0.0
-
-
-# ------------------------------------------------------------------------------------- making
 
 
 def probe() -> str | None:
@@ -304,10 +149,10 @@ def _can_make(plan: Plan) -> bool:
     return shutil.which("nona") is not None and all(image.photo.is_file() for image in plan.images)
 
 
-def _make_all(plan: Plan, folder: Path, keep: bool, progress: Progress) -> _Found:
+def _make_all(plan: Plan, folder: Path, keep: bool, progress: Progress) -> Found:
     """Have nona make every layer."""
     for image in plan.images:
-        _require_photo(image)
+        _require_photo(plan, image)
     with progress("remap", len(_STEPS) * len(plan.images)) as advance:
         code, lines = _run(plan, folder, [], advance)
     made = _made(plan, folder)
@@ -316,10 +161,10 @@ def _make_all(plan: Plan, folder: Path, keep: bool, progress: Progress) -> _Foun
     if not made:
         raise LayersMissingError(f"{plan.file}: no active image reaches into the crop; nona made no layer")
     prefix = str(plan.folder / plan.layer_prefix(plan.stem))
-    return _Found(prefix, _keep(plan, prefix, made) if keep else made)
+    return Found(prefix, _keep(plan, prefix, made) if keep else made)
 
 
-def _make_missing(plan: Plan, folder: Path, found: _Found, keep: bool, progress: Progress) -> dict[int, Path]:
+def _make_missing(plan: Plan, folder: Path, found: Found, keep: bool, progress: Progress) -> dict[int, Path]:
     """Have nona make the layers that are not there; images that miss the crop have none."""
     missing = found.missing(plan)
     if not missing:
@@ -331,13 +176,18 @@ def _make_missing(plan: Plan, folder: Path, found: _Found, keep: bool, progress:
                 # nona does not count an image outside the crop as one of the project's
                 log.info("image %d (%s) misses the crop: it has no layer", image.index, image.name)
             elif code:
-                _require_photo(image)
+                _require_photo(plan, image)
                 raise _failure(plan, folder, code, lines)
     made = _made(plan, folder)
     return _keep(plan, found.prefix, made) if keep else made
 
 
-def _require_photo(image: PlannedImage) -> None:
+def _require_photo(plan: Plan, image: PlannedImage) -> None:
+    if not image.name:
+        raise PhotoMissingError(
+            f"image {image.index} of {plan.file} names no photo (its i-line has no n), and its layer must be "
+            "made from it; the project may be damaged: save it anew in Hugin"
+        )
     if not image.photo.is_file():
         raise PhotoMissingError(
             f"{image.photo} (image {image.index}) is not there, and its layer must be made from it; "
@@ -352,8 +202,8 @@ def _run(
 
     Raises `ImageReadError` for a photo of which pixels are missing.
     """
-    target, project = folder / plan.layer_prefix(plan.stem), _project_for_nona(plan, folder)
-    command = remapping(plan, options, str(target), str(project))
+    project = _project_for_nona(plan, folder)
+    command = remapping(plan, options, _prefix(plan, folder), str(project))
     log.info("%s", " ".join(command))
     try:
         process = subprocess.Popen(
@@ -415,21 +265,27 @@ def _project_for_nona(plan: Plan, folder: Path) -> Path:
     return copy
 
 
+def _prefix(plan: Plan, folder: Path) -> str:
+    """Where nona makes layers; named in UTF-8, without which OpenImageIO reads nothing."""
+    name = plan.stem.encode(errors="replace").decode()
+    return str(folder / plan.layer_prefix(name))
+
+
 def _made(plan: Plan, folder: Path) -> dict[int, Path]:
     """The layers that nona left in the folder."""
     ending = ".exr" if plan.hdr else ".tif"
-    prefix = str(folder / plan.layer_prefix(plan.stem))
-    paths = {image.index: _layer_path(prefix, image.index, ending) for image in plan.images}
+    prefix = _prefix(plan, folder)
+    paths = {image.index: layer_path(prefix, image.index, ending) for image in plan.images}
     return {index: path for index, path in paths.items() if path.is_file()}
 
 
 def _failure(plan: Plan, folder: Path, code: int, lines: list[str]) -> NonaFailedError:
     said = "\n  ".join(lines) or "(nothing)"
     how = f"was killed ({signal.Signals(-code).name})" if code < 0 else f"failed (exit code {code})"
-    return NonaFailedError(
-        f"nona {how} on {plan.file}; it wrote into {folder.parent}, TMPDIR chooses "
-        f"another folder. Its last lines:\n  {said}"
-    )
+    advice = f"it wrote into {folder.parent}, TMPDIR chooses another folder"
+    if "bad_alloc" in said:
+        advice = "it had not enough memory: close other programs, or make the panorama smaller in Hugin"
+    return NonaFailedError(f"nona {how} on {plan.file}; {advice}. Its last lines:\n  {said}")
 
 
 def _keep(plan: Plan, prefix: str, made: dict[int, Path]) -> dict[int, Path]:
@@ -437,7 +293,7 @@ def _keep(plan: Plan, prefix: str, made: dict[int, Path]) -> dict[int, Path]:
     photos = {photo.resolve() for photo in plan.photos}
     kept, advice = {}, "leave out --keep-layers or free the folder"
     for index, path in made.items():
-        final = _layer_path(prefix, index, path.suffix)
+        final = layer_path(prefix, index, path.suffix)
         if final.resolve() in photos:
             raise OutputError(
                 f"{final} is a photo, the layer cannot be kept by that name; rename the project"

@@ -13,8 +13,8 @@ from enum import StrEnum
 from pathlib import Path
 
 from hugin_abflow import pto
+from hugin_abflow.found import layer_name
 from hugin_abflow.metadata import PROGRAM
-from hugin_abflow.nona import layer_name
 from hugin_abflow.programs import missing
 from hugin_abflow.project import TIFF_COMPRESSIONS, Plan, read_output
 from hugin_abflow.stacks import exposure_layers, stacks

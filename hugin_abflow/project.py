@@ -219,7 +219,7 @@ def read_output(project: pto.Project, hdr: bool) -> Output:
         ending=ending,
         # Hugin's GUI writes TIFF's compression beside any type, LZW for EXR too
         compression=compression if ending == ".tif" and compression in TIFF_COMPRESSIONS else None,
-        jpeg_quality=min(100, max(1, int(quality))) if quality.isdecimal() else _JPEG_QUALITY,
+        jpeg_quality=int(min(100, max(1, float(quality)))) if quality.isdecimal() else _JPEG_QUALITY,
     )
 
 

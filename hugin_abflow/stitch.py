@@ -13,11 +13,12 @@ from typing import Any
 
 from hugin_abflow.errors import ProgramMissingError
 from hugin_abflow.exif import embed
+from hugin_abflow.found import Remap, find_layers, layers_there
 from hugin_abflow.images import COMPRESSIONS, ENDINGS, read_layer
 from hugin_abflow.layer import Layer, check_layers
 from hugin_abflow.merge import OpenDevice, guides_of, merge_project, refuse_input, write_panorama
 from hugin_abflow.metadata import describe
-from hugin_abflow.nona import Remap, find_layers, layers_there, open_layers, remapping
+from hugin_abflow.nona import open_layers, remapping
 from hugin_abflow.outputs import (
     BLEND,
     WORDS,

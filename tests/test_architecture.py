@@ -20,7 +20,7 @@ USERS = {
     "rich": {"batch", "terminal"},
     "distributed": {"batch"},
     "OpenImageIO": {"images", "imagewriter"},
-    "pyopencl": {"opencl", "launch"},
+    "pyopencl": {"devices", "opencl", "launch"},
     "tifffile": {"tiffreader", "tiffwriter"},
     "imagecodecs": {"tiffwriter"},
 }

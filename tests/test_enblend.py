@@ -250,6 +250,17 @@ def test_canvases_that_disagree(layers: list[str], capsys: pytest.CaptureFixture
     assert "-f 200x90+0+0 reaches beyond the canvas of 180x90" in capsys.readouterr().err
 
 
+def test_layer_beyond_the_canvas(layers: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    """As a photo among the layers may be: nobody said -f."""
+    write_image("photo.tif", np.full((100, 300, 4), 255, np.uint8))
+    assert run(*layers, "photo.tif") == 1
+    message = capsys.readouterr().err
+    assert "photo.tif covers columns 0 to 300" in message and "-f" not in message
+    write_image("photo.jpg", np.full((100, 300, 4), 255, np.uint8))
+    assert run(*layers, "photo.jpg") == 1
+    assert "photo.jpg has no alpha channel" in capsys.readouterr().err
+
+
 LENS = "Eev0 Er1 Eb1 r0 p0 TrX0 TrY0 TrZ0 j0 a0 b0 c0 d0 e0 g0 t0"
 PROJECT = f"""# hugin project file
 p f2 w180 h90 v360 E0 R0 S20,160,0,85 n"TIFF_m c:LZW r:CROP"

@@ -175,6 +175,18 @@ def test_photos_of_other_types(nona: str, tmp_path: Path, ending: str) -> None:
     assert difference.max() <= (2 if ending == ".png" else 12)
 
 
+@pytest.mark.parametrize(("white", "told"), [(1.15, False), (1.3, True)])
+def test_what_is_brighter_than_white_is_told_where_it_is_lost(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, white: float, told: bool
+) -> None:
+    """Not what is a little brighter, beside edges that nona sampled by a cubic."""
+    pixels = np.full((5, 7, 4), (white, -0.1, 0.5, 1.0), np.float32)
+    for ending in (".png", ".jpg", ".tif"):
+        caplog.clear()
+        write_image(tmp_path / f"a{ending}", pixels)
+        assert ("clipped" in caplog.text) == (told and ending != ".tif")
+
+
 @pytest.mark.parametrize("kind", ["8 bit TIFF", "float TIFF"])
 def test_bigtiff_where_classic_ends(
     project_of: Callable, kind: str, monkeypatch: pytest.MonkeyPatch, exiftool: str

@@ -202,6 +202,27 @@ def test_photo_missing(make_project, nona):
         pass
 
 
+def test_image_that_names_no_photo(make_project, nona):
+    """As where a project was cut off within a line."""
+    project = make_project()
+    project.write_text(project.read_text().replace(' n"photo 1.tif"', ""))
+    plan = read_plan(project)
+    with pytest.raises(PhotoMissingError, match=r"image 1 of .*pano\.pto names no photo"), open_layers(plan):
+        pass
+    remap(read_plan(make_project(stem="whole")), str(plan.folder / "pano"))
+    with open_layers(plan, remap="never") as layers:
+        assert len(layers) == 3
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="only Linux has names that are not UTF-8")
+def test_project_whose_name_is_not_utf8(make_project, nona):
+    """Its layers are called by another name, without which they could not be read."""
+    plan = read_plan(make_project(stem="p\udcf6n\udcff"))
+    with open_layers(plan) as layers:
+        assert names_of(layers) == [f"p?n?{index:04d}.tif" for index in range(3)]
+        pixels_of(layers)
+
+
 def test_photo_that_was_cut_is_told(make_project, nona, caplog):
     """nona itself ends with success: what is missing is black, of JPEG grey."""
     project = make_project()
@@ -254,6 +275,19 @@ def test_nona_fails(make_project, nona):
     ):
         pass
     assert "did not find a matching file type" in str(error.value)  # nona's own words
+
+
+def test_nona_without_memory(make_project, tmp_path, monkeypatch):
+    program_file = tmp_path / "nona"
+    program_file.write_text('#!/bin/sh\necho "what():  std::bad_alloc"\nkill -6 $$\n')
+    program_file.chmod(0o755)
+    monkeypatch.setenv("PATH", str(tmp_path))
+    with (
+        pytest.raises(NonaFailedError, match=r"(?s)SIGABRT.* close other programs.*std::bad_alloc") as error,
+        open_layers(read_plan(make_project())),
+    ):
+        pass
+    assert "TMPDIR" not in str(error.value)
 
 
 SLOW_NONA = """#!/bin/sh
@@ -401,5 +435,5 @@ def test_a_layer_that_is_no_image(make_project, nona):
     plan = read_plan(make_project())
     remap(plan, "pano")
     (plan.folder / "pano0002.tif").write_bytes(b"II*\0")
-    with pytest.raises(ImageReadError, match=r"pano0002\.tif"), open_layers(plan):
+    with pytest.raises(ImageReadError, match=r"pano0002\.tif"), open_layers(plan, remap="never"):
         pass

@@ -183,6 +183,9 @@ def test_hugin_lines_win_and_nonsense_keeps_the_default(make_project):
     extra = "#hugin_outputImageType jpg\n#hugin_outputJPEGQuality none\n#hugin_outputImageTypeCompression\n"
     output = read_plan(make_project(panorama='f2 w802 h401 v360 n"PNG"', extra=extra)).output
     assert (output.ending, output.compression, output.jpeg_quality) == (".jpg", None, 100)
+    for quality, taken in (("9" * 5000, 100), ("0" * 5000 + "87", 87), ("0", 1)):
+        extra = f"#hugin_outputImageType jpg\n#hugin_outputJPEGQuality {quality}\n"
+        assert read_plan(make_project(extra=extra)).output.jpeg_quality == taken
 
 
 @pytest.mark.parametrize(("kind", "compression"), [("tif", "lzw"), ("exr", None)])

@@ -22,6 +22,9 @@ def request(line: str) -> Request:
     return read_command_line(["a.tif", *line.split()])
 
 
+DIGITS = "9" * 5000  # more than Python makes a number of
+
+
 @pytest.mark.parametrize(
     ("line", "changed"),
     [
@@ -87,6 +90,10 @@ def test_option_means(line: str, changed: dict[str, Any]) -> None:
         ("--compression=-5", "or 0 to 100"),
         ("--compression=lzw:3", "or 0 to 100"),
         ("--compression=jpeg:best", "or 0 to 100"),
+        (f"--compression={DIGITS}", "or 0 to 100"),
+        (f"--compression=jpeg:{DIGITS}", "or 0 to 100"),
+        (f"-f {DIGITS}x{DIGITS}", "give WIDTHxHEIGHT"),
+        (f"-v{DIGITS}", "choose a whole number"),
         ("-l x", "choose a whole number or auto"),
         ("-vx", "--verbose=x: choose a whole number"),
         ("-va", "--verbose=a"),

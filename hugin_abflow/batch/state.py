@@ -18,9 +18,9 @@ from typing import Any
 
 from hugin_abflow.batch.record import Record, write_json
 from hugin_abflow.errors import AbflowError
+from hugin_abflow.found import layers_there
 from hugin_abflow.images import read_layers
 from hugin_abflow.metadata import version
-from hugin_abflow.nona import layers_there
 from hugin_abflow.outputs import checked_outputs, impossible, possible_outputs
 from hugin_abflow.project import read_plan
 

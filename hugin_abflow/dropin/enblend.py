@@ -131,7 +131,6 @@ def _canvas(layers: Sequence[Layer], crop: Box | None, wraps: bool) -> Canvas:
     wide as high is the whole sphere: no other projection is used for that.
     """
     bounds = bounding_box(layers)
-    crop = crop or bounds
     sizes = {layer.canvas_size: layer for layer in layers if layer.canvas_size}
     if len(sizes) > 1:
         (one, first), (other, second) = list(sizes.items())[:2]
@@ -140,10 +139,10 @@ def _canvas(layers: Sequence[Layer], crop: Box | None, wraps: bool) -> Canvas:
             f"{other[0]}x{other[1]}; name the layers of one panorama"
         )
     width, height = next(iter(sizes), None) or (
-        max(bounds.right, crop.right),
-        max(bounds.bottom, crop.bottom),
+        max(bounds.right, crop.right if crop else 0),
+        max(bounds.bottom, crop.bottom if crop else 0),
     )
-    if crop.right > width or crop.bottom > height:
+    if crop and (crop.right > width or crop.bottom > height):
         raise LayersMismatchError(
             f"-f {crop.width}x{crop.height}+{crop.left}+{crop.top} reaches beyond the canvas of "
             f"{width}x{height} that the layers were made for; make them again, or correct -f"
@@ -151,4 +150,4 @@ def _canvas(layers: Sequence[Layer], crop: Box | None, wraps: bool) -> Canvas:
     whole = (
         Canvas.sphere(width, height) if wraps and width == 2 * height else Canvas.plane(width, height, wraps)
     )
-    return replace(whole, crop=crop)
+    return replace(whole, crop=crop or bounds)

@@ -72,7 +72,7 @@ def _output(request: Request, value: str) -> Request:
 
 
 def _crop(request: Request, value: str) -> Request:
-    found = re.fullmatch(r"(\d+)x(\d+)(?:\+(\d+)\+(\d+))?", value)
+    found = re.fullmatch(r"(\d{1,9})x(\d{1,9})(?:\+(\d{1,9})\+(\d{1,9}))?", value)
     width, height, left, top = (int(number or 0) for number in found.groups()) if found else (0, 0, 0, 0)
     if not width or not height:
         raise CommandLineError(f"-f {value}: give WIDTHxHEIGHT or WIDTHxHEIGHT+X+Y in pixels")
@@ -102,7 +102,7 @@ def _compression(request: Request, value: str) -> Request:
     name, _, quality = value.lower().partition(":")
     if name.isdecimal() and not quality:
         name, quality = "jpeg", name
-    if name in ("jpeg", "jpeg-arith") and (quality.isdecimal() or not quality):
+    if name in ("jpeg", "jpeg-arith") and re.fullmatch(r"\d{0,9}", quality):
         chosen = max(1, min(100, int(quality))) if quality else request.jpeg_quality
         return replace(request, compression="jpeg", jpeg_quality=chosen)
     if name not in COMPRESSIONS["TIFF"] or quality:
@@ -118,7 +118,7 @@ def _levels(request: Request, value: str) -> Request:
 
 
 def _verbose(request: Request, value: str) -> Request:
-    if not re.fullmatch(r"-?\d*", value):
+    if not re.fullmatch(r"(-?\d{1,9})?", value):
         raise CommandLineError(f"--verbose={value}: choose a whole number")
     return replace(request, verbosity=max(0, int(value)) if value else request.verbosity + 1)
 
@@ -215,7 +215,7 @@ INPUT... are the layers that nona makes, or @LIST: a file with a name on each li
   -f WIDTHxHEIGHT[+X+Y]  size and position of the output; default: all that the layers cover
   -w, --wrap[=MODE]      "horizontal" (also without MODE): left and right border are one; "none"
   -d, --depth=DEPTH      samples of the output: 8, 16, r32, r64; default: as the layers'
-  --compression=NAME     TIFF: none, packbits, lzw, deflate, zstd; JPEG: quality, 0 to 100
+  --compression=NAME     TIFF: none, packbits, lzw, deflate, zstd, jpeg; JPEG: quality, 0 to 100
   -v, --verbose[=LEVEL]  0: warnings only; 1: phases (default); 2: say what is done
   --save-masks[=NAME]    write each layer's weight; NAME may hold %n (number), %i (index), %f (the layer's
                          name), %d (its folder), %b (its file), %p (its path), %e (its ending), and the same

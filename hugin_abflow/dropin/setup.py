@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import shutil
 from collections.abc import Sequence
-from contextlib import suppress
 from importlib import resources
 from pathlib import Path, PureWindowsPath
 
@@ -13,6 +12,7 @@ from hugin_abflow.dropin import wxconfig
 from hugin_abflow.dropin.places import Places, our_places, program
 from hugin_abflow.errors import ExitCode, SetupError
 from hugin_abflow.metadata import version
+from hugin_abflow.scratch import part_beside
 from hugin_abflow.terminal import catching, print_result
 
 NAME = "hugin-abflow-setup"
@@ -144,17 +144,15 @@ def _read(path: Path) -> str | None:
 def _write(path: Path, content: str, dry_run: bool) -> list[str]:
     """Write a file whole or not at all; what was done, in words."""
     final = path.resolve()  # through a link: what it points to is replaced, not the link
-    part = final.with_name(f".{final.name}.abflow")
     if not dry_run:
         try:
             final.parent.mkdir(parents=True, exist_ok=True)
-            part.write_bytes(content.encode("utf-8", "surrogateescape"))
-            if final.exists():
-                shutil.copymode(final, part)
-            part.replace(final)
+            with part_beside(final, ".part") as part:
+                part.write_bytes(content.encode("utf-8", "surrogateescape"))
+                if final.exists():
+                    shutil.copymode(final, part)
+                part.replace(final)
         except OSError as error:
-            with suppress(OSError):
-                part.unlink()
             raise SetupError(
                 f"{path} cannot be written: {error.strerror}; allow writing there, then try again"
             ) from None

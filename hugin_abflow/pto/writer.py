@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import secrets
 import shutil
 from pathlib import Path
 
 from hugin_abflow.errors import OutputError
 from hugin_abflow.pto.model import Project
+from hugin_abflow.scratch import part_beside
 
 
 def dumps(project: Project) -> bytes:
@@ -28,15 +28,11 @@ def dump(project: Project, path: str | Path) -> None:
     data = dumps(project)
     try:
         target = Path(path).resolve()  # a link stays a link
-        partial = target.with_name(f".{secrets.token_hex(8)}.pto.part")
-        try:
-            with partial.open("xb") as stream:
-                stream.write(data)
+        with part_beside(target, ".part") as part:
+            part.write_bytes(data)
             if target.exists():
-                shutil.copymode(target, partial)
-            partial.replace(target)
-        finally:
-            partial.unlink(missing_ok=True)
+                shutil.copymode(target, part)
+            part.replace(target)
     except (OSError, ValueError) as error:  # ValueError: a name that no file can have
         reason = getattr(error, "strerror", None) or error
         raise OutputError(f"{path}: cannot be written ({reason}); check folder and permissions") from error

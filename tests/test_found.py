@@ -13,10 +13,12 @@ from conftest import age, names_of, pixels_of, refuse, remap, same
 
 from hugin_abflow import nona as program
 from hugin_abflow.errors import (
+    ImageReadError,
     LayersMissingError,
     OutputError,
     SettingsError,
 )
+from hugin_abflow.found import find_layers
 from hugin_abflow.images import write_image
 from hugin_abflow.nona import open_layers
 from hugin_abflow.project import read_plan
@@ -163,6 +165,51 @@ def test_no_image_in_the_crop(make_project, nona):
 
 
 # ------------------------------------------------------------------------------------ stale layers
+
+
+@pytest.mark.parametrize("left", [0, 4, 2000])
+@pytest.mark.parametrize("prefix", ["pano", "photo 0 - photo 2"])
+def test_layers_of_a_run_that_was_broken_off_are_made_again(
+    make_project, nona, temporary, caplog, left, prefix
+):
+    """TIFF's directory comes last: of what is left nothing can be read."""
+    plan = read_plan(make_project())
+    remap(plan, prefix)
+    cut = plan.folder / f"{prefix}0001.tif"
+    whole = cut.read_bytes()
+    assert len(whole) > 2000
+    cut.write_bytes(whole[:left])
+    assert find_layers(plan, "auto") is None
+    with open_layers(plan) as layers:
+        assert all(temporary in layer.file.parents for layer in layers)
+    assert "layers are made again" in caplog.text and f"{prefix}0001.tif" in caplog.text
+    assert cut.read_bytes() == whole[:left]
+    with open_layers(plan, keep_layers=True):
+        pass
+    assert find_layers(plan, "auto") == "pano"
+
+
+def test_whole_layers_go_before_broken_ones(make_project, nona, monkeypatch):
+    plan = read_plan(make_project())
+    remap(plan, "pano")
+    remap(plan, "photo 0 - photo 2")
+    (plan.folder / "pano0001.tif").write_bytes(b"")
+    monkeypatch.setattr(program, "_run", refuse)
+    with open_layers(plan) as layers:
+        assert names_of(layers)[1] == "photo 0 - photo 20001.tif"
+
+
+@pytest.mark.parametrize("without", ["photo", "nona"])
+def test_broken_layers_that_cannot_be_made_again_are_told(make_project, nona, monkeypatch, without):
+    plan = read_plan(make_project())
+    remap(plan, "pano")
+    (plan.folder / "pano0001.tif").write_bytes(b"")
+    if without == "photo":
+        plan.images[2].photo.unlink()
+    else:
+        monkeypatch.setenv("PATH", "")
+    with pytest.raises(ImageReadError, match=r"pano0001\.tif cannot be read"), open_layers(plan):
+        pass
 
 
 @pytest.mark.parametrize("older, stale", [(1.0, False), (3.0, True)])

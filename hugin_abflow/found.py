@@ -1,0 +1,196 @@
+"""Layers that are there already: what they are called, whether they are all there, fresh and whole."""
+
+from __future__ import annotations
+
+import logging
+import os
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+from hugin_abflow import tifftags
+from hugin_abflow.errors import ImageReadError, LayersMissingError
+from hugin_abflow.images import read_layers
+from hugin_abflow.project import Plan, PlannedImage
+
+log = logging.getLogger("hugin_abflow.nona")
+
+Remap = Literal["auto", "always", "never"]
+
+_STALE_SECONDS = 2.0  # file times closer than this say nothing (FAT counts in steps of 2 s)
+
+
+@dataclass(frozen=True)
+class Found:
+    """Layers on disk: one file per image index, or one file of many pages (then `files` is empty).
+
+    The prefix is what comes before the numbers, folder included; it may end in a slash.
+    """
+
+    prefix: str
+    files: dict[int, Path]
+    pages: Path | None = None
+
+    def missing(self, plan: Plan) -> list[PlannedImage]:
+        """Active images without a layer; of a file of pages nobody can tell."""
+        return [] if self.pages else [image for image in plan.images if image.index not in self.files]
+
+    def stale(self, plan: Plan) -> list[Path]:
+        """Layers older than the project or their photo."""
+        project = _time(plan.file)
+        photos = {image.index: _time(image.photo) for image in plan.images}
+        newest = {file: max(project, photos[index]) for index, file in self.files.items()}
+        if self.pages:
+            newest[self.pages] = max(project, *photos.values())
+        return [file for file, time in newest.items() if _time(file) < time - _STALE_SECONDS]
+
+    def usable(self, plan: Plan) -> bool:
+        """Whether those that are there need not be made again."""
+        return not self.stale(plan) and self.broken() is None
+
+    def broken(self) -> ImageReadError | None:
+        """What is wrong with the first that is no image, or not one that a layer can be."""
+        try:
+            for file in self.in_order():
+                read_layers(file)
+        except ImageReadError as error:
+            return error
+        return None
+
+    def in_order(self) -> list[Path]:
+        """The files by image index."""
+        return [self.pages] if self.pages else [self.files[index] for index in sorted(self.files)]
+
+
+def layer_name(prefix: str, index: int, ending: str) -> str:
+    """What nona calls the layer of image `index`; numbers of unused images are left out."""
+    return f"{prefix}{index:04d}{ending}"
+
+
+def layer_path(prefix: str, index: int, ending: str) -> Path:
+    """The file of that name."""
+    return Path(layer_name(prefix, index, ending)).absolute()
+
+
+def _find_under(plan: Plan, prefix: str) -> Found | None:
+    """Layers that begin with `prefix`, if any."""
+    endings = (".exr", ".tif", ".tiff") if plan.hdr else (".tif", ".tiff", ".exr")
+    photos = set(plan.photos)  # may be named alike: img0000.tif of img.pto
+    for ending in endings:
+        paths = {image.index: layer_path(prefix, image.index, ending) for image in plan.images}
+        files = {index: path for index, path in paths.items() if path.is_file() and path not in photos}
+        if files:
+            return Found(prefix, files)
+    for ending in (".tif", ".tiff"):
+        pages = Path(prefix + ending).absolute()
+        if _is_multilayer(pages):
+            return Found(prefix, {}, pages)
+    return None
+
+
+def _is_multilayer(path: Path) -> bool:
+    """Whether a file is nona's TIFF_multilayer: a finished panorama may have the same name."""
+    try:
+        return path.is_file() and any(place.paged for place in tifftags.read_places(path))
+    except ImageReadError:
+        return False
+
+
+def find(plan: Plan) -> Found | None:
+    """Layers under the project's stem or Hugin's default prefix; complete, fresh and whole ones first."""
+    other = plan.folder / f"{plan.hugin_prefix}.pto"  # layers of its name are its own
+    shared = not other.is_file() or other.samefile(plan.file)
+    stems = [plan.stem, plan.hugin_prefix] if shared else [plan.stem]
+    names = [plan.layer_prefix(name) for name in stems]
+    names += stems if plan.hdr else []
+    found = [layers for name in names if (layers := _find_under(plan, str(plan.folder / name)))]
+    if plan.hdr:  # what is linear; layers of the other panorama may lie there too
+        found = [layers for layers in found if all(path.suffix == ".exr" for path in layers.in_order())]
+    return min(found, key=lambda f: (bool(f.missing(plan)), not f.usable(plan)), default=None)
+
+
+def layers_there(
+    plan: Plan, prefix: str | Path | None, layers: Sequence[str | Path] | None, remap: Remap
+) -> list[Path]:
+    """The files that `open_layers` would find with these arguments; they may be stale, or not be there."""
+    if layers:
+        return [Path(path) for path in layers]
+    if prefix:
+        under = (_find_under(plan, place) for place in _places(plan, os.fspath(prefix)))
+        found = next((layers for layers in under if layers), None)
+    else:
+        found = None if remap == "always" else find(plan)
+    return found.in_order() if found else []
+
+
+def layers_by_prefix(plan: Plan, prefix: str | Path) -> Found:
+    """Layers that the user named by their prefix. Raises `LayersMissingError`."""
+    prefix = os.fspath(prefix)
+    for place in _places(plan, prefix):
+        found = _find_under(plan, place)
+        if found:
+            for image in found.missing(plan):
+                # nona makes none for a photo that misses the crop, but one that was lost leaves a hole
+                log.warning(
+                    "no layer of image %d (%s) under %s: it is left out", image.index, image.name, prefix
+                )
+            return found
+    first = layer_name(prefix, plan.images[0].index, ".tif")
+    raise LayersMissingError(
+        f"no layer {first} (nor .exr, nor of another active image) here or in {plan.folder}; "
+        f"{_better_prefix(plan, prefix)}"
+    )
+
+
+def _places(plan: Plan, name: str) -> tuple[str, str]:
+    """Where a name may lie. Joined as text: pathlib drops a slash at the end."""
+    return name, os.path.join(plan.folder, name)  # noqa: PTH118
+
+
+def _better_prefix(plan: Plan, prefix: str) -> str:
+    """What to do about a prefix that no layer has: it may be the name of one."""
+    for pattern in (r"\d{4}(\.\w+)?$", r"\.\w+$"):
+        shorter = re.sub(pattern, "", prefix)
+        if shorter not in ("", prefix) and any(_find_under(plan, p) for p in _places(plan, shorter)):
+            return f"the prefix is what comes before the numbers: --prefix {shorter}"
+    if any(Path(place).is_file() for place in _places(plan, prefix)):
+        return f"{prefix} is a file: name all layers with --layers"
+    return "check --prefix, or leave it out to have nona make the layers"
+
+
+def named_files(layers: Sequence[str | Path]) -> list[Path]:
+    """Layers that the user named; raises `LayersMissingError` if one is not there."""
+    for path in map(Path, layers):
+        if not path.is_file():
+            raise LayersMissingError(f"{path}: no such layer; check --layers")
+    return [Path(path) for path in layers]
+
+
+def find_layers(plan: Plan, remap: Remap) -> str | None:
+    """The prefix of layers that `open_layers` takes without making any; None if there are none.
+
+    Raises `LayersMissingError` as it does.
+    """
+    found = None if remap == "always" else find(plan)
+    if found is None and remap == "never":
+        raise none_there(plan)
+    taken = found and (remap == "never" or (not found.missing(plan) and found.usable(plan)))
+    return Path(found.prefix).name if found and taken else None
+
+
+def none_there(plan: Plan) -> LayersMissingError:
+    """What to raise where layers are neither there nor to be made."""
+    return LayersMissingError(
+        f"no layers {plan.stem}0000.tif ... or {plan.hugin_prefix}0000.tif ... beside {plan.file}; "
+        "name them with --prefix or --layers, or let nona make them (--remap auto)"
+    )
+
+
+def _time(path: Path) -> float:
+    """Time of the last change; 0 for what is not there, which makes nothing stale."""
+    try:
+        return path.stat().st_mtime
+    except OSError:
+        return 0.0
