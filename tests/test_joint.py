@@ -324,7 +324,7 @@ def test_neither_threads_nor_memory_change_a_pixel(monkeypatch):
     for other in ({"threads": 1}, {"threads": 2, "band_rows": 7}, {"max_memory": 4 << 30}):
         np.testing.assert_array_equal(merged(layers, canvas, **other), expected)
     ((reckoned, _),) = (values for text, values in needed.items() if text.startswith("memory"))
-    with pytest.raises(SettingsError, match=rf"20\.0 MiB is too little.* about {reckoned}; give \d+M, or"):
+    with pytest.raises(SettingsError, match=rf"20\.0 MiB is too little.* about {reckoned}; give \d+M$"):
         merged(layers, canvas, max_memory=20 << 20)
     with pytest.raises(SettingsError, match="too little for these layers, which take about"):
         merged(layers, canvas, max_memory=20 << 20, flow=False)
