@@ -7,6 +7,7 @@ import os
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Literal
 
@@ -15,7 +16,7 @@ from hugin_abflow.errors import ImageReadError, LayersMissingError
 from hugin_abflow.images import read_layers
 from hugin_abflow.project import Plan, PlannedImage
 
-log = logging.getLogger("hugin_abflow.nona")
+_log = logging.getLogger(__name__)
 
 Remap = Literal["auto", "always", "never"]
 
@@ -46,17 +47,14 @@ class Found:
             newest[self.pages] = max(project, *photos.values())
         return [file for file, time in newest.items() if _time(file) < time - _STALE_SECONDS]
 
-    def usable(self, plan: Plan) -> bool:
-        """Whether those that are there need not be made again."""
-        return not self.stale(plan) and self.broken() is None
-
-    def broken(self) -> ImageReadError | None:
-        """What is wrong with the first that is no image, or not one that a layer can be."""
-        try:
-            for file in self.in_order():
+    @cached_property
+    def broken(self) -> Path | None:
+        """The first that is no image, or not one that a layer can be; pixels are not looked at."""
+        for file in self.in_order():
+            try:
                 read_layers(file)
-        except ImageReadError as error:
-            return error
+            except ImageReadError:
+                return file
         return None
 
     def in_order(self) -> list[Path]:
@@ -99,7 +97,7 @@ def _is_multilayer(path: Path) -> bool:
 
 
 def find(plan: Plan) -> Found | None:
-    """Layers under the project's stem or Hugin's default prefix; complete, fresh and whole ones first."""
+    """Layers under the project's stem or Hugin's default prefix; whole, complete and fresh ones first."""
     other = plan.folder / f"{plan.hugin_prefix}.pto"  # layers of its name are its own
     shared = not other.is_file() or other.samefile(plan.file)
     stems = [plan.stem, plan.hugin_prefix] if shared else [plan.stem]
@@ -108,7 +106,9 @@ def find(plan: Plan) -> Found | None:
     found = [layers for name in names if (layers := _find_under(plan, str(plan.folder / name)))]
     if plan.hdr:  # what is linear; layers of the other panorama may lie there too
         found = [layers for layers in found if all(path.suffix == ".exr" for path in layers.in_order())]
-    return min(found, key=lambda f: (bool(f.missing(plan)), not f.usable(plan)), default=None)
+    return min(
+        found, key=lambda f: (bool(f.broken), bool(f.missing(plan)), bool(f.stale(plan))), default=None
+    )
 
 
 def layers_there(
@@ -133,7 +133,7 @@ def layers_by_prefix(plan: Plan, prefix: str | Path) -> Found:
         if found:
             for image in found.missing(plan):
                 # nona makes none for a photo that misses the crop, but one that was lost leaves a hole
-                log.warning(
+                _log.warning(
                     "no layer of image %d (%s) under %s: it is left out", image.index, image.name, prefix
                 )
             return found
@@ -176,8 +176,9 @@ def find_layers(plan: Plan, remap: Remap) -> str | None:
     found = None if remap == "always" else find(plan)
     if found is None and remap == "never":
         raise none_there(plan)
-    taken = found and (remap == "never" or (not found.missing(plan) and found.usable(plan)))
-    return Path(found.prefix).name if found and taken else None
+    if found is None or (remap != "never" and (found.broken or found.missing(plan) or found.stale(plan))):
+        return None
+    return Path(found.prefix).name
 
 
 def none_there(plan: Plan) -> LayersMissingError:

@@ -43,7 +43,7 @@ from hugin_abflow.guides import Guide, by_pair
 from hugin_abflow.layer import Canvas, Layer
 from hugin_abflow.opencl import Buffer, Device, DeviceMemoryError
 from hugin_abflow.progress import Progress
-from hugin_abflow.settings import Settings
+from hugin_abflow.settings import FlowQuality, Settings
 from hugin_abflow.working import Grid, WorkingLayer
 
 _log = logging.getLogger(__name__)
@@ -148,7 +148,8 @@ def prepare(
     reduced = saturation.with_whites(device, reduced, overlapping)
     shared = [overlap for _, overlap in overlaps] if settings.flow else []
     charts = pairflow.charts(shared, masks.grid, grid, settings)
-    _check_memory(device, reduced, charts, grid, settings)
+    fast = partial(_of_quality, "fast", full, shared, masks.grid, settings)
+    _check_memory(device, reduced, charts, grid, settings, fast)
     its_guides = by_pair(guides if settings.guides else ())
     flows, shifts, singles = (
         pairflow.solve(device, reduced, overlapping, charts, grid, progress, settings, its_guides, numbers)
@@ -356,15 +357,35 @@ def _overlaps(
     return result
 
 
+def _of_quality(
+    quality: FlowQuality,
+    full: Grid,
+    overlaps: Sequence[npt.NDArray[np.bool_]],
+    masks: Grid,
+    settings: Settings,
+) -> tuple[Sequence[Chart], Grid, Settings]:
+    """Charts, working grid and settings of another quality."""
+    settings = replace(settings, flow_quality=quality)
+    grid = working.working_grid(full, settings)
+    return pairflow.charts(overlaps, masks, grid, settings), grid, settings
+
+
 def _check_memory(
-    device: Device, layers: Sequence[WorkingLayer], charts: Sequence[Chart], grid: Grid, settings: Settings
+    device: Device,
+    layers: Sequence[WorkingLayer],
+    charts: Sequence[Chart],
+    grid: Grid,
+    settings: Settings,
+    fast: Callable[[], tuple[Sequence[Chart], Grid, Settings]],
 ) -> None:
     """Refuse a limit that is too low for the working canvas, which must not depend on it.
 
-    charts: on which flow is found; none if there is no flow.
+    charts      on which flow is found; none if there is no flow.
+    fast        gives charts, grid and settings of `--flow-quality fast`.
     """
     there = memory.resident() + device.own_memory + _LIBRARY_BYTES
-    needed = there + _working_bytes(layers, charts, grid, settings)
+    pixels = sum(layer.box[2] * layer.box[3] for layer in layers)
+    needed = there + _working_bytes(pixels, charts, grid, settings)
     limit = memory.limit(settings.max_memory)
     _log.info("memory: about %s of %s at working resolution", memory.size(needed), memory.size(limit))
     if needed <= limit:
@@ -373,17 +394,16 @@ def _check_memory(
     what = "whose flow takes" if settings.flow else "which take"
     said = f"{given} is too little for these layers, {what} about {memory.size(needed)}"
     if settings.max_memory:
-        fast = there + _working_bytes(layers, charts, grid, replace(settings, flow_quality="fast"))
-        less = ", or choose --flow-quality fast" if fast <= limit else ""
-        raise SettingsError(f"{said}; {remedy}{less}")
+        fewer, coarser, less = fast()
+        share = coarser.width * coarser.height / (grid.width * grid.height)
+        there -= round((1 - share) * sum(layer.pixels.nbytes for layer in layers))
+        would_do = there + _working_bytes(round(share * pixels), fewer, coarser, less) <= limit
+        raise SettingsError(f"{said}; {remedy}{', or choose --flow-quality fast' if would_do else ''}")
     _log.warning("%s; going on with that", said)
 
 
-def _working_bytes(
-    layers: Sequence[WorkingLayer], charts: Sequence[Chart], grid: Grid, settings: Settings
-) -> int:
-    """What flow, and what is found from it, take at working resolution."""
-    pixels = sum(layer.box[2] * layer.box[3] for layer in layers)
+def _working_bytes(pixels: int, charts: Sequence[Chart], grid: Grid, settings: Settings) -> int:
+    """What flow, and what is found from it, take at working resolution. pixels: of all layers."""
     sizes = [chart.width * chart.height for chart in pairflow.finest(charts, grid, settings)]
     at_last, meanwhile = _STEP_BYTES * pixels, _SOLVER_BYTES * max(sizes, default=0)
     return max(_FLOW_BYTES * sum(sizes) + at_last, _FOUND_BYTES * sum(sizes) + meanwhile)

@@ -18,7 +18,7 @@ from hugin_abflow import joint, sequential
 from hugin_abflow.devices import choose
 from hugin_abflow.errors import LayersMissingError, OutputError
 from hugin_abflow.exif import Metadata
-from hugin_abflow.found import Remap
+from hugin_abflow.found import Remap, layers_there
 from hugin_abflow.guides import Guide
 from hugin_abflow.images import ENDINGS, ImageWriter, check_target, use_threads
 from hugin_abflow.kept import in_use, kept_device
@@ -234,8 +234,8 @@ def _report(canvas: Canvas, projection: str, layers: Sequence[Layer], writer: Im
 def _target(plan: Plan, layers: Sequence[Layer], output: Path | str | None) -> Path:
     """The panorama's file, which must be none of the inputs."""
     inputs = [layer.file for layer in layers if layer.file is not None]
-    if output is None:
-        return plan.default_output(inputs)
+    if output is None:  # layers that are there stay, also where they were made again
+        return plan.default_output([*inputs, *layers_there(plan, None, None, "auto")])
     refuse_input(Path(output), inputs)
     return Path(output)
 

@@ -1,4 +1,4 @@
-"""Layers of a project: find them, or have Hugin's nona make them."""
+"""Layers of a project: those that are there, and what Hugin's nona makes."""
 
 from __future__ import annotations
 
@@ -34,6 +34,7 @@ from hugin_abflow.found import (
     none_there,
 )
 from hugin_abflow.images import read_layers
+from hugin_abflow.imagewriter import named_in_unicode
 from hugin_abflow.layer import Layer, check_layers
 from hugin_abflow.programs import move_whole, stop
 from hugin_abflow.progress import Progress, silent
@@ -110,15 +111,14 @@ def _find_or_make(plan: Plan, folder: Path, remap: Remap, keep: bool, progress: 
             raise none_there(plan)
         _report_used(plan, found)
         return found
-    stale = found.stale(plan) if found else []
-    broken = found.broken() if found else None
-    if found is None or ((stale or broken) and _can_make(plan)):
+    broken, stale = (found.broken, found.stale(plan)) if found else (None, [])
+    if found is None or ((broken or stale) and _can_make(plan)):
         if broken:
-            log.warning("all layers are made again, as this one is broken: %s", broken)
+            log.warning("%s cannot be read: all layers are made again", broken)
         elif stale:
             log.info("%s is older than the project or its photo: layers are made again", stale[0])
         return _make_all(plan, folder, keep, progress)
-    if stale:
+    if stale and not broken:
         reason = "nona is not installed" if shutil.which("nona") is None else "photos are missing"
         log.warning("%s is older than the project or its photo; used as it is, since %s", stale[0], reason)
     made = _make_missing(plan, folder, found, keep, progress)
@@ -151,6 +151,9 @@ def _can_make(plan: Plan) -> bool:
 
 def _make_all(plan: Plan, folder: Path, keep: bool, progress: Progress) -> Found:
     """Have nona make every layer."""
+    prefix = str(plan.folder / plan.layer_prefix(plan.stem))
+    if keep:
+        _refuse_to_keep(prefix)
     for image in plan.images:
         _require_photo(plan, image)
     with progress("remap", len(_STEPS) * len(plan.images)) as advance:
@@ -160,7 +163,6 @@ def _make_all(plan: Plan, folder: Path, keep: bool, progress: Progress) -> Found
         raise _failure(plan, folder, code, lines)
     if not made:
         raise LayersMissingError(f"{plan.file}: no active image reaches into the crop; nona made no layer")
-    prefix = str(plan.folder / plan.layer_prefix(plan.stem))
     return Found(prefix, _keep(plan, prefix, made) if keep else made)
 
 
@@ -169,6 +171,8 @@ def _make_missing(plan: Plan, folder: Path, found: Found, keep: bool, progress: 
     missing = found.missing(plan)
     if not missing:
         return {}
+    if keep:
+        _refuse_to_keep(found.prefix)
     with progress("remap", len(_STEPS) * len(missing)) as advance:
         for image in missing:
             code, lines = _run(plan, folder, ["-i", str(image.index)], advance)
@@ -286,6 +290,15 @@ def _failure(plan: Plan, folder: Path, code: int, lines: list[str]) -> NonaFaile
     if "bad_alloc" in said:
         advice = "it had not enough memory: close other programs, or make the panorama smaller in Hugin"
     return NonaFailedError(f"nona {how} on {plan.file}; {advice}. Its last lines:\n  {said}")
+
+
+def _refuse_to_keep(prefix: str) -> None:
+    """Raise `OutputError` if layers of these names could not be read."""
+    if not named_in_unicode(Path(prefix)):
+        raise OutputError(
+            f"{prefix}0000 is not valid UTF-8, so that layers cannot be kept by such names; rename "
+            "folder and project, or leave out --keep-layers"
+        )
 
 
 def _keep(plan: Plan, prefix: str, made: dict[int, Path]) -> dict[int, Path]:

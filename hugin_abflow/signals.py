@@ -7,12 +7,13 @@ import signal
 import sys
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from types import FrameType
 
 _NAMES = ("SIGINT", "SIGTERM", "SIGHUP")  # Windows has no SIGHUP
 _ENDING = [getattr(signal, name) for name in _NAMES if hasattr(signal, name)]
+_installed: dict[int, Callable[[int, FrameType | None], None]] = {}  # while `interruptible`
 
 
 @contextmanager
@@ -34,43 +35,49 @@ def interruptible() -> Iterator[None]:
     # What is ignored stays ignored: that is how nohup works.
     before = {number: signal.getsignal(number) for number in _ENDING}
     changed = [number for number in _ENDING if before[number] is not signal.SIG_IGN]
-    for number in changed:
-        signal.signal(number, interrupt)
+    _installed.update(dict.fromkeys(changed, interrupt))
+    _install()
     try:
         yield
     finally:
+        _installed.clear()
         for number in changed:
             signal.signal(number, before[number])
 
 
 @contextmanager
 def held() -> Iterator[None]:
-    """Have drivers of OpenCL set themselves up, or compile, with nothing to interrupt it; signals come after.
+    """Let drivers of OpenCL set themselves up, or compile, and what they start not get these signals.
 
-    A shell sends Ctrl-C to all that a program has started. PoCL ends us where its linker is ended: what is
-    started meanwhile, by threads that are started meanwhile too, never gets these signals.
+    A shell sends Ctrl-C to all that a program has started, and PoCL ends us where its linker is ended. This
+    thread and those that are started meanwhile hold signals back, and so does whatever these start. Other
+    threads may still get them: Python then raises what it has to between two calls of the driver.
 
     LLVM, in PoCL and others, puts handlers in place of Python's. At the first signal they give way to the
     system's for a moment, in which a second one, as of `timeout`, would end us with nothing tidied up. After
-    this Python's handlers are in place again, and LLVM does not repeat it.
+    this those of `interruptible` are in place again, and LLVM does not repeat it. Handlers of programs that
+    use us as a library are theirs.
     """
     if os.name == "nt":
         yield
         return
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, _ENDING)
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, ())
     try:
+        signal.pthread_sigmask(signal.SIG_BLOCK, _ENDING)  # may raise when it is done
         yield
     finally:
         try:
-            _reinstall()
+            if threading.current_thread() is threading.main_thread():
+                _install()
         finally:
-            signal.pthread_sigmask(signal.SIG_SETMASK, before)
+            try:
+                signal.pthread_sigmask(signal.SIG_SETMASK, before)
+            except BaseException:  # Python told of one that another thread got, with nothing done yet
+                signal.pthread_sigmask(signal.SIG_SETMASK, before)
+                raise
 
 
-def _reinstall() -> None:
-    """Put Python's handlers in place, which it believes they are; only its main thread may."""
-    if threading.current_thread() is threading.main_thread():
-        for number in _ENDING:
-            handler = signal.getsignal(number)
-            if handler is not None:  # set by somebody else, before Python was started
-                signal.signal(number, handler)
+def _install() -> None:
+    """Put the handlers of `interruptible` in place."""
+    for number, handler in _installed.items():
+        signal.signal(number, handler)

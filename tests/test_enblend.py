@@ -248,6 +248,8 @@ def test_canvases_that_disagree(layers: list[str], capsys: pytest.CaptureFixture
     assert "canvas of 180x90" in message and "other.tif" in message and "360x180" in message
     assert run("-f200x90", *layers) == 1
     assert "-f 200x90+0+0 reaches beyond the canvas of 180x90" in capsys.readouterr().err
+    assert run("-f180x80+0+20", *layers) == 1
+    assert "-f 180x80+0+20 reaches beyond the canvas of 180x90" in capsys.readouterr().err
 
 
 def test_layer_beyond_the_canvas(layers: list[str], capsys: pytest.CaptureFixture[str]) -> None:

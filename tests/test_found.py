@@ -20,8 +20,10 @@ from hugin_abflow.errors import (
 )
 from hugin_abflow.found import find_layers
 from hugin_abflow.images import write_image
+from hugin_abflow.merge import merge_project
 from hugin_abflow.nona import open_layers
 from hugin_abflow.project import read_plan
+from hugin_abflow.settings import Settings
 
 pytestmark = pytest.mark.usefixtures("temporary")
 
@@ -182,25 +184,54 @@ def test_layers_of_a_run_that_was_broken_off_are_made_again(
     assert find_layers(plan, "auto") is None
     with open_layers(plan) as layers:
         assert all(temporary in layer.file.parents for layer in layers)
-    assert "layers are made again" in caplog.text and f"{prefix}0001.tif" in caplog.text
+    assert "cannot be read: all layers are made again" in caplog.text and f"{prefix}0001.tif" in caplog.text
     assert cut.read_bytes() == whole[:left]
     with open_layers(plan, keep_layers=True):
         pass
     assert find_layers(plan, "auto") == "pano"
 
 
-def test_whole_layers_go_before_broken_ones(make_project, nona, monkeypatch):
+@pytest.mark.parametrize("fault", ["broken", "stale"])
+def test_whole_and_fresh_layers_go_before_others(make_project, nona, monkeypatch, fault):
     plan = read_plan(make_project())
     remap(plan, "pano")
     remap(plan, "photo 0 - photo 2")
-    (plan.folder / "pano0001.tif").write_bytes(b"")
+    if fault == "broken":
+        (plan.folder / "pano0001.tif").write_bytes(b"")
+    else:
+        age(plan.folder / "pano0001.tif", 60)
     monkeypatch.setattr(program, "_run", refuse)
+    assert find_layers(plan, "auto") == "photo 0 - photo 2"
     with open_layers(plan) as layers:
         assert names_of(layers)[1] == "photo 0 - photo 20001.tif"
 
 
+def test_whole_layers_go_before_complete_ones(make_project, nona):
+    """One that is missing costs less to make than all."""
+    plan = read_plan(make_project())
+    remap(plan, "pano")
+    remap(plan, "photo 0 - photo 2")
+    (plan.folder / "pano0001.tif").write_bytes(b"")
+    (plan.folder / "photo 0 - photo 20002.tif").unlink()
+    assert find_layers(plan, "auto") is None
+    with open_layers(plan) as layers:
+        assert [layer.file.parent == plan.folder for layer in layers] == [True, True, False]
+
+
+def test_layers_that_are_there_are_never_replaced_by_the_panorama(make_project, nona):
+    """As nona's file of many pages, which has the panorama's name, where it is no longer whole."""
+    plan = read_plan(make_project())
+    remap(plan, "pano", "-m", "TIFF_multilayer")
+    pages = plan.folder / "pano.tif"
+    for left in (pages.read_bytes(), pages.read_bytes()[:-200]):
+        pages.write_bytes(left)
+        age(pages, 60)
+        assert merge_project(plan.file, Settings(flow=False)).name.startswith("pano_abflow")
+        assert pages.read_bytes() == left
+
+
 @pytest.mark.parametrize("without", ["photo", "nona"])
-def test_broken_layers_that_cannot_be_made_again_are_told(make_project, nona, monkeypatch, without):
+def test_broken_layers_that_cannot_be_made_again_are_told(make_project, nona, monkeypatch, caplog, without):
     plan = read_plan(make_project())
     remap(plan, "pano")
     (plan.folder / "pano0001.tif").write_bytes(b"")
@@ -208,8 +239,10 @@ def test_broken_layers_that_cannot_be_made_again_are_told(make_project, nona, mo
         plan.images[2].photo.unlink()
     else:
         monkeypatch.setenv("PATH", "")
+    age(plan.folder / "pano0001.tif", 60)
     with pytest.raises(ImageReadError, match=r"pano0001\.tif cannot be read"), open_layers(plan):
         pass
+    assert not caplog.text  # they are not "used as they are"
 
 
 @pytest.mark.parametrize("older, stale", [(1.0, False), (3.0, True)])

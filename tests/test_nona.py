@@ -22,6 +22,7 @@ from hugin_abflow.errors import (
     LayersMismatchError,
     NonaFailedError,
     NonaMissingError,
+    OutputError,
     PhotoMissingError,
 )
 from hugin_abflow.images import read_layers, write_image
@@ -221,6 +222,13 @@ def test_project_whose_name_is_not_utf8(make_project, nona):
     with open_layers(plan) as layers:
         assert names_of(layers) == [f"p?n?{index:04d}.tif" for index in range(3)]
         pixels_of(layers)
+    before = sorted(plan.folder.iterdir())
+    with (
+        pytest.raises(OutputError, match=r"not valid UTF-8.*--keep-layers"),
+        open_layers(plan, keep_layers=True),
+    ):
+        pass
+    assert sorted(plan.folder.iterdir()) == before
 
 
 def test_photo_that_was_cut_is_told(make_project, nona, caplog):

@@ -102,13 +102,30 @@ def test_memory_is_reckoned_for_charts_as_fine_as_they_get(monkeypatch: pytest.M
     few, fast, same, best = reckoned
     assert 0 <= same - few < 2 and best - same == pytest.approx(4 * (fast - few), abs=8)
     assert fast - few > 20
-    between = int((fast + best) / 2 * (1 << 20))
-    with pytest.raises(SettingsError, match=r"give \S+, or choose --flow-quality fast"):
-        merged(layers(61), CANVAS, flow_quality="best", working_pixels=45_451, max_memory=between)
     monkeypatch.setattr(joint, "_FOUND_BYTES", 10_000)
     with pytest.raises(SettingsError, match=r"take?s? about \S+ MiB") as told:
         merged(layers(61), CANVAS, flow_quality="fast", working_pixels=45_451, max_memory=1 << 20)
     assert float(str(told.value).split("about ")[1].split()[0]) > fast
+
+
+@pytest.mark.usefixtures(small.__name__)
+@pytest.mark.parametrize("name", ["normal", "best"])
+def test_less_quality_is_advised_where_that_would_do(monkeypatch: pytest.MonkeyPatch, name: str) -> None:
+    """Where `fast` itself is not refused."""
+    monkeypatch.setattr(joint.memory, "resident", lambda: 0)
+    monkeypatch.setattr(joint, "_SOLVER_BYTES", 20_000)
+    least = {}
+    for one in ("fast", name):
+        with pytest.raises(SettingsError, match="about") as told:
+            merged(layers(61), CANVAS, flow_quality=one, working_pixels=45_451, max_memory=1 << 20)
+        least[one] = float(str(told.value).split("about ")[1].split()[0])
+    assert least[name] > 1.2 * least["fast"]
+    for share, advised in ((0.9, False), (1.1, True)):
+        limit = int(share * least["fast"] * (1 << 20))
+        with pytest.raises(SettingsError, match=r"give \d+\w") as told:
+            merged(layers(61), CANVAS, flow_quality=name, working_pixels=45_451, max_memory=limit)
+        assert str(told.value).endswith(", or choose --flow-quality fast") == advised
+    assert merged(layers(61), CANVAS, flow_quality="fast", working_pixels=45_451, max_memory=limit).any()
 
 
 @pytest.mark.usefixtures(small.__name__)

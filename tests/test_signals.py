@@ -16,6 +16,7 @@ import pyopencl as cl
 import pytest
 
 from hugin_abflow import signals
+from hugin_abflow.devices import list_devices
 from hugin_abflow.opencl import Device
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="drivers are looked at by Linux's means")
@@ -52,18 +53,66 @@ def test_signals_come_after() -> None:
     assert sorted(came) == sorted(ENDING)
 
 
-def test_handlers_of_others_go() -> None:
-    """As LLVM's, which take one signal only."""
+def set_beside_python(number: int) -> int:
+    """Set a handler as LLVM does, of which Python does not know; its address."""
     system = ctypes.CDLL(None)
     system.signal.argtypes, system.signal.restype = (ctypes.c_int, ctypes.c_void_p), ctypes.c_void_p
-    ours = handler_of(signal.SIGINT)
-    ignored = signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    address = ctypes.cast(system.abort, ctypes.c_void_p)
+    system.signal(number, address)
+    return int(address.value or 0)
+
+
+def test_handlers_of_drivers_give_way_to_those_of_a_run() -> None:
+    signal.signal(signal.SIGHUP, signal.SIG_IGN)  # nohup
+    signal.signal(signal.SIGTERM, signal.SIG_DFL)
+    with signals.interruptible():
+        ours = [handler_of(number) for number in ENDING]
+        with signals.held():
+            theirs = [set_beside_python(number) for number in ENDING]
+            assert [handler_of(number) for number in ENDING] == theirs
+        assert [handler_of(number) for number in ENDING[:2]] == ours[:2]
+        with pytest.raises(KeyboardInterrupt):
+            signal.raise_signal(signal.SIGTERM)
+    assert handler_of(signal.SIGTERM) == signal.SIG_DFL
+
+
+def test_handlers_of_programs_that_use_the_library_stay() -> None:
+    theirs = [set_beside_python(number) for number in ENDING]
     with signals.held():
-        for number in ENDING:
-            system.signal(number, ctypes.cast(system.abort, ctypes.c_void_p))
-        assert handler_of(signal.SIGINT) != ours
-    assert handler_of(signal.SIGINT) == ours
-    assert handler_of(signal.SIGHUP) == signal.SIG_IGN != ignored
+        pass
+    assert [handler_of(number) for number in ENDING] == theirs
+
+
+def test_nothing_stays_held_back() -> None:
+    """Where a signal that came before is told when they begin to be held, and when they no longer are."""
+    code = """
+import os, signal, threading, time
+from hugin_abflow import signals
+def interrupt(number, frame):
+    if armed:
+        armed.clear()
+        raise KeyboardInterrupt
+def bother():
+    for _ in range(300):
+        time.sleep(0.001)
+        os.kill(os.getpid(), signal.SIGINT)
+    done.append(True)
+armed, done, caught = [], [], 0
+signal.signal(signal.SIGINT, interrupt)
+threading.Thread(target=bother).start()
+while not done:
+    try:
+        armed.append(True)
+        while not done:
+            with signals.held():
+                pass
+    except KeyboardInterrupt:
+        caught += 1
+    assert not signal.pthread_sigmask(signal.SIG_BLOCK, ()), caught
+print(caught)
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60)
+    assert int(done.stdout) > 30, done.stderr
 
 
 def test_other_threads_may_hold_them_too() -> None:
@@ -95,6 +144,8 @@ def test_they_are_held_whatever_a_driver_does_with_them(monkeypatch: pytest.Monk
         return original(*arguments, **keywords)
 
     monkeypatch.setattr(cl, what, observed)
+    if what == "get_platforms":
+        list_devices()
     Device().build("pyramid")
     assert masks and all(mask >= set(ENDING) for mask in masks)
     assert not signal.pthread_sigmask(signal.SIG_BLOCK, ()) & set(ENDING)
