@@ -111,9 +111,8 @@ def _expand(graph: Graph, labels: Labels, label: int, free: npt.NDArray[np.bool_
     nodes = np.flatnonzero(free)
     if not nodes.size:
         return labels
-    count = nodes.size
     number = np.full(labels.size, -1)
-    number[nodes] = np.arange(count)
+    number[nodes] = np.arange(nodes.size)
     linked = free[graph.first] | free[graph.second]
     first, second, cut = graph.first[linked], graph.second[linked], graph.cut[linked]
     # what a link costs now, and where only one of its nodes takes the label; where both do, nothing
@@ -126,19 +125,35 @@ def _expand(graph: Graph, labels: Labels, label: int, free: npt.NDArray[np.bool_
     edge = (only_second + only_first - now)[both]
     must = graph.possible[label, nodes] & ~graph.possible[labels[nodes], nodes]
     own = np.where(must, 0, take[nodes])
+    result = labels.copy()
+    result[nodes[_taking(number[first[both]], number[second[both]], edge, own, must)]] = label
+    return result
+
+
+def _taking(
+    first: npt.NDArray[np.intp],
+    second: npt.NDArray[np.intp],
+    edge: npt.NDArray[np.float64],
+    own: npt.NDArray[np.float64],
+    must: npt.NDArray[np.bool_],
+) -> npt.NDArray[np.bool_]:
+    """Which nodes take a label, by a minimal cut between those that do and those that keep theirs.
+
+    edge        (links,): price where the first of a link keeps its label and the second takes the other.
+    own         (nodes,): price of taking it over that of keeping.
+    must        (nodes,): it has to be taken, whatever that costs.
+    """
+    count = own.size
     unit = min(_UNIT, _MOST / max(np.abs(own).max(), edge.max(initial=0), 1))
     source, sink, each = count, count + 1, np.arange(count)
-    starts = np.concatenate([number[first[both]], np.full(count, source), each])
-    ends = np.concatenate([number[second[both]], each, np.full(count, sink)])
+    starts = np.concatenate([first, np.full(count, source), each])
+    ends = np.concatenate([second, each, np.full(count, sink)])
     capacities = np.concatenate([edge * unit, np.maximum(own * unit, 0), np.where(must, _MUST, -own * unit)])
     whole = np.maximum(np.rint(capacities), 0).astype(np.int32)
     network = scipy.sparse.csr_array((whole, (starts, ends)), shape=(count + 2, count + 2))
     left = network - scipy.sparse.csgraph.maximum_flow(network, source, sink).flow
-    left.data = np.maximum(left.data, 0)
     left.eliminate_zeros()
     keeps = scipy.sparse.csgraph.breadth_first_order(left, source, return_predecessors=False)
     takes = np.ones(count + 2, bool)
     takes[keeps] = False
-    result = labels.copy()
-    result[nodes[takes[:count]]] = label
-    return result
+    return takes[:count]
