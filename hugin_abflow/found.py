@@ -96,8 +96,8 @@ def _is_multilayer(path: Path) -> bool:
         return False
 
 
-def find(plan: Plan) -> Found | None:
-    """Layers under the project's stem or Hugin's default prefix; whole, complete and fresh ones first."""
+def candidates(plan: Plan) -> list[Found]:
+    """Layers under the project's stem and under Hugin's default prefix, in this order."""
     other = plan.folder / f"{plan.hugin_prefix}.pto"  # layers of its name are its own
     shared = not other.is_file() or other.samefile(plan.file)
     stems = [plan.stem, plan.hugin_prefix] if shared else [plan.stem]
@@ -106,9 +106,15 @@ def find(plan: Plan) -> Found | None:
     found = [layers for name in names if (layers := _find_under(plan, str(plan.folder / name)))]
     if plan.hdr:  # what is linear; layers of the other panorama may lie there too
         found = [layers for layers in found if all(path.suffix == ".exr" for path in layers.in_order())]
-    return min(
-        found, key=lambda f: (bool(f.broken), bool(f.missing(plan)), bool(f.stale(plan))), default=None
-    )
+    return found
+
+
+def find(plan: Plan) -> Found | None:
+    """The best of the candidates: whole, complete and fresh ones first."""
+    found = candidates(plan)
+    if len(found) < 2:  # then it need not be looked into
+        return found[0] if found else None
+    return min(found, key=lambda f: (bool(f.broken), bool(f.missing(plan)), bool(f.stale(plan))))
 
 
 def layers_there(

@@ -18,7 +18,7 @@ from hugin_abflow import joint, sequential
 from hugin_abflow.devices import choose
 from hugin_abflow.errors import LayersMissingError, OutputError
 from hugin_abflow.exif import Metadata
-from hugin_abflow.found import Remap, layers_there
+from hugin_abflow.found import Remap, candidates
 from hugin_abflow.guides import Guide
 from hugin_abflow.images import ENDINGS, ImageWriter, check_target, use_threads
 from hugin_abflow.kept import in_use, kept_device
@@ -235,7 +235,8 @@ def _target(plan: Plan, layers: Sequence[Layer], output: Path | str | None) -> P
     """The panorama's file, which must be none of the inputs."""
     inputs = [layer.file for layer in layers if layer.file is not None]
     if output is None:  # layers that are there stay, also where they were made again
-        return plan.default_output([*inputs, *layers_there(plan, None, None, "auto")])
+        there = [file for found in candidates(plan) for file in found.in_order()]
+        return plan.default_output([*inputs, *there])
     refuse_input(Path(output), inputs)
     return Path(output)
 

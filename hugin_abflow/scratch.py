@@ -72,6 +72,18 @@ def part_beside(final: Path, suffix: str | None = None) -> Iterator[Path]:
             os.close(descriptor)
 
 
+def write_whole(final: Path, data: bytes) -> None:
+    """Write a file, which is replaced by the complete new one or not at all, and keeps its permissions.
+
+    Raises OSError.
+    """
+    with part_beside(final, ".part") as part:
+        part.write_bytes(data)
+        if final.exists():
+            shutil.copymode(final, part)
+        part.replace(final)
+
+
 def _create(final: Path, suffix: str) -> tuple[Path, int | None]:
     """A file that is in use until the descriptor is closed; Windows needs none."""
     while True:

@@ -131,6 +131,7 @@ def _canvas(layers: Sequence[Layer], crop: Box | None, wraps: bool) -> Canvas:
     wide as high is the whole sphere: no other projection is used for that.
     """
     bounds = bounding_box(layers)
+    shown = crop or bounds
     sizes = {layer.canvas_size: layer for layer in layers if layer.canvas_size}
     if len(sizes) > 1:
         (one, first), (other, second) = list(sizes.items())[:2]
@@ -139,8 +140,8 @@ def _canvas(layers: Sequence[Layer], crop: Box | None, wraps: bool) -> Canvas:
             f"{other[0]}x{other[1]}; name the layers of one panorama"
         )
     width, height = next(iter(sizes), None) or (
-        max(bounds.right, crop.right if crop else 0),
-        max(bounds.bottom, crop.bottom if crop else 0),
+        max(bounds.right, shown.right),
+        max(bounds.bottom, shown.bottom),
     )
     if crop and (crop.right > width or crop.bottom > height):
         raise LayersMismatchError(
@@ -150,4 +151,4 @@ def _canvas(layers: Sequence[Layer], crop: Box | None, wraps: bool) -> Canvas:
     whole = (
         Canvas.sphere(width, height) if wraps and width == 2 * height else Canvas.plane(width, height, wraps)
     )
-    return replace(whole, crop=crop or bounds)
+    return replace(whole, crop=shown)

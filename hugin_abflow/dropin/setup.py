@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import shutil
 from collections.abc import Sequence
 from importlib import resources
 from pathlib import Path, PureWindowsPath
@@ -12,7 +11,7 @@ from hugin_abflow.dropin import wxconfig
 from hugin_abflow.dropin.places import Places, our_places, program
 from hugin_abflow.errors import ExitCode, SetupError
 from hugin_abflow.metadata import version
-from hugin_abflow.scratch import part_beside
+from hugin_abflow.scratch import write_whole
 from hugin_abflow.terminal import catching, print_result
 
 NAME = "hugin-abflow-setup"
@@ -147,11 +146,7 @@ def _write(path: Path, content: str, dry_run: bool) -> list[str]:
     if not dry_run:
         try:
             final.parent.mkdir(parents=True, exist_ok=True)
-            with part_beside(final, ".part") as part:
-                part.write_bytes(content.encode("utf-8", "surrogateescape"))
-                if final.exists():
-                    shutil.copymode(final, part)
-                part.replace(final)
+            write_whole(final, content.encode("utf-8", "surrogateescape"))
         except OSError as error:
             raise SetupError(
                 f"{path} cannot be written: {error.strerror}; allow writing there, then try again"

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import shutil
 from pathlib import Path
 
 from hugin_abflow.errors import OutputError
 from hugin_abflow.pto.model import Project
-from hugin_abflow.scratch import part_beside
+from hugin_abflow.scratch import write_whole
 
 
 def dumps(project: Project) -> bytes:
@@ -27,12 +26,7 @@ def dump(project: Project, path: str | Path) -> None:
     """
     data = dumps(project)
     try:
-        target = Path(path).resolve()  # a link stays a link
-        with part_beside(target, ".part") as part:
-            part.write_bytes(data)
-            if target.exists():
-                shutil.copymode(target, part)
-            part.replace(target)
+        write_whole(Path(path).resolve(), data)  # a link stays a link
     except (OSError, ValueError) as error:  # ValueError: a name that no file can have
         reason = getattr(error, "strerror", None) or error
         raise OutputError(f"{path}: cannot be written ({reason}); check folder and permissions") from error
