@@ -38,6 +38,9 @@ _WHOLE_STRIP = 2 << 20
 _QUARTER_LEVEL = {np.dtype(np.uint8): 0.25 / 255}
 _QUARTER_FINE_LEVEL = 0.25 / 65535
 
+# Build options of what goes over coarse arrays, of floats whatever the layers are.
+_OF_COARSE = "-DPIXEL=float -DSAMPLES=4 -DWHITE=1.0f -DINTEGER=0 -DPIXELS=2"
+
 # A row of the table of layers: `blend_layer` of kernels/blend.cl.
 _LAYER = np.dtype(
     [
@@ -159,6 +162,20 @@ def _pass_memory(layers: Sequence[BlendLayer], plan: Sequence[_Band], scale: flo
     return shelves.total * pixel + fresh * pixel + 4 * out + slices
 
 
+def option_sets(device: Device, first: Layer) -> tuple[str, str]:
+    """Build options of what makes the panorama's pixels, which are as the first layer's, and of what goes
+    over coarse arrays before.
+    """
+    pixel, white = pixel_options(first)
+    integer, together = int(first.dtype.kind == "u"), _together(device)
+    return f"{pixel} -DWHITE={white:.1f}f -DINTEGER={integer} -DPIXELS={together}", _OF_COARSE
+
+
+def _together(device: Device) -> int:
+    """How many pixels of a row are made together."""
+    return 4 if device.has_long_vectors else 2
+
+
 def _bands(
     device: Device,
     layers: Sequence[BlendLayer],
@@ -173,9 +190,7 @@ def _bands(
 ) -> Iterator[npt.NDArray[Any]]:
     """Bands of `height` rows."""
     region, first = full.region, layers[0].layer
-    pixel, white = pixel_options(first)
-    together = 4 if device.has_long_vectors else 2  # pixels
-    options = f"{pixel} -DWHITE={white:.1f}f -DINTEGER={int(first.dtype.kind == 'u')} -DPIXELS={together}"
+    together, options = _together(device), option_sets(device, first)[0]
     share = _QUARTER_LEVEL.get(first.dtype, _QUARTER_FINE_LEVEL)
     whole = (0, 0, gain_grid.width, gain_grid.height)
     fields = [(layer.box, layer.field) for layer in layers]
@@ -268,7 +283,7 @@ def _hide(
     run = 0, first, grid.width, last - first
     device.run(
         "blend", "blend_hide", run[2:], ways, device.upload(places), len(places), run, share,
-        options="-DPIXEL=float -DSAMPLES=4 -DWHITE=1.0f -DINTEGER=0 -DPIXELS=2",
+        options=_OF_COARSE,
     )  # fmt: skip
 
 

@@ -52,6 +52,11 @@ _PLANES = 22
 _TOGETHER = 1 << 23
 
 
+def board_options(wraps: bool) -> str:
+    """Build options of kernels that go over a board, whose last column may be beside its first one."""
+    return f"-DWRAPS={int(wraps)}"
+
+
 @dataclass(frozen=True)
 class Board:
     """Linear systems of one grid with the flows that solve them, one for each way (kernels/common.cl).
@@ -82,7 +87,7 @@ class Board:
     @property
     def options(self) -> str:
         """Build options of kernels that go over the board."""
-        return f"-DWRAPS={self.grid[2]}"
+        return board_options(bool(self.grid[2]))
 
     def relax(self, device: Device, sweeps: int, relaxation: float) -> None:
         """Red-black sweeps."""

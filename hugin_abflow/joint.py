@@ -7,7 +7,7 @@ import logging
 import threading
 from collections import Counter
 from collections.abc import Callable, Generator, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from functools import partial
@@ -22,6 +22,7 @@ from hugin_abflow import (
     coefficient,
     colour,
     figures,
+    flow,
     geometry,
     highlights,
     memory,
@@ -149,28 +150,28 @@ def prepare(
     shared = [overlap for _, overlap in overlaps] if settings.flow else []
     charts = pairflow.charts(shared, masks.grid, grid, settings)
     fast = partial(_of_quality, "fast", full, shared, masks.grid, settings)
-    _check_memory(device, reduced, charts, grid, settings, fast)
+    abreast = _check_memory(device, reduced, charts, grid, settings, fast)
     its_guides = by_pair(guides if settings.guides else ())
     flows, shifts, singles = (
-        pairflow.solve(device, reduced, overlapping, charts, grid, progress, settings, its_guides, numbers)
+        pairflow.solve(
+            device, reduced, overlapping, charts, grid, progress, settings, its_guides, numbers, abreast
+        )
         if settings.flow
         else ([], [], [])
     )
     with progress("align", 1) as advance:
         once = single.on_canvas(singles, [flow.chart for flow in flows], seam.seam_grid(grid))
-        fields, correction, whole = _align(device, reduced, overlapping, flows, once, masks, grid, settings)
+        aligned = _align(device, reduced, overlapping, flows, once, masks, grid, settings)
         if _log.isEnabledFor(logging.INFO):
-            _tell_overlaps(reduced, overlaps, shifts, grid, whole)
+            _tell_overlaps(reduced, overlaps, shifts, grid, aligned.whole)
         del masks, overlaps, shared  # what comes takes the most memory
-        offsets = multiband.none(grid, len(reduced))
+        offsets, correction = multiband.none(grid, len(reduced)), aligned.correction
         if settings.exposure and overlapping:
-            offsets = multiband.offsets(device, reduced, fields, correction, grid, once)
+            offsets = multiband.offsets(device, reduced, aligned.fields, correction, grid, once)
         final = [
-            BlendLayer(
-                layer.layer, layer.box, field, geometry.reach(device, layer, field, grid), gain, offset
-            )
-            for layer, field, gain, offset in zip(
-                reduced, fields, correction.gains, offsets.layers, strict=True
+            BlendLayer(layer.layer, layer.box, field, reach, gain, offset)
+            for layer, field, reach, gain, offset in zip(
+                reduced, aligned.fields, aligned.reaches, correction.gains, offsets.layers, strict=True
             )
         ]
         advance(1)
@@ -183,12 +184,12 @@ def _making_ready(device: Device, first: Layer, settings: Settings) -> Iterator[
     """Load and build what comes after reading, meanwhile: it takes most of a second on one core, and several
     where kernels are compiled for the first time; no process that is to end waits for all of it.
     """
-    of_flow = ("chart", "pyramid", "flow", "search", "consistency", "relay", "transition")
-    flow = of_flow if settings.flow else ()
-    kernels = ("coefficient", "saturation", *flow, "highlights", "geometry", "colour", "seam", "multiband")
+    kernels = [("coefficient", "")]  # and with them all others that take no options
+    kernels += [("flow", flow.board_options(wraps=False))] if settings.flow else []
     libraries = ("scipy.ndimage", "scipy.sparse.csgraph", "scipy.sparse.linalg")
-    steps: list[Callable[[], object]] = [partial(device.build, name) for name in kernels]
+    steps: list[Callable[[], object]] = [partial(device.build, *one) for one in kernels]
     steps += [partial(importlib.import_module, name) for name in libraries]
+    steps += [partial(device.build, "blend", options) for options in blend.option_sets(device, first)]
     device.build("working", working.pixel_options(first)[0])  # else reading would wait for all the others
     done = threading.Event()
 
@@ -205,6 +206,20 @@ def _making_ready(device: Device, first: Layer, settings: Settings) -> Iterator[
         done.set()
 
 
+@dataclass(frozen=True)
+class _Aligned:
+    """Layers that agree.
+
+    fields      where each is sampled, and its weight. reaches: how far from there, by rows (geometry.py).
+    whole       where one layer was taken, on the seam grid; None: nowhere, or, without flow, everywhere.
+    """
+
+    fields: list[Buffer]
+    reaches: list[list[float]]
+    correction: Correction
+    whole: seam.Cells | None
+
+
 def _align(
     device: Device,
     layers: Sequence[WorkingLayer],
@@ -214,15 +229,12 @@ def _align(
     masks: Masks,
     grid: Grid,
     settings: Settings,
-) -> tuple[list[Buffer], Correction, npt.NDArray[np.bool_] | None]:
+) -> _Aligned:
     """Geometry and colour that make the layers agree, without flow cuts alone; where nothing does, one
-    layer whole. `flows` is emptied. The last is where one layer was taken, on the seam grid; None: nowhere,
-    or everywhere, if there is no flow.
+    layer whole. `flows` is emptied.
 
     What flow cannot explain spoils the exposure around it, which is found again without it.
     """
-    regions: npt.NDArray[np.bool_] | None = None
-    whole: npt.NDArray[np.bool_] | None = None
     settled = transition.wanted(flows, settings)
     coefficients = coefficient.coefficients(device, layers, masks, grid, even=settled)
     clipped = highlights.excess(device, layers, masks, grid, settings)
@@ -233,29 +245,38 @@ def _align(
     device.give_back()
     highlights.give_way(device, layers, fields, clipped, grid)
     measured = colour.measure(device, layers, fields, pairs, grid, masks.host)
-    correct = partial(colour.correction, device, measured)
-    # exposure explains a difference whether it is corrected or not
-    exposure = replace(settings, exposure=True)
-    for _ in range(_SEAM_ROUNDS if settings.seam else 0):
-        strict = correct(exposure, regions, strict=True)
-        device.give_back()
-        residual = seam.residuals(device, layers, fields, pairs, strict, grid)
-        found = seam.regions(residual, grid, aligned=settings.flow, once=once)
-        grown = found if regions is None else found | regions
-        if not grown.any() or (regions is not None and np.array_equal(grown, regions)):
-            break
-        regions = grown
-    if settings.seam and not settings.flow:
-        seam.divide(device, layers, fields, pairs, strict, masks, grid)
-        # what is not aligned tells little of exposures; bands of frequencies change over as they are
-        return fields, correct(replace(settings, exposure=False)), whole
-    elif regions is not None:
-        whole = regions
-        with ThreadPoolExecutor(1, "gains") as beside:  # solved on one core: the device cuts meanwhile
-            gains = beside.submit(correct, settings, regions)
-            seam.cut(device, layers, fields, residual, regions, masks, grid, once)
-            return fields, gains.result(), whole
-    return fields, correct(settings, regions), whole
+    with ThreadPoolExecutor(2, "gains") as solving:  # each on one core: the device goes on meanwhile
+
+        def correct(
+            how: Settings, ignored: seam.Cells | None = None, strict: bool = False
+        ) -> Future[Correction]:
+            return solving.submit(colour.correction, device, measured, how, ignored, strict)
+
+        # exposure explains a difference whether it is corrected or not
+        exposure, rounds = replace(settings, exposure=True), _SEAM_ROUNDS if settings.seam else 0
+        first = correct(exposure, strict=True) if rounds else None
+        # what the layers get, unless something is to be whole, which is rarely known before
+        last = correct(settings) if settings.flow and once is None and settings.cores > 1 else None
+        reaches = [geometry.reach(device, *one, grid) for one in zip(layers, fields, strict=True)]
+        whole: seam.Cells | None = None
+        for _ in range(rounds):
+            strict = (first or correct(exposure, whole, strict=True)).result()
+            first = None
+            device.give_back()
+            residual = seam.residuals(device, layers, fields, pairs, strict, grid)
+            found = seam.regions(residual, grid, aligned=settings.flow, once=once)
+            grown = found if whole is None else found | whole
+            if not grown.any() or (whole is not None and np.array_equal(grown, whole)):
+                break
+            whole = grown
+        if rounds and not settings.flow:
+            seam.divide(device, layers, fields, pairs, strict, masks, grid)
+            # what is not aligned tells little of exposures; bands of frequencies change over as they are
+            last, whole = correct(replace(settings, exposure=False)), None
+        elif whole is not None:
+            last = correct(settings, whole)
+            seam.cut(device, layers, fields, residual, whole, masks, grid, once)
+        return _Aligned(fields, reaches, (last or correct(settings)).result(), whole)
 
 
 def _tell_overlaps(
@@ -377,19 +398,23 @@ def _check_memory(
     grid: Grid,
     settings: Settings,
     fast: Callable[[], tuple[Sequence[Chart], Grid, Settings]],
-) -> None:
-    """Refuse a limit that is too low for the working canvas, which must not depend on it.
+) -> int:
+    """How many pairs' flow may be found at a time. A limit that is too low even for one is refused: the
+    working canvas must not depend on it.
 
     charts      on which flow is found; none if there is no flow.
     fast        gives charts, grid and settings of `--flow-quality fast`.
     """
     there = memory.resident() + device.own_memory + _LIBRARY_BYTES
     pixels = sum(layer.box[2] * layer.box[3] for layer in layers)
-    needed = there + _working_bytes(pixels, charts, grid, settings)
     limit = memory.limit(settings.max_memory)
+    for abreast in range(pairflow.most_abreast(settings), 0, -1):
+        needed = there + _working_bytes(pixels, charts, grid, settings, abreast)
+        if needed <= limit:
+            break
     _log.info("memory: about %s of %s at working resolution", memory.size(needed), memory.size(limit))
     if needed <= limit:
-        return
+        return abreast
     given, remedy = memory.shortage(settings.max_memory, needed)
     what = "whose flow takes" if settings.flow else "which take"
     said = f"{given} is too little for these layers, {what} about {memory.size(needed)}"
@@ -400,10 +425,16 @@ def _check_memory(
         would_do = there + _working_bytes(round(share * pixels), fewer, coarser, less) <= limit
         raise SettingsError(f"{said}; {remedy}{', or choose --flow-quality fast' if would_do else ''}")
     _log.warning("%s; going on with that", said)
+    return abreast
 
 
-def _working_bytes(pixels: int, charts: Sequence[Chart], grid: Grid, settings: Settings) -> int:
-    """What flow, and what is found from it, take at working resolution. pixels: of all layers."""
-    sizes = [chart.width * chart.height for chart in pairflow.finest(charts, grid, settings)]
-    at_last, meanwhile = _STEP_BYTES * pixels, _SOLVER_BYTES * max(sizes, default=0)
+def _working_bytes(
+    pixels: int, charts: Sequence[Chart], grid: Grid, settings: Settings, abreast: int = 1
+) -> int:
+    """What flow, and what is found from it, take at working resolution.
+
+    pixels: of all layers. abreast: how many pairs' flow is found at a time.
+    """
+    sizes = sorted(chart.width * chart.height for chart in pairflow.finest(charts, grid, settings))
+    at_last, meanwhile = _STEP_BYTES * pixels, _SOLVER_BYTES * sum(sizes[-abreast:])
     return max(_FLOW_BYTES * sum(sizes) + at_last, _FOUND_BYTES * sum(sizes) + meanwhile)

@@ -1,12 +1,10 @@
-"""The OpenCL device: build, run. With `devices` and `launch` the only module that uses pyopencl."""
+"""The OpenCL device: build, run. With `devices`, `lane` and `launch` the only module that uses pyopencl."""
 
 from __future__ import annotations
 
 import math
 import threading
-import time
 import warnings
-from collections import deque
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from functools import cache
@@ -21,7 +19,7 @@ import pyopencl as cl
 from hugin_abflow import launch, memory, pocl, signals, trace
 from hugin_abflow.devices import choose, kind_of, limited
 from hugin_abflow.errors import DeviceError
-from hugin_abflow.spare import Spare
+from hugin_abflow.lane import Lane, StoppedError
 
 # Work-group: rows suit both a GPU's wavefronts and the vector units of a CPU.
 _GROUP = 256
@@ -35,9 +33,20 @@ def _kernel_files() -> dict[str, str]:
     return {path.stem: path.read_text("utf-8") for path in folder.glob("*.cl")}
 
 
-def kernel_source(module: str) -> str:
+# These are built for a kind of pixels. All others are built at once: PoCL keeps what it has compiled, but
+# reads OpenCL's headers each time, which takes longer than all of ours.
+_OF_PIXELS = frozenset({"blend", "working"})
+
+
+def kernel_source(*modules: str) -> str:
     """Source of ``kernels/<module>.cl`` with common.cl in front; #line keeps messages true."""
-    return "".join(f'#line 1 "{name}.cl"\n{_kernel_files()[name]}\n' for name in ("common", module))
+    return "".join(f'#line 1 "{name}.cl"\n{_kernel_files()[name]}\n' for name in ("common", *modules))
+
+
+def _together(module: str, options: str) -> tuple[str, ...]:
+    """The modules that are built with this one."""
+    others = sorted(_kernel_files().keys() - _OF_PIXELS - {"common"})
+    return tuple(others) if module in others and not options else (module,)
 
 
 class DeviceMemoryError(DeviceError):
@@ -66,13 +75,16 @@ def _device_errors(doing: str) -> Iterator[None]:
 
 
 class Buffer:
-    """An array on the device: shape and dtype with a `cl.Buffer`. Freed with the object."""
+    """An array on the device: shape and dtype with a `cl.Buffer`. Freed with the object.
+
+    lane    where it was used last: what is done there afterwards may have its memory.
+    """
 
     def __init__(self, device: Device, shape: tuple[int, ...], dtype: npt.DTypeLike) -> None:
         self.shape, self.dtype = shape, np.dtype(dtype)
         self.nbytes = math.prod(map(int, shape)) * self.dtype.itemsize
-        self._device = device
-        self.data = device.spare.take(self.nbytes)
+        self._device, self.lane = device, device.current
+        self.data = self.lane.spare.take(self.nbytes)
         if self.data is None:
             with _device_errors(f"allocating {self.nbytes} bytes"):
                 self.data = cl.Buffer(device.context, cl.mem_flags.READ_WRITE, max(self.nbytes, 16))
@@ -80,11 +92,12 @@ class Buffer:
 
     def __del__(self) -> None:
         if getattr(self, "data", None) is not None:  # else there was no room for it
-            self._device.spare.keep(self.nbytes, self.data)
+            self.lane.spare.keep(self.nbytes, self.data)
 
     def _transfer(self, name: str, *places: Any, **offsets: int) -> None:
         """Copy between arrays, the target first."""
-        self._device.timed(name, trace.TRANSFER, cl.enqueue_copy(self._device.queue, *places, **offsets))
+        self.lane = self._device.current
+        self.lane.timed(name, trace.TRANSFER, cl.enqueue_copy(self.lane.queue, *places, **offsets))
 
     def get(self) -> npt.NDArray[Any]:
         """Copy to the host."""
@@ -92,7 +105,7 @@ class Buffer:
         if host.size:
             with _device_errors("copying to the host"):
                 self._transfer("download", host, self.data)
-            self._device.tell_times()
+            self.lane.tell_times()
         return host
 
     def set(self, host: npt.NDArray[Any]) -> Buffer:
@@ -112,6 +125,7 @@ class Buffer:
     def copy(self, start: int, source: Buffer, first: int, count: int) -> None:
         """Copy `count` pixels of another buffer, from its `first` on, to this one's from `start` on."""
         if count:
+            source.lane = self._device.current
             with _device_errors("copying on the device"):
                 self._transfer(
                     "copy", self.data, source.data, byte_count=count * self._pixel,
@@ -127,41 +141,10 @@ class Buffer:
         """Set every element."""
         if self.nbytes:
             pattern = np.array(value, self.dtype)
+            self.lane = self._device.current
             with _device_errors("filling a buffer"):
-                cl.enqueue_fill_buffer(self._device.queue, self.data, pattern, 0, self.nbytes)
+                cl.enqueue_fill_buffer(self.lane.queue, self.data, pattern, 0, self.nbytes)
         return self
-
-
-class _Times:
-    """When the device did what; its queue does one thing after the other."""
-
-    def __init__(self, queue: cl.CommandQueue) -> None:
-        self._events: deque[tuple[str, str, cl.Event]] = deque()
-        self._lock = threading.Lock()
-        # its clock to ours: the least of several, for we may be told late
-        self._offset = min(self._lag(queue) for _ in range(8))
-
-    @staticmethod
-    def _lag(queue: cl.CommandQueue) -> float:
-        """Seconds from the end of an event on the device's clock to now on ours."""
-        event = cl.enqueue_fill_buffer(queue, cl.Buffer(queue.context, 0, 16), np.int32(0), 0, 16)
-        event.wait()
-        return time.perf_counter() - float(event.profile.end) * 1e-9
-
-    def add(self, name: str, kind: str, event: cl.Event) -> None:
-        """Have the trace told when this was done, later."""
-        self._events.append((name, kind, event))
-        if kind == trace.TRANSFER:
-            self.tell()  # at once: the event keeps the host's array
-
-    def tell(self) -> None:
-        """Tell the trace what is done."""
-        complete = cl.command_execution_status.COMPLETE
-        with self._lock:
-            while self._events and self._events[0][2].command_execution_status == complete:
-                name, kind, event = self._events.popleft()
-                start, end = (self._offset + ns * 1e-9 for ns in (event.profile.start, event.profile.end))
-                trace.add(name, kind, start, end, "device")
 
 
 class Device:
@@ -174,16 +157,16 @@ class Device:
     """
 
     def __init__(self, wanted: str | None = None, threads: int = 0) -> None:
-        timing = cl.command_queue_properties.PROFILING_ENABLE if trace.is_recording() else 0
         with signals.held():  # the driver starts its threads, from which PoCL starts its linker
             chosen = choose(wanted, threads)
             pocl.name_processor(chosen.version, chosen.int_ptr)
             self.device = limited(chosen, threads)
             self.context = cl.Context([self.device])
-            self.queue = cl.CommandQueue(self.context, properties=timing)
-        self._times = _Times(self.queue) if timing else None
+            self._timing = trace.is_recording()
+            self._first = Lane(self.context, 1, self._timing)
+        self._lanes = [self._first]
+        self._free, self._entering, self._entered = list[Lane](), threading.Lock(), threading.local()
         self.buffers: WeakSet[Buffer] = WeakSet()
-        self.spare = Spare()
         self._kernels: dict[tuple[str, str], dict[str, cl.Kernel]] = {}
         self._programs: dict[tuple[str, str], cl.Program] = {}  # Intel's driver does not keep a kernel's own
         self._building = threading.Lock()
@@ -210,6 +193,34 @@ class Device:
     def kind(self) -> str:
         """ "GPU", "CPU" or "other"."""
         return kind_of(self.device)
+
+    @property
+    def current(self) -> Lane:
+        """The lane of this thread: the first one, unless it entered another."""
+        lane: Lane = getattr(self._entered, "lane", self._first)
+        return lane
+
+    @contextmanager
+    def lane(self, stopped: threading.Event) -> Iterator[None]:
+        """Have what this thread starts done beside what others start, and done at the end of the block.
+
+        Until then no other thread may use what it makes, nor it what others are not done with.
+        stopped: from when this is set on, starting anything raises `StoppedError`.
+        """
+        with self._entering, signals.held(), _device_errors("starting another queue"):
+            if not self._free:
+                self._free.append(Lane(self.context, len(self._lanes) + 1, self._timing))
+                self._lanes.append(self._free[-1])
+            lane = self._free.pop()
+        lane.stopped, self._entered.lane = stopped, lane
+        try:
+            yield
+        finally:
+            try:
+                self.finish()
+            finally:
+                del self._entered.lane
+                self._free.append(lane)
 
     def empty(self, shape: Sequence[int], dtype: npt.DTypeLike = np.float32) -> Buffer:
         """An uninitialised array."""
@@ -239,27 +250,29 @@ class Device:
         key = module, options
         if key not in self._kernels:  # what is built does not wait for what is being built
             with self._building:
-                self._kernels[key] = self._kernels.get(key) or self._build(module, options)
+                if key not in self._kernels:
+                    modules = _together(module, options)
+                    kernels = self._build(modules, options)
+                    self._kernels |= {(one, options): kernels for one in modules}
         return self._kernels[key]
 
-    def _build(self, module: str, options: str) -> dict[str, cl.Kernel]:
+    def _build(self, modules: Sequence[str], options: str) -> dict[str, cl.Kernel]:
+        files = f"kernels/{modules[0]}.cl" if len(modules) == 1 else "kernels/*.cl"
         try:
             # compilers chat; errors come with the exception
             with warnings.catch_warnings(), signals.held():
                 warnings.simplefilter("ignore", cl.CompilerWarning)
-                program = cl.Program(self.context, kernel_source(module))
+                program = cl.Program(self.context, kernel_source(*modules))
                 program.build(["-cl-std=CL1.2", *options.split()])
         except cl.Error as error:
             raise DeviceError(
-                f"kernels/{module}.cl does not build on {self.device.name.strip()}: {error}; "
+                f"{files} does not build on {self.device.name.strip()}: {error}; "
                 "update the OpenCL driver or choose another --device"
             ) from error
-        self._programs[module, options] = program
+        self._programs |= {(one, options): program for one in modules}
         kernels = {kernel.function_name: kernel for kernel in program.all_kernels()}
         if not kernels:  # some drivers call that a success
-            raise DeviceError(
-                f"kernels/{module}.cl has no kernels for {self.device.name.strip()}; use another --device"
-            )
+            raise DeviceError(f"{files} has no kernels for {self.device.name.strip()}; use another --device")
         return kernels
 
     def run(
@@ -279,11 +292,12 @@ class Device:
         """
         if min(size) <= 0:
             return
+        lane = self._started()
         with self._arguments, _device_errors(f"running {name}"):
             kernel = self.kernel(module, name, options)
-            launch.set_arguments(kernel, _values(args))
-            event = cl.enqueue_nd_range_kernel(self.queue, kernel, *launch.work_groups(size, group))
-        self.timed(name, trace.KERNEL, event)
+            launch.set_arguments(kernel, _values(args, lane))
+            event = cl.enqueue_nd_range_kernel(lane.queue, kernel, *launch.work_groups(size, group))
+        lane.timed(name, trace.KERNEL, event)
 
     def repeat(
         self,
@@ -299,15 +313,15 @@ class Device:
 
         Arguments are set once: on small grids that is most of what a launch costs.
         """
-        groups = launch.work_groups(size, group)
+        lane, groups = self._started(), launch.work_groups(size, group)
         with self._arguments, _device_errors(f"running {name}"):
             kernels = self._instances(module, name, options, len(calls))
             for kernel, args in zip(kernels, calls, strict=True):
-                launch.set_arguments(kernel, _values(args))
+                launch.set_arguments(kernel, _values(args, lane))
             for _ in range(times):
                 for kernel in kernels:
-                    event = cl.enqueue_nd_range_kernel(self.queue, kernel, *groups)
-                    self.timed(name, trace.KERNEL, event)
+                    event = cl.enqueue_nd_range_kernel(lane.queue, kernel, *groups)
+                    lane.timed(name, trace.KERNEL, event)
 
     def _instances(self, module: str, name: str, options: str, count: int) -> list[cl.Kernel]:
         """Objects of one kernel, each with arguments of its own; they are slow to make."""
@@ -319,30 +333,32 @@ class Device:
     def give_back(self) -> None:
         """Return freed memory to the system, on the device and the host, at the end of a step."""
         self.finish()  # what still waits for its kernels would stay
-        self.spare.release()
+        for lane in self._lanes:
+            lane.spare.release()
         memory.give_back()
 
     def finish(self) -> None:
-        """Wait for all that was started; raises `DeviceError` if the device failed."""
+        """Wait for all that this thread's lane started; raises `DeviceError` if the device failed."""
         with _device_errors("finishing"):
-            self.queue.finish()
-        self.tell_times()
+            self.current.queue.finish()
+        self.current.tell_times()
 
     def flush(self) -> None:
         """Have all that was started begun, while the host does something else."""
         with _device_errors("starting"):
-            self.queue.flush()
+            self.current.queue.flush()
 
-    def timed(self, name: str, kind: str, event: cl.Event) -> None:
-        """Have the trace, where there is one, told later when this was done."""
-        if self._times:
-            self._times.add(name, kind, event)
-
-    def tell_times(self) -> None:
-        """Tell the trace what is done."""
-        if self._times:
-            self._times.tell()
+    def _started(self) -> Lane:
+        """The lane of this thread, unless that is stopped."""
+        lane = self.current
+        if lane.stopped.is_set():
+            raise StoppedError
+        return lane
 
 
-def _values(arguments: Sequence[object]) -> list[object]:
-    return [value.data if isinstance(value, Buffer) else value for value in arguments]
+def _values(arguments: Sequence[object], lane: Lane) -> list[object]:
+    values = list(arguments)
+    for index, value in enumerate(values):
+        if isinstance(value, Buffer):
+            value.lane, values[index] = lane, value.data
+    return values

@@ -8,21 +8,24 @@ bars are as wide as on the working canvas.
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
+from collections.abc import Iterable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import closing
+from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
 import numpy.typing as npt
 
 from hugin_abflow import chart, consistency, figures, flow, guidance, quality, relay, single
+from hugin_abflow.abreast import side_by_side
 from hugin_abflow.cells import View, Whole
 from hugin_abflow.chart import Chart
 from hugin_abflow.consistency import Weighed
 from hugin_abflow.geometry import Pair, PairFlow
 from hugin_abflow.guides import Guide
 from hugin_abflow.opencl import Device
-from hugin_abflow.progress import Progress
+from hugin_abflow.progress import Advance, Progress
 from hugin_abflow.pyramid import Level
 from hugin_abflow.settings import Settings
 from hugin_abflow.working import Grid, WorkingLayer
@@ -31,6 +34,9 @@ _log = logging.getLogger(__name__)
 
 # Motion that is looked for, as a share of the canvas's width.
 _REACH = 0.1
+# Pairs whose flow is found at a time, at most: small grids and steps on the host leave cores idle, and memory
+# is needed for each.
+_ABREAST = 2
 
 
 def charts(
@@ -55,6 +61,11 @@ def finest(drawn: Sequence[Chart], grid: Grid, settings: Settings) -> Sequence[C
     return fine if quality.refined(settings.flow_quality, grid.width * grid.height, pixels) else drawn
 
 
+def most_abreast(settings: Settings) -> int:
+    """How many pairs' flow is found at a time, where memory suffices."""
+    return min(_ABREAST, settings.cores)
+
+
 def solve(
     device: Device,
     layers: Sequence[WorkingLayer],
@@ -65,73 +76,121 @@ def solve(
     settings: Settings,
     guides: Mapping[tuple[int, int], Sequence[Guide]],
     numbers: Sequence[int],
+    abreast: int = 1,
 ) -> tuple[list[PairFlow], list[figures.Parallax], list[Whole | None]]:
     """Flow of every pair of layers, mended; figures of it, if somebody listens; and what is taken from one of
     them, whole, by cells of the flow's chart.
 
     drawn       the charts of `pairs`, on which flow is found.
     guides      of each two layers, by their numbers; numbers: what guides call each of `layers`.
+    abreast     how many pairs are worked on at a time; no flow depends on it.
     """
-    parameters = quality.flow_parameters(settings.flow_quality, settings.large_motion)
-    largest = _REACH * (grid.canvas_width or grid.region.width) * grid.width / grid.region.width
     ends = finest(drawn, grid, settings)
-    weighed, singles, shifts = list[Weighed](), list[Whole | None](), list[figures.Parallax]()
-    waiting: list[tuple[PairFlow, tuple[Level, Level], Future[Whole | None] | None]] = []
-    held: dict[tuple[int, int], guidance.Values] = {}
-    compared = settings.relay and relay.triangles(pairs)
-
-    def weigh() -> None:
-        while waiting:  # one at most: a pair's images are large
-            pair, images, job = waiting.pop()
-            found = job.result() if job else None
-            singles.append(found.finer() if found and ends is not drawn else found)
-            weighed.append(consistency.weigh(device, pair, images, singles[-1]))
-
-    with ThreadPoolExecutor(1, "single") as looking, progress("flow", len(pairs)) as advance:
-        for pair, its_chart, its_finest in zip(pairs, drawn, ends, strict=True):
-            images = _images(device, layers, pair, its_chart, grid)
-            bearings = its_chart.eye.bearings if its_chart.eye else None
-            reach = largest / its_chart.coarse if settings.large_motion != "off" else 0.0
-            solved = flow.solve(device, *images, parameters, reach=reach, bearings=bearings)
-            found = (solved.forward, solved.backward)
-            first, second = numbers[pair.a], numbers[pair.b]
-            its_guides = guides.get((min(first, second), max(first, second)), ())
-            placed = guidance.on_chart(its_guides, first, its_chart, grid)
-            if its_guides:
-                found = guidance.lead(device, images, found, placed, its_chart.around(grid))
-            if its_guides and compared:
-                scale, ways = its_finest.width / its_chart.width, guidance.held(images, found, placed)
-                held[pair.a, pair.b], held[pair.b, pair.a] = (scale * way for way in ways)
-            weigh()
-            job = None
-            if settings.seam and (settings.foreground or (settings.movers and its_chart.eye)):
-                views = (View.of(images[0]), View.of(images[1]))
-                arrays, vouched = (found[0].get(), found[1].get()), (placed.at_a, placed.at_b)
-                job = looking.submit(single.find, its_chart, arrays, views, vouched, solved.refused, settings)
-            its_flow = PairFlow(pair.a, pair.b, its_chart, *found)
-            if _log.isEnabledFor(logging.INFO):
-                shifts.append(figures.parallax(device, its_flow, images, grid))
-            if its_finest is not its_chart:
-                images = _images(device, layers, pair, its_finest, grid)
-                found = flow.refine(device, *images, *found, parameters)
-                its_flow = PairFlow(pair.a, pair.b, its_finest, *found)
-            waiting.append((its_flow, images, job))
-            advance(1)
-        weigh()
+    compared = bool(settings.relay and relay.triangles(pairs))
+    solver = _Solver(device, layers, grid, settings, guides, numbers, compared)
+    work = (partial(solver.solve, *each) for each in zip(pairs, drawn, ends, strict=True))
+    with progress("flow", len(pairs)) as advance:
+        with closing(side_by_side(device, work, abreast)) as solved:
+            weighed, shifts, singles, held = _gathered(pairs, solved, advance)
         if compared:
             for a, b in relay.mend(device, weighed, held):
                 _log.info(
                     "flow of %s and %s: by way of other layers, which contradict it or know more",
                     layers[a].layer.name, layers[b].layer.name,
                 )  # fmt: skip
-        result = [consistency.mend(device, weighed.pop(0)) for _ in range(len(weighed))]
-        device.give_back()  # it waits: else the last pair's time would be told as that of what follows
+        mending = (partial(consistency.mend, device, weighed.pop(0)) for _ in range(len(weighed)))
+        result = list(side_by_side(device, mending, abreast))
+        device.give_back()
     return result, shifts, singles
 
 
-def _images(
-    device: Device, layers: Sequence[WorkingLayer], pair: Pair, its_chart: Chart, grid: Grid
-) -> tuple[Level, Level]:
-    """What both layers of a pair show on its chart."""
-    a, b = (chart.sample(device, layers[index], grid, its_chart) for index in (pair.a, pair.b))
-    return a, b
+@dataclass(frozen=True)
+class _Solved:
+    """A pair's flow as it was found.
+
+    shifts  figures of it, if somebody listens.
+    held    what guides hold, both ways, on the chart of the flow; none: nothing.
+    """
+
+    weighed: Weighed
+    single: Whole | None
+    shifts: tuple[figures.Parallax, ...]
+    held: tuple[guidance.Values, ...]
+
+
+def _gathered(
+    pairs: Sequence[Pair], solved: Iterable[_Solved], advance: Advance
+) -> tuple[list[Weighed], list[figures.Parallax], list[Whole | None], dict[tuple[int, int], guidance.Values]]:
+    """What is found of all pairs, as it comes; the last by layer that flow starts on, and the other one."""
+    weighed, shifts, singles = list[Weighed](), list[figures.Parallax](), list[Whole | None]()
+    held: dict[tuple[int, int], guidance.Values] = {}
+    for pair, one in zip(pairs, solved, strict=True):
+        weighed.append(one.weighed)
+        shifts += one.shifts
+        singles.append(one.single)
+        if one.held:
+            held[pair.a, pair.b], held[pair.b, pair.a] = one.held
+        advance(1)
+    return weighed, shifts, singles, held
+
+
+@dataclass(frozen=True)
+class _Solver:
+    """Finds the flow of one pair; the fields are arguments of `solve`. compared: whether other pairs' flow is
+    asked afterwards.
+    """
+
+    device: Device
+    layers: Sequence[WorkingLayer]
+    grid: Grid
+    settings: Settings
+    guides: Mapping[tuple[int, int], Sequence[Guide]]
+    numbers: Sequence[int]
+    compared: bool
+
+    def solve(self, pair: Pair, its_chart: Chart, its_finest: Chart) -> _Solved:
+        """The flow of a pair, found on one chart and refined on another."""
+        device, grid, settings = self.device, self.grid, self.settings
+        parameters = quality.flow_parameters(settings.flow_quality, settings.large_motion)
+        images = self._images(pair, its_chart)
+        bearings = its_chart.eye.bearings if its_chart.eye else None
+        solved = flow.solve(device, *images, parameters, reach=self._reach(its_chart), bearings=bearings)
+        found = (solved.forward, solved.backward)
+        first, second = self.numbers[pair.a], self.numbers[pair.b]
+        its_guides = self.guides.get((min(first, second), max(first, second)), ())
+        placed = guidance.on_chart(its_guides, first, its_chart, grid)
+        held = tuple[guidance.Values, ...]()
+        if its_guides:
+            found = guidance.lead(device, images, found, placed, its_chart.around(grid))
+        if its_guides and self.compared:
+            scale = its_finest.width / its_chart.width
+            held = tuple(scale * way for way in guidance.held(images, found, placed))
+        one = None
+        if settings.seam and (settings.foreground or (settings.movers and its_chart.eye)):
+            views = (View.of(images[0]), View.of(images[1]))
+            arrays, vouched = (found[0].get(), found[1].get()), (placed.at_a, placed.at_b)
+            one = single.find(its_chart, arrays, views, vouched, solved.refused, settings)
+        its_flow, shifts = PairFlow(pair.a, pair.b, its_chart, *found), tuple[figures.Parallax, ...]()
+        if _log.isEnabledFor(logging.INFO):
+            shifts = (figures.parallax(device, its_flow, images, grid),)
+        if its_finest is not its_chart:
+            images = self._images(pair, its_finest)
+            found = flow.refine(device, *images, *found, parameters)
+            its_flow = PairFlow(pair.a, pair.b, its_finest, *found)
+            one = one and one.finer()
+        return _Solved(consistency.weigh(device, its_flow, images, one), one, shifts, held)
+
+    def _reach(self, its_chart: Chart) -> float:
+        """Px of a chart up to which motion is searched."""
+        if self.settings.large_motion == "off":
+            return 0.0
+        grid = self.grid
+        width = (grid.canvas_width or grid.region.width) * grid.width / grid.region.width
+        return _REACH * width / its_chart.coarse
+
+    def _images(self, pair: Pair, its_chart: Chart) -> tuple[Level, Level]:
+        """What both layers of a pair show on a chart."""
+        a, b = (
+            chart.sample(self.device, self.layers[index], self.grid, its_chart) for index in (pair.a, pair.b)
+        )
+        return a, b

@@ -4,7 +4,7 @@
    is around. */
 
 /* The area that a pixel's has become where its flow leads. Beyond a border that does not wrap flow is the same. */
-static inline float area_there(__global const float2 *flow, int x, int y, int4 grid) {
+static inline float consistency_area(__global const float2 *flow, int x, int y, int4 grid) {
     const int at = y * grid.x + x, turn = grid.z ? grid.x - 1 : 0;
     const float2 left = flow[x > 0 ? at - 1 : at + turn], right = flow[x < grid.x - 1 ? at + 1 : at - turn];
     const float2 above = flow[y > 0 ? at - grid.x : at], below = flow[y < grid.y - 1 ? at + grid.x : at];
@@ -37,7 +37,7 @@ __kernel void consistency_trust(__global const float2 *flow, /* (grid.y, grid.x)
     const float2 e = (f + bilinear_flow(back, q, grid)) / tolerance;
     const float c = 1.0f / (1.0f + square2(e));
     const int column = LEAST(x / cells.z, cells.x - 1), row = LEAST(y / cells.z, cells.y - 1);
-    const float room = (area_there(flow, x, y, grid) - squeezed) / (1.0f - squeezed);
+    const float room = (consistency_area(flow, x, y, grid) - squeezed) / (1.0f - squeezed);
     const float shown = LIMITED(room, 0.0f, 1.0f);
     const bool single = once[row * cells.x + column];
     trusted[at] = (float4)(f, single ? 0.0f : shown * c * c * c * c, single ? UNTOLD : image[at]);
@@ -118,7 +118,7 @@ __kernel void consistency_pull(__global const float4 *trusted, /* (fine.y, fine.
 }
 
 /* How well flow is carried from a pixel to the next, by their brightness: 1 where it is equal. */
-static inline float conductance(float a, float b, float edge) {
+static inline float consistency_conductance(float a, float b, float edge) {
     const float d = GREATEST(a, b) < UNTOLD ? (a - b) / edge : 0.0f;
     return 1.0f / (1.0f + d * d);
 }
@@ -146,7 +146,7 @@ __kernel void consistency_relax(__global const float4 *trusted, /* (grid.y, grid
     float2 sum = weight * its.xy;
     for (int i = 0; i < 4; ++i) {
         const int n = there[i] ? beside[i] : at;
-        const float w = there[i] ? conductance(trusted[n].w, its.w, edge) : 0.0f;
+        const float w = there[i] ? consistency_conductance(trusted[n].w, its.w, edge) : 0.0f;
         sum += w * filled[n];
         weight += w;
     }

@@ -20,7 +20,7 @@ USERS = {
     "rich": {"batch", "terminal"},
     "distributed": {"batch"},
     "OpenImageIO": {"images", "imagewriter"},
-    "pyopencl": {"devices", "opencl", "launch"},
+    "pyopencl": {"devices", "opencl", "lane", "launch"},
     "tifffile": {"tiffreader", "tiffwriter"},
     "imagecodecs": {"tiffwriter"},
 }

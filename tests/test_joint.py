@@ -210,9 +210,9 @@ def test_pixels_of_one_layer_are_copied_where_the_correction_is_zero(monkeypatch
     seen = []
     original = joint.colour.correction
 
-    def remember(*arguments, **more):
-        found = original(*arguments, **more)
-        seen[:] = [found]  # the last one counts
+    def remember(device, measured, settings, ignored, strict):
+        found = original(device, measured, settings, ignored, strict)
+        seen.extend([] if strict else [found])
         return found
 
     monkeypatch.setattr(joint.colour, "correction", remember)
@@ -346,40 +346,44 @@ def test_only_transitions_do_without_distances(monkeypatch, canvas, strain):
 
 @pytest.mark.parametrize("looked_for", [True, False])
 def test_every_pair_is_mended_with_its_own_images(monkeypatch, looked_for):
-    """In their order, the last one, too, each with what is taken whole."""
-    sampled, weighed, mended, given = [], [], {}, []
+    """Each with what is taken whole, whatever others are worked on meanwhile, and told in their order."""
+    sampled, weighed, mended, found, given = [], {}, {}, {}, []
     sample, weigh, mend, align = chart.sample, consistency.weigh, consistency.mend, joint._align
 
     def spy_sample(device, layer, grid, chart):
-        sampled.append((layer, chart, sample(device, layer, grid, chart)))
-        return sampled[-1][2]
+        level = sample(device, layer, grid, chart)
+        sampled.append((layer, chart, level))
+        return level
 
     def spy_weigh(device, pair, images, whole=None):
-        weighed.append((pair, images, whole, weigh(device, pair, images, whole)))
-        return weighed[-1][3]
+        its = weigh(device, pair, images, whole)
+        weighed[pair.a, pair.b] = pair, images, whole, its
+        return its
 
     def spy_mend(device, found):
         return mended.setdefault(id(found), mend(device, found))
 
+    def spy_find(chart, *_):
+        return found.setdefault(id(chart), Whole(nowhere, nowhere) if looked_for else None)
+
     def spy_align(device, layers, pairs, flows, *rest):
-        given.append((layers, list(flows)))
+        given.append((layers, pairs, list(flows)))
         return align(device, layers, pairs, flows, *rest)
 
     nowhere = np.zeros((1, 1), bool)
-    found = [Whole(nowhere, nowhere) if looked_for else None for _ in range(20)]
-    left = iter(found)
-    monkeypatch.setattr(single, "find", lambda *_: next(left))
+    monkeypatch.setattr(single, "find", spy_find)
     monkeypatch.setattr(single, "on_canvas", lambda *_: None)
     monkeypatch.setattr(chart, "sample", spy_sample)
     monkeypatch.setattr(consistency, "weigh", spy_weigh)
     monkeypatch.setattr(consistency, "mend", spy_mend)
     monkeypatch.setattr(joint, "_align", spy_align)
     merged(moving(SPHERE), SPHERE, movers=looked_for, foreground=False)
-    [(layers, flows)] = given
+    [(layers, pairs, flows)] = given
     assert len(flows) == len(weighed) == len(sampled) // 2 > 3
-    for number, (flow, (pair, images, whole, found_flow)) in enumerate(zip(flows, weighed, strict=True)):
+    for its, flow in zip(pairs, flows, strict=True):
+        pair, images, whole, found_flow = weighed[its.a, its.b]
         assert flow is mended[id(found_flow)]
-        assert whole is found[number]
+        assert whole is found.get(id(pair.chart))
         shown = [(layer, level) for layer, its_chart, level in sampled if its_chart is pair.chart]
         assert [level for _, level in shown] == list(images)
         assert [layer for layer, _ in shown] == [layers[pair.a], layers[pair.b]]

@@ -42,7 +42,7 @@ def test_arguments_arrive_each_time(device: Device) -> None:
     ):
         values = [value.data if isinstance(value, Buffer) else value for value in given]
         launch.set_arguments(kernel, [result.data, *values])
-        cl.enqueue_nd_range_kernel(device.queue, kernel, *launch.work_groups((1,), 1))
+        cl.enqueue_nd_range_kernel(device.current.queue, kernel, *launch.work_groups((1,), 1))
         np.testing.assert_array_equal(result.get(), expected)
 
 

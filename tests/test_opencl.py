@@ -70,9 +70,33 @@ def test_every_file_builds_alone_without_warnings(device: Device, module: str, o
 def test_a_file_that_gives_no_kernels_is_a_device_error_with_its_name(
     device: Device, monkeypatch: pytest.MonkeyPatch, module: str, source: str, said: str
 ) -> None:
-    monkeypatch.setattr(opencl, "kernel_source", lambda module: source)
+    monkeypatch.setattr(opencl, "kernel_source", lambda *modules: source)
     with pytest.raises(DeviceError, match=said):
         device.kernel(module, module)
+
+
+def test_files_without_options_are_built_together(monkeypatch: pytest.MonkeyPatch) -> None:
+    """To read OpenCL's headers takes a driver longer than each of them."""
+    device, built = Device(), []
+
+    def build(modules: tuple[str, ...], options: str) -> dict[str, cl.Kernel]:
+        built.append((modules, options))
+        return Device._build(device, modules, options)
+
+    monkeypatch.setattr(device, "_build", build)
+    names = {name for module in MODULES for name in kernels_of(module)}
+    own = {name for module in ("blend", "working") for name in kernels_of(module)}
+    assert set(device.build("flow")) == set(device.build("seam")) == names - own
+    assert sorted(device.build("flow", "-DWRAPS=1")) == sorted(kernels_of("flow"))
+    sizes = [(len(modules), options) for modules, options in built]
+    assert sizes == [(len(MODULES) - 2, ""), (1, "-DWRAPS=1")]
+
+
+def test_that_none_of_many_files_builds_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    device = Device()
+    monkeypatch.setattr(opencl, "kernel_source", lambda *modules: "__kernel void broken( {")
+    with pytest.raises(DeviceError, match=r"(?s)^kernels/\*\.cl does not build on .*driver"):
+        device.build("flow")
 
 
 def test_what_is_built_does_not_wait_for_what_is_being_built(
@@ -171,10 +195,10 @@ def test_memory_of_buffers_that_are_gone_is_used_again() -> None:
     device.give_back()
     for _ in range(1000):
         device.empty((1 << 20,))
-    assert device.spare._total <= spare.MOST_BYTES
+    assert device.current.spare._total <= spare.MOST_BYTES
     many = [device.empty((k,)) for k in range(1, 500)]
     del many
-    assert len(device.spare._kept) <= spare.MOST_BLOCKS
+    assert len(device.current.spare._kept) <= spare.MOST_BLOCKS
 
 
 def test_only_memory_of_its_own_counts_for_the_device() -> None:

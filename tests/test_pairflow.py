@@ -128,6 +128,57 @@ def test_less_quality_is_advised_where_that_would_do(monkeypatch: pytest.MonkeyP
     assert merged(layers(61), CANVAS, flow_quality="fast", working_pixels=45_451, max_memory=limit).any()
 
 
+def _three() -> list[Layer]:
+    """Of which each two overlap, and differ."""
+    rng = np.random.default_rng(5)
+    pixels = [rng.integers(0, 256, (151, width, 4), np.uint8) for width in (200, 160, 180)]
+    for picture in pixels:
+        picture[..., 3] = 255
+    return [
+        Layer.from_array(name, picture, left)
+        for name, picture, left in zip("abc", pixels, (0, 100, 121), strict=True)
+    ]
+
+
+@pytest.mark.parametrize(
+    ("limit", "threads", "most"), [("roomy", 2, 2), ("roomy", 1, 1), ("tight", 2, 1), ("too low", 2, 1)]
+)
+def test_two_pairs_are_worked_on_at_a_time_where_memory_suffices(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, limit: str, threads: int, most: int
+) -> None:
+    """They are the largest two that are reckoned with; nobody is refused for want of memory for two."""
+    monkeypatch.setattr(joint.memory, "resident", lambda: 0)
+    monkeypatch.setattr(joint, "_SOLVER_BYTES", 20_000)
+    sizes, seen = list[int](), list[int]()
+    draw, side_by_side = pairflow.charts, pairflow.side_by_side
+
+    def spy_charts(*given: Any) -> list[chart.Chart]:
+        charts = draw(*given)
+        sizes[:] = sorted(one.width * one.height for one in charts)
+        return charts
+
+    def spy_side_by_side(device: Any, work: Any, lanes: int) -> Any:
+        seen.append(lanes)
+        return side_by_side(device, work, lanes)
+
+    monkeypatch.setattr(pairflow, "charts", spy_charts)
+    monkeypatch.setattr(pairflow, "side_by_side", spy_side_by_side)
+    expected = merged(_three(), CANVAS, threads=1)
+    one, two = 20_000 * sizes[-1], 20_000 * (sizes[-1] + sizes[-2])
+    bytes_ = {"roomy": 2 * two, "tight": (one + two) // 2, "too low": one // 2}[limit]
+    seen.clear()
+    if limit == "too low":  # not given by the user, so it goes on
+        monkeypatch.setattr(joint.memory, "limit", lambda given: bytes_)
+    with caplog.at_level("INFO", "hugin_abflow.joint"):
+        given = 0 if limit == "too low" else bytes_
+        found = merged(_three(), CANVAS, threads=threads, max_memory=given)
+    assert np.array_equal(found, expected) and len(sizes) == 3
+    assert seen == [most, most]
+    (said,) = (record.args[0] for record in caplog.records if "at working resolution" in record.msg)
+    reckoned = float(str(said).split()[0]) * (1 << 20)
+    assert reckoned == pytest.approx(two if most == 2 else one, rel=0.2)
+
+
 @pytest.mark.usefixtures(small.__name__)
 def test_what_is_taken_whole_is_told_on_the_chart_that_its_flow_has(
     weighed: list[tuple[Any, ...]], monkeypatch: pytest.MonkeyPatch

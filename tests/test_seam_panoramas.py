@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 from pictures import masked, merged, one_device, pixel_places, texture
 from scipy import ndimage
 
-from hugin_abflow import joint, seam
+from hugin_abflow import colour, joint, seam
 from hugin_abflow.layer import Canvas, Layer
 from hugin_abflow.opencl import Device
 from hugin_abflow.progress import silent
@@ -184,6 +186,29 @@ def prepared(device: Device, layers: list[Layer], canvas: Canvas, **chosen) -> j
 
 def fields_of(found: joint.Prepared) -> list[np.ndarray]:
     return [layer.field.get() for layer in found.layers]
+
+
+@pytest.mark.parametrize("threads", [1, 2])
+@pytest.mark.parametrize("who", [None, 0])
+def test_gains_are_those_without_what_is_whole(
+    device: Device, monkeypatch: pytest.MonkeyPatch, who: int | None, threads: int
+) -> None:
+    """Others are found before it is known, so that nobody waits for them where nothing is."""
+    solved, correct = list[Any](), colour.correction
+
+    def spy(
+        device: Device, measured: Any, settings: Settings, ignored: Any, strict: bool
+    ) -> colour.Correction:
+        found = correct(device, measured, settings, ignored, strict)
+        solved.append((ignored is not None, strict, found))
+        return found
+
+    monkeypatch.setattr(colour, "correction", spy)
+    layers, canvas, _, _ = scene("plane", who, 0.8)
+    found = prepared(device, layers, canvas, threads=threads)
+    (last,) = (one for without, strict, one in solved if without == (who is not None) and not strict)
+    assert [layer.gain for layer in found.layers] == list(last.gains) and any(last.gains)
+    assert any(strict for _, strict, _ in solved)
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,90 @@
+"""Queues of one device side by side, each with memory of its own to use again."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+
+from hugin_abflow.lane import StoppedError
+from hugin_abflow.opencl import Buffer, Device
+
+
+@pytest.fixture
+def device() -> Iterator[Device]:
+    """One whose memory nothing else uses."""
+    yield Device()
+
+
+def halve(device: Device, image: Buffer) -> None:
+    """Start a kernel."""
+    side = image.shape[0]
+    small, share = (device.empty((side // 2,) * 2) for _ in range(2))
+    grid, size = (side, side, 0, 0), (side // 2,) * 2
+    device.run("pyramid", "pyramid_reduce", size, image, image, grid, small, share, size)
+
+
+def test_what_is_made_in_a_lane_is_there_for_all_when_it_ends(device: Device) -> None:
+    image = device.upload(np.arange(700**2, dtype=np.float32).reshape(700, 700))
+    with device.lane(threading.Event()):
+        lane, copies = device.current, [image]
+        for _ in range(20):
+            copies.append(device.copy(copies[-1]))
+    assert device.current is not lane
+    assert np.array_equal(device.copy(copies[-1]).get(), image.get())
+
+
+def test_a_lane_is_used_again(device: Device) -> None:
+    """Two at a time take two, whatever came before."""
+    lanes = set()
+    for _ in range(3):
+        with device.lane(threading.Event()):
+            lanes.add(device.current)
+            other = threading.Thread(target=lambda: lanes.add(device.current))
+            other.start()
+            other.join()
+    assert len(lanes) == 2  # the other thread has entered none: its is the first
+
+
+def test_memory_waits_for_what_used_it_last(device: Device) -> None:
+    """What another lane may still work on is not for this one."""
+    with device.lane(threading.Event()):
+        made, kept = device.zeros((33, 7)), device.zeros((33, 7))
+        own = device.current
+    memory = made.data
+    halve(device, device.zeros((8, 8)))
+    made.fill(3)  # by the first lane, which may not have begun
+    del made
+    with device.lane(threading.Event()):
+        assert device.current is own
+        assert device.empty((33, 7)).data != memory
+        before = kept.data
+        del kept
+        assert device.empty((33, 7)).data == before
+    assert device.empty((33, 7)).data == memory
+
+
+def test_memory_of_all_lanes_is_given_back(device: Device) -> None:
+    with device.lane(threading.Event()):
+        lane = device.current
+        device.zeros((33, 7))
+    assert lane.spare._kept
+    device.give_back()
+    assert not lane.spare._kept
+
+
+@pytest.mark.parametrize("how", ["run", "repeat"])
+def test_nothing_is_started_in_a_lane_that_is_stopped(device: Device, how: str) -> None:
+    stopped, image = threading.Event(), device.zeros((8, 8))
+    with pytest.raises(StoppedError), device.lane(stopped):
+        halve(device, image)
+        stopped.set()
+        if how == "run":
+            halve(device, image)
+        else:
+            device.repeat("pyramid", "pyramid_reduce", (4, 4), [], 1)
+    halve(device, image)
+    with device.lane(threading.Event()):
+        halve(device, image)
