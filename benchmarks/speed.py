@@ -61,6 +61,8 @@ def make_layers(folder: Path, width: int) -> None:
 def measure(command: list[str]) -> Run:
     """Run a command to its end and ask the system what it took, its children included."""
     environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    # compiled once, as pip does with what it installs, whatever this shell does
+    environment |= {"PYTHONDONTWRITEBYTECODE": "", "PYTHONPYCACHEPREFIX": str(ROOT / "build" / "bytecode")}
     with tempfile.TemporaryFile() as log:
         start = time.perf_counter()
         streams = [(os.POSIX_SPAWN_DUP2, log.fileno(), 1), (os.POSIX_SPAWN_DUP2, log.fileno(), 2)]
