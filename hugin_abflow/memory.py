@@ -35,10 +35,10 @@ def parse_size(text: str) -> int:
 
 
 def size(number: int) -> str:
-    """A number of bytes for people."""
+    """A number of bytes for people, so exactly that a limit and what is a little more are told apart."""
     for unit, name in _NAMES:
         if number >= unit:
-            return f"{number / unit:.1f} {name}"
+            return f"{number / unit:.{1 if unit < 1 << 30 else 2}f} {name}"
     return f"{number} bytes"
 
 

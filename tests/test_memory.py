@@ -41,6 +41,7 @@ def test_what_is_no_size_is_refused(text: str) -> None:
 def test_sizes_in_words_are_read_back() -> None:
     for count in (500 << 10, 3 * MIB, 812 * MIB, 20 << 30):
         assert memory.parse_size(memory.size(count).replace(" ", "")) == count
+    assert (memory.size(1 << 30), memory.size(1067 * MIB)) == ("1.00 GiB", "1.04 GiB")
 
 
 def test_the_limit_is_half_of_the_machine_unless_given(monkeypatch: pytest.MonkeyPatch) -> None:
