@@ -167,11 +167,11 @@ def option_sets(device: Device, first: Layer) -> tuple[str, str]:
     over coarse arrays before.
     """
     pixel, white = pixel_options(first)
-    integer, together = int(first.dtype.kind == "u"), _together(device)
+    integer, together = int(first.dtype.kind == "u"), _pixels_together(device)
     return f"{pixel} -DWHITE={white:.1f}f -DINTEGER={integer} -DPIXELS={together}", _OF_COARSE
 
 
-def _together(device: Device) -> int:
+def _pixels_together(device: Device) -> int:
     """How many pixels of a row are made together."""
     return 4 if device.has_long_vectors else 2
 
@@ -190,7 +190,7 @@ def _bands(
 ) -> Iterator[npt.NDArray[Any]]:
     """Bands of `height` rows."""
     region, first = full.region, layers[0].layer
-    together, options = _together(device), option_sets(device, first)[0]
+    together, options = _pixels_together(device), option_sets(device, first)[0]
     share = _QUARTER_LEVEL.get(first.dtype, _QUARTER_FINE_LEVEL)
     whole = (0, 0, gain_grid.width, gain_grid.height)
     fields = [(layer.box, layer.field) for layer in layers]

@@ -112,18 +112,24 @@ def prepare_in_memory(
     progress: Progress,
     guides: Sequence[Guide] = (),
 ) -> Prepared:
-    """`prepare`, on a smaller working canvas where the device's memory does not hold the wanted one."""
+    """`prepare`, one pair of layers at a time where the device's memory does not hold more, and on a smaller
+    working canvas where it does not hold that.
+    """
     region = working.full_grid(canvas, layers).region
+    abreast = min(pairflow.ABREAST, settings.cores) if settings.flow else 1
     with _making_ready(device, layers[0], settings):
         while True:
             try:
-                return prepare(device, layers, canvas, settings, progress, guides)
+                return prepare(device, layers, canvas, settings, progress, guides, abreast)
             except DeviceMemoryError:
                 fewer = min(settings.working_limit, region.width * region.height) // 2
-                if fewer < _LEAST_WORKING_PIXELS:
-                    raise
-                _log.warning("the device's memory is too small; trying again at a lower working resolution")
-                settings = replace(settings, working_pixels=fewer)
+                if abreast == 1:
+                    if fewer < _LEAST_WORKING_PIXELS:
+                        raise
+                    _log.warning("the device's memory is too small; now at a lower working resolution")
+                    settings = replace(settings, working_pixels=fewer)
+                abreast = 1
+            device.give_back()
 
 
 def prepare(
@@ -133,8 +139,12 @@ def prepare(
     settings: Settings,
     progress: Progress,
     guides: Sequence[Guide] = (),
+    abreast: int = 1,
 ) -> Prepared:
-    """Everything that sees far, at working resolution: flow, coefficients, geometry, colour, low bands."""
+    """Everything that sees far, at working resolution: flow, coefficients, geometry, colour, low bands.
+
+    abreast: pairs of layers whose flow is found at a time, at most; nothing else depends on it.
+    """
     full = working.full_grid(canvas, layers)
     grid = working.working_grid(full, settings)
     everything = _read(device, layers, grid, progress, settings.cores)
@@ -150,7 +160,7 @@ def prepare(
     shared = [overlap for _, overlap in overlaps] if settings.flow else []
     charts = pairflow.charts(shared, masks.grid, grid, settings)
     fast = partial(_of_quality, "fast", full, shared, masks.grid, settings)
-    abreast = _check_memory(device, reduced, charts, grid, settings, fast)
+    abreast = _check_memory(device, reduced, charts, grid, settings, fast, abreast)
     its_guides = by_pair(guides if settings.guides else ())
     flows, shifts, singles = (
         pairflow.solve(
@@ -181,10 +191,10 @@ def prepare(
 
 @contextmanager
 def _making_ready(device: Device, first: Layer, settings: Settings) -> Iterator[None]:
-    """Load and build what comes after reading, meanwhile: it takes most of a second on one core, and several
-    where kernels are compiled for the first time; no process that is to end waits for all of it.
+    """Load and build what comes after reading, meanwhile: it takes half a second on one core, and several
+    where kernels are compiled for the first time; a process that is to end waits for one step at most.
     """
-    kernels = [("coefficient", "")]  # and with them all others that take no options
+    kernels = [("coefficient", "")]  # and with it all others that take no options
     kernels += [("flow", flow.board_options(wraps=False))] if settings.flow else []
     libraries = ("scipy.ndimage", "scipy.sparse.csgraph", "scipy.sparse.linalg")
     steps: list[Callable[[], object]] = [partial(device.build, *one) for one in kernels]
@@ -247,21 +257,18 @@ def _align(
     measured = colour.measure(device, layers, fields, pairs, grid, masks.host)
     with ThreadPoolExecutor(2, "gains") as solving:  # each on one core: the device goes on meanwhile
 
-        def correct(
-            how: Settings, ignored: seam.Cells | None = None, strict: bool = False
-        ) -> Future[Correction]:
-            return solving.submit(colour.correction, device, measured, how, ignored, strict)
+        def gains(how: Settings, ignored: seam.Cells | None, stern: bool = False) -> Future[Correction]:
+            return solving.submit(colour.correction, device, measured, how, ignored, stern)
 
         # exposure explains a difference whether it is corrected or not
         exposure, rounds = replace(settings, exposure=True), _SEAM_ROUNDS if settings.seam else 0
-        first = correct(exposure, strict=True) if rounds else None
+        first = gains(exposure, None, True) if rounds else None
         # what the layers get, unless something is to be whole, which is rarely known before
-        last = correct(settings) if settings.flow and once is None and settings.cores > 1 else None
+        hoped = gains(settings, None) if settings.flow and once is None and settings.cores > 1 else None
         reaches = [geometry.reach(device, *one, grid) for one in zip(layers, fields, strict=True)]
         whole: seam.Cells | None = None
         for _ in range(rounds):
-            strict = (first or correct(exposure, whole, strict=True)).result()
-            first = None
+            strict = (first if first and whole is None else gains(exposure, whole, True)).result()
             device.give_back()
             residual = seam.residuals(device, layers, fields, pairs, strict, grid)
             found = seam.regions(residual, grid, aligned=settings.flow, once=once)
@@ -272,11 +279,13 @@ def _align(
         if rounds and not settings.flow:
             seam.divide(device, layers, fields, pairs, strict, masks, grid)
             # what is not aligned tells little of exposures; bands of frequencies change over as they are
-            last, whole = correct(replace(settings, exposure=False)), None
+            last, whole = gains(replace(settings, exposure=False), None), None
         elif whole is not None:
-            last = correct(settings, whole)
+            last = gains(settings, whole)
             seam.cut(device, layers, fields, residual, whole, masks, grid, once)
-        return _Aligned(fields, reaches, (last or correct(settings)).result(), whole)
+        else:
+            last = hoped or gains(settings, None)
+        return _Aligned(fields, reaches, last.result(), whole)
 
 
 def _tell_overlaps(
@@ -398,9 +407,10 @@ def _check_memory(
     grid: Grid,
     settings: Settings,
     fast: Callable[[], tuple[Sequence[Chart], Grid, Settings]],
+    most: int,
 ) -> int:
-    """How many pairs' flow may be found at a time. A limit that is too low even for one is refused: the
-    working canvas must not depend on it.
+    """How many pairs' flow may be found at a time, `most` at most. A limit that is too low even for one is
+    refused: the working canvas must not depend on it.
 
     charts      on which flow is found; none if there is no flow.
     fast        gives charts, grid and settings of `--flow-quality fast`.
@@ -408,7 +418,7 @@ def _check_memory(
     there = memory.resident() + device.own_memory + _LIBRARY_BYTES
     pixels = sum(layer.box[2] * layer.box[3] for layer in layers)
     limit = memory.limit(settings.max_memory)
-    for abreast in range(pairflow.most_abreast(settings), 0, -1):
+    for abreast in range(most, 0, -1):
         needed = there + _working_bytes(pixels, charts, grid, settings, abreast)
         if needed <= limit:
             break

@@ -47,12 +47,13 @@ class _Times:
 
 
 class StoppedError(Exception):
-    """Nobody waits any more for what a lane is working on."""
+    """Nobody waits any more for what is done in a lane."""
 
 
 class Lane:
-    """A queue, which does one thing after the other, with the memory that it may use again.
+    """A queue, which does one thing after the other.
 
+    spare       memory that what comes may use. stopped: set when no kernel is to be started any more.
     number      of this lane among the device's. timing: whether the trace is told when what was done.
     """
 

@@ -10,7 +10,6 @@ from contextlib import contextmanager
 from functools import cache
 from pathlib import Path
 from typing import Any
-from weakref import WeakSet
 
 import numpy as np
 import numpy.typing as npt
@@ -43,8 +42,8 @@ def kernel_source(*modules: str) -> str:
     return "".join(f'#line 1 "{name}.cl"\n{_kernel_files()[name]}\n' for name in ("common", *modules))
 
 
-def _together(module: str, options: str) -> tuple[str, ...]:
-    """The modules that are built with this one."""
+def _built_with(module: str, options: str) -> tuple[str, ...]:
+    """The modules that are built with this one, and itself."""
     others = sorted(_kernel_files().keys() - _OF_PIXELS - {"common"})
     return tuple(others) if module in others and not options else (module,)
 
@@ -77,7 +76,8 @@ def _device_errors(doing: str) -> Iterator[None]:
 class Buffer:
     """An array on the device: shape and dtype with a `cl.Buffer`. Freed with the object.
 
-    lane    where it was used last: what is done there afterwards may have its memory.
+    lane    where it was used last: what is done there afterwards may have its memory. What several lanes use
+            has to live until all but one of them have ended.
     """
 
     def __init__(self, device: Device, shape: tuple[int, ...], dtype: npt.DTypeLike) -> None:
@@ -88,10 +88,11 @@ class Buffer:
         if self.data is None:
             with _device_errors(f"allocating {self.nbytes} bytes"):
                 self.data = cl.Buffer(device.context, cl.mem_flags.READ_WRITE, max(self.nbytes, 16))
-        device.buffers.add(self)
+        device.count(self.nbytes)
 
     def __del__(self) -> None:
         if getattr(self, "data", None) is not None:  # else there was no room for it
+            self._device.count(-self.nbytes)
             self.lane.spare.keep(self.nbytes, self.data)
 
     def _transfer(self, name: str, *places: Any, **offsets: int) -> None:
@@ -148,7 +149,7 @@ class Buffer:
 
 
 class Device:
-    """A device with its queue and built kernels.
+    """A device with its queues and built kernels.
 
     wanted      as `Settings.device`.
     threads     cores that a processor may use; 0: all. PoCL keeps to the first number in a process.
@@ -166,10 +167,10 @@ class Device:
             self._first = Lane(self.context, 1, self._timing)
         self._lanes = [self._first]
         self._free, self._entering, self._entered = list[Lane](), threading.Lock(), threading.local()
-        self.buffers: WeakSet[Buffer] = WeakSet()
+        self._bytes, self._counting = 0, threading.RLock()  # buffers may be collected while it is held
         self._kernels: dict[tuple[str, str], dict[str, cl.Kernel]] = {}
         self._programs: dict[tuple[str, str], cl.Program] = {}  # Intel's driver does not keep a kernel's own
-        self._building = threading.Lock()
+        self._building, self._one_by_one = threading.Lock(), False
         self._repeated: dict[tuple[str, str, str], list[cl.Kernel]] = {}
         self._arguments = threading.Lock()  # a kernel keeps its arguments from when they are set to its start
 
@@ -182,7 +183,12 @@ class Device:
     def own_memory(self) -> int:
         """Bytes that buffers take and the host's count does not hold: those of a graphics card."""
         shared = self.device.host_unified_memory
-        return 0 if shared else sum(buffer.nbytes for buffer in self.buffers)
+        return 0 if shared else self._bytes
+
+    def count(self, more: int) -> None:
+        """Have buffers take so many bytes more. For any thread."""
+        with self._counting:
+            self._bytes += more
 
     @property
     def has_long_vectors(self) -> bool:
@@ -205,13 +211,13 @@ class Device:
         """Have what this thread starts done beside what others start, and done at the end of the block.
 
         Until then no other thread may use what it makes, nor it what others are not done with.
-        stopped: from when this is set on, starting anything raises `StoppedError`.
+        stopped: from when this is set on, to start a kernel raises `StoppedError`.
         """
         with self._entering, signals.held(), _device_errors("starting another queue"):
             if not self._free:
                 self._free.append(Lane(self.context, len(self._lanes) + 1, self._timing))
                 self._lanes.append(self._free[-1])
-            lane = self._free.pop()
+            lane, before = self._free.pop(), self.current
         lane.stopped, self._entered.lane = stopped, lane
         try:
             yield
@@ -219,7 +225,7 @@ class Device:
             try:
                 self.finish()
             finally:
-                del self._entered.lane
+                self._entered.lane = before
                 self._free.append(lane)
 
     def empty(self, shape: Sequence[int], dtype: npt.DTypeLike = np.float32) -> Buffer:
@@ -251,13 +257,22 @@ class Device:
         if key not in self._kernels:  # what is built does not wait for what is being built
             with self._building:
                 if key not in self._kernels:
-                    modules = _together(module, options)
-                    kernels = self._build(modules, options)
-                    self._kernels |= {(one, options): kernels for one in modules}
+                    self._build_with_others(module, options)
         return self._kernels[key]
 
+    def _build_with_others(self, module: str, options: str) -> None:
+        modules = (module,) if self._one_by_one else _built_with(module, options)
+        try:
+            kernels = self._build(modules, options)
+        except DeviceError:
+            if len(modules) == 1:
+                raise
+            self._one_by_one = True  # perhaps one fails that is not needed, else its name is told
+            modules, kernels = (module,), self._build((module,), options)
+        self._kernels |= {(one, options): kernels for one in modules}
+
     def _build(self, modules: Sequence[str], options: str) -> dict[str, cl.Kernel]:
-        files = f"kernels/{modules[0]}.cl" if len(modules) == 1 else "kernels/*.cl"
+        file = f"kernels/{modules[0]}.cl"  # of several nobody is told
         try:
             # compilers chat; errors come with the exception
             with warnings.catch_warnings(), signals.held():
@@ -266,13 +281,13 @@ class Device:
                 program.build(["-cl-std=CL1.2", *options.split()])
         except cl.Error as error:
             raise DeviceError(
-                f"{files} does not build on {self.device.name.strip()}: {error}; "
+                f"{file} does not build on {self.device.name.strip()}: {error}; "
                 "update the OpenCL driver or choose another --device"
             ) from error
         self._programs |= {(one, options): program for one in modules}
         kernels = {kernel.function_name: kernel for kernel in program.all_kernels()}
         if not kernels:  # some drivers call that a success
-            raise DeviceError(f"{files} has no kernels for {self.device.name.strip()}; use another --device")
+            raise DeviceError(f"{file} has no kernels for {self.device.name.strip()}; use another --device")
         return kernels
 
     def run(
@@ -292,9 +307,8 @@ class Device:
         """
         if min(size) <= 0:
             return
-        lane = self._started()
+        lane, kernel = self._started(), self.kernel(module, name, options)
         with self._arguments, _device_errors(f"running {name}"):
-            kernel = self.kernel(module, name, options)
             launch.set_arguments(kernel, _values(args, lane))
             event = cl.enqueue_nd_range_kernel(lane.queue, kernel, *launch.work_groups(size, group))
         lane.timed(name, trace.KERNEL, event)
@@ -314,6 +328,7 @@ class Device:
         Arguments are set once: on small grids that is most of what a launch costs.
         """
         lane, groups = self._started(), launch.work_groups(size, group)
+        self.build(module, options)  # before others have to wait
         with self._arguments, _device_errors(f"running {name}"):
             kernels = self._instances(module, name, options, len(calls))
             for kernel, args in zip(kernels, calls, strict=True):
@@ -331,7 +346,9 @@ class Device:
         return made[:count]
 
     def give_back(self) -> None:
-        """Return freed memory to the system, on the device and the host, at the end of a step."""
+        """Return freed memory to the system, on the device and the host, at the end of a step. The driver
+        keeps what other lanes still work with.
+        """
         self.finish()  # what still waits for its kernels would stay
         for lane in self._lanes:
             lane.spare.release()
@@ -344,7 +361,7 @@ class Device:
         self.current.tell_times()
 
     def flush(self) -> None:
-        """Have all that was started begun, while the host does something else."""
+        """Have all that this thread's lane started begun, while the host does something else."""
         with _device_errors("starting"):
             self.current.queue.flush()
 

@@ -36,7 +36,7 @@ _log = logging.getLogger(__name__)
 _REACH = 0.1
 # Pairs whose flow is found at a time, at most: small grids and steps on the host leave cores idle, and memory
 # is needed for each.
-_ABREAST = 2
+ABREAST = 2
 
 
 def charts(
@@ -59,11 +59,6 @@ def finest(drawn: Sequence[Chart], grid: Grid, settings: Settings) -> Sequence[C
     fine = [one.finer() for one in drawn if one.coarse > 1]
     pixels = sum(one.width * one.height for one in fine)
     return fine if quality.refined(settings.flow_quality, grid.width * grid.height, pixels) else drawn
-
-
-def most_abreast(settings: Settings) -> int:
-    """How many pairs' flow is found at a time, where memory suffices."""
-    return min(_ABREAST, settings.cores)
 
 
 def solve(

@@ -11,8 +11,8 @@ MOST_BYTES, MOST_BLOCKS = 32 << 20, 64
 
 class Spare:
     """Memory of buffers that are gone, for the next ones of their size: the flow asks for the same few sizes
-    thousands of times, and to clear new pages takes as long as to fill them. The queue is in order, so what
-    still uses them is done before what comes.
+    thousands of times, and to clear new pages takes as long as to fill them. A lane's queue is in order, so
+    what still uses them is done before what comes.
     """
 
     def __init__(self) -> None:

@@ -77,7 +77,29 @@ def test_where_one_fails_the_others_are_stopped_or_left(device: Device) -> None:
     work += [partial(wait, k) for k in range(100)]
     with pytest.raises(OSError, match="mine"):
         list(side_by_side(device, work, 2))
-    assert [type(error) for error in ended] == [StoppedError] and len(left) < 100
+    assert [type(error) for error in ended] == [StoppedError] and not left
+
+
+def test_what_fails_first_is_told_at_once(device: Device) -> None:
+    """Not when its turn comes; that others were stopped for it is nothing to tell."""
+    begun, ended, late = threading.Event(), list[BaseException](), list[int]()
+
+    def fail() -> None:
+        assert begun.wait(60)
+        raise OSError("mine")
+
+    work: list[Callable[[], None]] = [partial(_until_stopped, device, begun, ended), fail]
+    work += [partial(late.append, k) for k in range(5)]
+    with pytest.raises(OSError, match="mine") as told:
+        list(side_by_side(device, work, 2))
+    assert [type(error) for error in ended] == [StoppedError] and not late
+    assert told.value.__suppress_context__
+
+
+def test_one_at_a_time_is_done_here(device: Device) -> None:
+    """Where no second queue can be had, as well."""
+    places = list(side_by_side(device, [lambda: (threading.current_thread(), device.current)] * 3, 1))
+    assert places == [(threading.current_thread(), device.current)] * 3
 
 
 def test_where_nobody_wants_more_they_are_stopped(device: Device) -> None:

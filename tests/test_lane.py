@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import sys
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 
 import numpy as np
 import pytest
@@ -48,22 +49,73 @@ def test_a_lane_is_used_again(device: Device) -> None:
     assert len(lanes) == 2  # the other thread has entered none: its is the first
 
 
-def test_memory_waits_for_what_used_it_last(device: Device) -> None:
+SHAPE = (8, 8)
+USES: dict[str, Callable[[Device, Buffer], object]] = {
+    "fill": lambda device, buffer: buffer.fill(3),
+    "set": lambda device, buffer: buffer.set(np.ones(SHAPE, np.float32)),
+    "put": lambda device, buffer: buffer.put(1, np.ones((2, 8), np.float32)),
+    "get": lambda device, buffer: buffer.get(),
+    "copy from": lambda device, buffer: device.empty((16, 8)).copy(3, buffer, 0, 8),
+    "copy to": lambda device, buffer: buffer.copy(0, device.zeros((16, 8)), 5, 8),
+    "run": halve,
+    "repeat": lambda device, buffer: device.repeat(
+        "pyramid", "pyramid_reduce", (4, 4),
+        [(buffer, buffer, (8, 8, 0, 0), device.empty((4, 4)), device.empty((4, 4)), (4, 4))], 2,
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("use", USES)
+def test_memory_waits_for_what_used_it_last(device: Device, use: str) -> None:
     """What another lane may still work on is not for this one."""
     with device.lane(threading.Event()):
-        made, kept = device.zeros((33, 7)), device.zeros((33, 7))
+        made, kept = device.zeros(SHAPE), device.zeros(SHAPE)
         own = device.current
     memory = made.data
-    halve(device, device.zeros((8, 8)))
-    made.fill(3)  # by the first lane, which may not have begun
+    USES[use](device, made)  # by the first lane, which may not have begun
     del made
     with device.lane(threading.Event()):
         assert device.current is own
-        assert device.empty((33, 7)).data != memory
+        assert device.empty(SHAPE).data != memory
         before = kept.data
         del kept
-        assert device.empty((33, 7)).data == before
-    assert device.empty((33, 7)).data == memory
+        assert device.empty(SHAPE).data == before
+    assert device.empty(SHAPE).data == memory
+
+
+def test_lanes_within_lanes_end_where_they_began(device: Device) -> None:
+    with device.lane(threading.Event()):
+        outer = device.current
+        with device.lane(threading.Event()):
+            assert device.current is not outer
+        assert device.current is outer
+    with device.lane(threading.Event()), device.lane(threading.Event()):
+        assert len(device._lanes) == 3
+
+
+def test_each_thread_starts_kernels_with_its_own_arguments(device: Device) -> None:
+    """A kernel has one set of them, and threads may change at any time."""
+    wrong = list[int]()
+
+    def start(value: int) -> None:
+        with device.lane(threading.Event()):
+            image, mask, share = (device.empty(SHAPE).fill(one) for one in (value, 1, 0))
+            found = [device.zeros((4, 4)) for _ in range(500)]
+            for one in found:
+                device.run("pyramid", "pyramid_reduce", (4, 4), image, mask, (8, 8, 0, 0), one, share, (4, 4))
+            wrong.extend(value for one in found if not np.allclose(one.get(), value))
+
+    before = sys.getswitchinterval()
+    sys.setswitchinterval(1e-6)
+    try:
+        threads = [threading.Thread(target=start, args=(value,)) for value in range(1, 5)]
+        for thread in threads:
+            thread.start()
+        for thread in threads:
+            thread.join()
+    finally:
+        sys.setswitchinterval(before)
+    assert not wrong
 
 
 def test_memory_of_all_lanes_is_given_back(device: Device) -> None:

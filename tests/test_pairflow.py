@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
@@ -9,12 +12,14 @@ import pytest
 from pictures import merged, one_device
 from scipy import ndimage
 
-from hugin_abflow import chart, consistency, flow, guidance, joint, pairflow, quality, relay, single
+from hugin_abflow import chart, consistency, flow, guidance, joint, opencl, pairflow, quality, relay, single
 from hugin_abflow.cells import Whole
 from hugin_abflow.errors import SettingsError
 from hugin_abflow.guides import Guide
 from hugin_abflow.layer import Canvas, Layer
 from hugin_abflow.merge import merge_layers
+from hugin_abflow.opencl import Device, DeviceMemoryError
+from hugin_abflow.progress import silent
 from hugin_abflow.settings import FlowQuality, Settings
 from hugin_abflow.working import Grid, full_grid
 
@@ -131,12 +136,12 @@ def test_less_quality_is_advised_where_that_would_do(monkeypatch: pytest.MonkeyP
 def _three() -> list[Layer]:
     """Of which each two overlap, and differ."""
     rng = np.random.default_rng(5)
-    pixels = [rng.integers(0, 256, (151, width, 4), np.uint8) for width in (200, 160, 180)]
+    pixels = [rng.integers(0, 256, (151, width, 4), np.uint8) for width in (200, 170, 151)]
     for picture in pixels:
         picture[..., 3] = 255
     return [
         Layer.from_array(name, picture, left)
-        for name, picture, left in zip("abc", pixels, (0, 100, 121), strict=True)
+        for name, picture, left in zip("abc", pixels, (0, 60, 150), strict=True)
     ]
 
 
@@ -154,7 +159,7 @@ def test_two_pairs_are_worked_on_at_a_time_where_memory_suffices(
 
     def spy_charts(*given: Any) -> list[chart.Chart]:
         charts = draw(*given)
-        sizes[:] = sorted(one.width * one.height for one in charts)
+        sizes[:] = [one.width * one.height for one in charts]
         return charts
 
     def spy_side_by_side(device: Any, work: Any, lanes: int) -> Any:
@@ -164,7 +169,8 @@ def test_two_pairs_are_worked_on_at_a_time_where_memory_suffices(
     monkeypatch.setattr(pairflow, "charts", spy_charts)
     monkeypatch.setattr(pairflow, "side_by_side", spy_side_by_side)
     expected = merged(_three(), CANVAS, threads=1)
-    one, two = 20_000 * sizes[-1], 20_000 * (sizes[-1] + sizes[-2])
+    assert max(sizes) == sizes[0] and len(sizes) == 3
+    one, two = 20_000 * sizes[0], 20_000 * (sizes[0] + max(sizes[1:]))
     bytes_ = {"roomy": 2 * two, "tight": (one + two) // 2, "too low": one // 2}[limit]
     seen.clear()
     if limit == "too low":  # not given by the user, so it goes on
@@ -172,11 +178,61 @@ def test_two_pairs_are_worked_on_at_a_time_where_memory_suffices(
     with caplog.at_level("INFO", "hugin_abflow.joint"):
         given = 0 if limit == "too low" else bytes_
         found = merged(_three(), CANVAS, threads=threads, max_memory=given)
-    assert np.array_equal(found, expected) and len(sizes) == 3
+    assert np.array_equal(found, expected)
     assert seen == [most, most]
     (said,) = (record.args[0] for record in caplog.records if "at working resolution" in record.msg)
     reckoned = float(str(said).split()[0]) * (1 << 20)
     assert reckoned == pytest.approx(two if most == 2 else one, rel=0.2)
+
+
+@pytest.mark.parametrize("lacks", ["memory for two", "a second queue"])
+def test_one_pair_at_a_time_where_the_device_lacks(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, lacks: str
+) -> None:
+    """What fits for one has to be the same as ever, and nothing to warn of."""
+    device, seen, side_by_side = Device(), list[int](), pairflow.side_by_side
+
+    def merge() -> Any:
+        settings = Settings(threads=2)
+        return list(joint.merge(device, _three(), CANVAS, settings, silent))
+
+    expected, solve = merge(), flow.solve
+
+    def limited(device: Device, *given: Any, **more: Any) -> Any:
+        if lacks == "memory for two" and device.current is not device._first:
+            raise DeviceMemoryError("for one there is enough")
+        return solve(device, *given, **more)
+
+    def spy(device: Any, work: Any, lanes: int) -> Any:
+        seen.append(lanes)
+        return side_by_side(device, work, lanes)
+
+    def no_queue(*_: Any) -> Any:
+        raise DeviceMemoryError("too many")
+
+    monkeypatch.setattr(flow, "solve", limited)
+    monkeypatch.setattr(pairflow, "side_by_side", spy)
+    if lacks == "a second queue":
+        device._free.clear()
+        monkeypatch.setattr(opencl, "Lane", no_queue)
+    assert np.array_equal(np.concatenate(merge()), np.concatenate(expected))
+    assert seen == [2, 1, 1] and not caplog.records
+
+
+def test_nothing_goes_on_when_the_run_is_interrupted(device: Device) -> None:
+    """Though what interrupted it is still looked at."""
+
+    @contextmanager
+    def progress(name: str, total: int) -> Iterator[Any]:
+        def interrupt(count: int) -> None:
+            if name == "flow":
+                raise KeyboardInterrupt
+
+        yield interrupt
+
+    with pytest.raises(KeyboardInterrupt) as told:
+        list(joint.merge(device, _three(), CANVAS, Settings(threads=2), progress))
+    assert told.value and not [one for one in threading.enumerate() if one.name.startswith("lane")]
 
 
 @pytest.mark.usefixtures(small.__name__)

@@ -9,7 +9,7 @@ import pytest
 from pictures import masked, merged, one_device, pixel_places, texture
 from scipy import ndimage
 
-from hugin_abflow import colour, joint, seam
+from hugin_abflow import colour, geometry, joint, seam
 from hugin_abflow.layer import Canvas, Layer
 from hugin_abflow.opencl import Device
 from hugin_abflow.progress import silent
@@ -208,7 +208,20 @@ def test_gains_are_those_without_what_is_whole(
     found = prepared(device, layers, canvas, threads=threads)
     (last,) = (one for without, strict, one in solved if without == (who is not None) and not strict)
     assert [layer.gain for layer in found.layers] == list(last.gains) and any(last.gains)
-    assert any(strict for _, strict, _ in solved)
+    # that by which they are found: without them from the second round on
+    assert [without for without, strict, _ in solved if strict] == [False, *[True] * (who is not None)]
+
+
+def test_each_layer_has_its_own_reach(device: Device) -> None:
+    layers, canvas, _, _ = scene("plane", None, dx=4.0)
+    found = prepared(device, layers, canvas)
+    reaches = [geometry.reach(device, one, one.field, found.grid) for one in found.layers]
+    assert [list(one.reach) for one in found.layers] == reaches and reaches[0] != reaches[1]
+
+
+def test_without_flow_there_are_no_gains(device: Device) -> None:
+    layers, canvas, _, _ = scene("plane", None, 0.8)
+    assert [one.gain for one in prepared(device, layers, canvas, flow=False).layers] == [None, None]
 
 
 @pytest.mark.parametrize(
