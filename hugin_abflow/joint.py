@@ -241,9 +241,8 @@ def _align(
     settings: Settings,
 ) -> _Aligned:
     """Geometry and colour that make the layers agree, without flow cuts alone; where nothing does, one
-    layer whole. `flows` is emptied.
-
-    What flow cannot explain spoils the exposure around it, which is found again without it.
+    layer whole. What flow cannot explain spoils the exposure around it, which is found again without it.
+    `flows` is emptied.
     """
     settled = transition.wanted(flows, settings)
     coefficients = coefficient.coefficients(device, layers, masks, grid, even=settled)
@@ -255,6 +254,7 @@ def _align(
     device.give_back()
     highlights.give_way(device, layers, fields, clipped, grid)
     measured = colour.measure(device, layers, fields, pairs, grid, masks.host)
+    device.give_back()  # two solutions at a time take the most memory
     with ThreadPoolExecutor(2, "gains") as solving:  # each on one core: the device goes on meanwhile
 
         def gains(how: Settings, ignored: seam.Cells | None, stern: bool = False) -> Future[Correction]:
