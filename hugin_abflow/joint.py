@@ -170,7 +170,7 @@ def prepare(
         else ([], [], [])
     )
     with progress("align", 1) as advance:
-        once = single.on_canvas(singles, [flow.chart for flow in flows], seam.seam_grid(grid))
+        once = single.on_canvas(singles, [one.chart for one in flows], seam.seam_grid(grid))
         aligned = _align(device, reduced, overlapping, flows, once, masks, grid, settings)
         if _log.isEnabledFor(logging.INFO):
             _tell_overlaps(reduced, overlaps, shifts, grid, aligned.whole)

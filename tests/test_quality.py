@@ -119,10 +119,11 @@ def test_time_of_the_flow_is_told_as_the_flows(device: Device, monkeypatch: pyte
     assert "flow" in happened[:end] and happened[end - 1] == "finish"
 
 
+@pytest.mark.parametrize("threads", [1, 2])
 def test_working_resolution_falls_from_what_the_quality_chose(
-    device: Device, monkeypatch: pytest.MonkeyPatch
+    device: Device, monkeypatch: pytest.MonkeyPatch, threads: int
 ) -> None:
-    """Where the device's memory is too small for it."""
+    """Where the device's memory is too small for it, also with one pair of layers at a time."""
     asked = []
 
     class EnoughSeenError(Exception):
@@ -130,10 +131,11 @@ def test_working_resolution_falls_from_what_the_quality_chose(
 
     def prepare(device, layers, canvas, settings, *more):
         asked.append(settings.working_limit)
-        raise DeviceMemoryError("too small") if len(asked) < 3 else EnoughSeenError
+        raise DeviceMemoryError("too small") if len(asked) < 2 + threads else EnoughSeenError
 
     monkeypatch.setattr(joint, "prepare", prepare)
     with pytest.raises(EnoughSeenError):
-        next(joint.merge(device, layers(LARGE), LARGE, Settings(flow_quality="best"), silent))
-    limit = Settings(flow_quality="best").working_limit
-    assert asked == [limit, limit // 2, limit // 4]
+        settings = Settings(flow_quality="best", threads=threads)
+        next(joint.merge(device, layers(LARGE), LARGE, settings, silent))
+    limit = settings.working_limit
+    assert asked == [*[limit] * threads, limit // 2, limit // 4]
