@@ -13,7 +13,8 @@ from types import FrameType
 
 _NAMES = ("SIGINT", "SIGTERM", "SIGHUP")  # Windows has no SIGHUP
 _ENDING = [getattr(signal, name) for name in _NAMES if hasattr(signal, name)]
-_installed: dict[int, Callable[[int, FrameType | None], None]] = {}  # while `interruptible`
+_Handler = Callable[[int, FrameType | None], None] | signal.Handlers
+_installed: dict[int, _Handler] = {}  # while `interruptible`
 
 
 @contextmanager
@@ -32,10 +33,10 @@ def interruptible() -> Iterator[None]:
         sys.unraisablehook = lambda unraisable: None  # what was being made may complain as it goes, at length
         raise KeyboardInterrupt
 
-    # What is ignored stays ignored: that is how nohup works.
+    # What is ignored stays ignored, whatever drivers do with it: that is how nohup works.
     before = {number: signal.getsignal(number) for number in _ENDING}
     changed = [number for number in _ENDING if before[number] is not signal.SIG_IGN]
-    _installed.update(dict.fromkeys(changed, interrupt))
+    _installed.update(dict.fromkeys(_ENDING, signal.SIG_IGN) | dict.fromkeys(changed, interrupt))
     _install()
     try:
         yield
