@@ -194,10 +194,9 @@ def _making_ready(device: Device, first: Layer, settings: Settings) -> Iterator[
     """Load and build what comes after reading, meanwhile: it takes half a second on one core, and several
     where kernels are compiled for the first time; a process that is to end waits for one step at most.
     """
-    kernels = [("coefficient", "")]  # and with it all others that take no options
-    kernels += [("flow", flow.board_options(wraps=False))] if settings.flow else []
     libraries = ("scipy.ndimage", "scipy.sparse.csgraph", "scipy.sparse.linalg")
-    steps: list[Callable[[], object]] = [partial(device.build, *one) for one in kernels]
+    steps: list[Callable[[], object]] = [partial(device.build, "coefficient")]  # and all without options
+    steps += [partial(device.build, "flow", flow.board_options(wraps=False))] if settings.flow else []
     steps += [partial(importlib.import_module, name) for name in libraries]
     steps += [partial(device.build, "blend", options) for options in blend.option_sets(device, first)]
     device.build("working", working.pixel_options(first)[0])  # else reading would wait for all the others

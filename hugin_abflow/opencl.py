@@ -163,9 +163,8 @@ class Device:
             pocl.name_processor(chosen.version, chosen.int_ptr)
             self.device = limited(chosen, threads)
             self.context = cl.Context([self.device])
-            self._timing = trace.is_recording()
-            self._first = Lane(self.context, 1, self._timing)
-        self._lanes = [self._first]
+            self._timing, self._lanes = trace.is_recording(), list[Lane]()
+            self._first = self._another_lane()
         self._free, self._entering, self._entered = list[Lane](), threading.Lock(), threading.local()
         self._bytes, self._counting = 0, threading.RLock()  # buffers may be collected while it is held
         self._kernels: dict[tuple[str, str], dict[str, cl.Kernel]] = {}
@@ -213,11 +212,8 @@ class Device:
         Until then no other thread may use what it makes, nor it what others are not done with.
         stopped: from when this is set on, to start a kernel raises `StoppedError`.
         """
-        with self._entering, signals.held(), _device_errors("starting another queue"):
-            if not self._free:
-                self._free.append(Lane(self.context, len(self._lanes) + 1, self._timing))
-                self._lanes.append(self._free[-1])
-            lane, before = self._free.pop(), self.current
+        with self._entering, _device_errors("starting another queue"):
+            lane, before = self._free.pop() if self._free else self._another_lane(), self.current
         lane.stopped, self._entered.lane = stopped, lane
         try:
             yield
@@ -227,6 +223,11 @@ class Device:
             finally:
                 self._entered.lane = before
                 self._free.append(lane)
+
+    def _another_lane(self) -> Lane:
+        with signals.held():  # as where the driver sets itself up
+            self._lanes.append(Lane(self.context, len(self._lanes) + 1, self._timing))
+        return self._lanes[-1]
 
     def empty(self, shape: Sequence[int], dtype: npt.DTypeLike = np.float32) -> Buffer:
         """An uninitialised array."""

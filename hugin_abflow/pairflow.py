@@ -95,7 +95,7 @@ def solve(
                 )  # fmt: skip
         mending = (partial(consistency.mend, device, weighed.pop(0)) for _ in range(len(weighed)))
         result = list(side_by_side(device, mending, abreast))
-        device.give_back()
+        device.give_back()  # it waits: else the time of one pair at a time would be told as what follows
     return result, shifts, singles
 
 

@@ -62,18 +62,20 @@ def _until_stopped(device: Device, begun: threading.Event, ended: list[BaseExcep
         raise
 
 
+def _fail(begun: threading.Event) -> None:
+    """Where another has begun."""
+    assert begun.wait(60)
+    raise OSError("mine")
+
+
 def test_where_one_fails_the_others_are_stopped_or_left(device: Device) -> None:
     begun, ended, left = threading.Event(), list[BaseException](), list[int]()
-
-    def fail() -> None:
-        assert begun.wait(60)
-        raise OSError("mine")
 
     def wait(number: int) -> None:
         left.append(number)
         time.sleep(0.05)
 
-    work: list[Callable[[], None]] = [fail, partial(_until_stopped, device, begun, ended)]
+    work: list[Callable[[], None]] = [partial(_fail, begun), partial(_until_stopped, device, begun, ended)]
     work += [partial(wait, k) for k in range(100)]
     with pytest.raises(OSError, match="mine"):
         list(side_by_side(device, work, 2))
@@ -83,12 +85,7 @@ def test_where_one_fails_the_others_are_stopped_or_left(device: Device) -> None:
 def test_what_fails_first_is_told_at_once(device: Device) -> None:
     """Not when its turn comes; that others were stopped for it is nothing to tell."""
     begun, ended, late = threading.Event(), list[BaseException](), list[int]()
-
-    def fail() -> None:
-        assert begun.wait(60)
-        raise OSError("mine")
-
-    work: list[Callable[[], None]] = [partial(_until_stopped, device, begun, ended), fail]
+    work: list[Callable[[], None]] = [partial(_until_stopped, device, begun, ended), partial(_fail, begun)]
     work += [partial(late.append, k) for k in range(5)]
     with pytest.raises(OSError, match="mine") as told:
         list(side_by_side(device, work, 2))

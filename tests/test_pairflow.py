@@ -145,41 +145,53 @@ def _three() -> list[Layer]:
     ]
 
 
+@pytest.fixture
+def lanes(monkeypatch: pytest.MonkeyPatch) -> list[int]:
+    """How many pairs are worked on at a time, each time."""
+    seen, side_by_side = list[int](), pairflow.side_by_side
+
+    def spy(device: Device, work: Any, lanes: int) -> Any:
+        seen.append(lanes)
+        return side_by_side(device, work, lanes)
+
+    monkeypatch.setattr(pairflow, "side_by_side", spy)
+    return seen
+
+
 @pytest.mark.parametrize(
     ("limit", "threads", "most"), [("roomy", 2, 2), ("roomy", 1, 1), ("tight", 2, 1), ("too low", 2, 1)]
 )
 def test_two_pairs_are_worked_on_at_a_time_where_memory_suffices(
-    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, limit: str, threads: int, most: int
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
+    lanes: list[int],
+    limit: str,
+    threads: int,
+    most: int,
 ) -> None:
     """They are the largest two that are reckoned with; nobody is refused for want of memory for two."""
     monkeypatch.setattr(joint.memory, "resident", lambda: 0)
     monkeypatch.setattr(joint, "_SOLVER_BYTES", 20_000)
-    sizes, seen = list[int](), list[int]()
-    draw, side_by_side = pairflow.charts, pairflow.side_by_side
+    sizes, draw = list[int](), pairflow.charts
 
     def spy_charts(*given: Any) -> list[chart.Chart]:
         charts = draw(*given)
         sizes[:] = [one.width * one.height for one in charts]
         return charts
 
-    def spy_side_by_side(device: Any, work: Any, lanes: int) -> Any:
-        seen.append(lanes)
-        return side_by_side(device, work, lanes)
-
     monkeypatch.setattr(pairflow, "charts", spy_charts)
-    monkeypatch.setattr(pairflow, "side_by_side", spy_side_by_side)
     expected = merged(_three(), CANVAS, threads=1)
     assert max(sizes) == sizes[0] and len(sizes) == 3
     one, two = 20_000 * sizes[0], 20_000 * (sizes[0] + max(sizes[1:]))
     bytes_ = {"roomy": 2 * two, "tight": (one + two) // 2, "too low": one // 2}[limit]
-    seen.clear()
+    lanes.clear()
     if limit == "too low":  # not given by the user, so it goes on
         monkeypatch.setattr(joint.memory, "limit", lambda given: bytes_)
     with caplog.at_level("INFO", "hugin_abflow.joint"):
         given = 0 if limit == "too low" else bytes_
         found = merged(_three(), CANVAS, threads=threads, max_memory=given)
     assert np.array_equal(found, expected)
-    assert seen == [most, most]
+    assert lanes == [most, most]
     (said,) = (record.args[0] for record in caplog.records if "at working resolution" in record.msg)
     reckoned = float(str(said).split()[0]) * (1 << 20)
     assert reckoned == pytest.approx(two if most == 2 else one, rel=0.2)
@@ -187,36 +199,32 @@ def test_two_pairs_are_worked_on_at_a_time_where_memory_suffices(
 
 @pytest.mark.parametrize("lacks", ["memory for two", "a second queue"])
 def test_one_pair_at_a_time_where_the_device_lacks(
-    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, lacks: str
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, lanes: list[int], lacks: str
 ) -> None:
     """What fits for one has to be the same as ever, and nothing to warn of."""
-    device, seen, side_by_side = Device(), list[int](), pairflow.side_by_side
+    device = Device()
 
     def merge() -> Any:
         settings = Settings(threads=2)
         return list(joint.merge(device, _three(), CANVAS, settings, silent))
 
     expected, solve = merge(), flow.solve
+    lanes.clear()
 
     def limited(device: Device, *given: Any, **more: Any) -> Any:
         if lacks == "memory for two" and device.current is not device._first:
             raise DeviceMemoryError("for one there is enough")
         return solve(device, *given, **more)
 
-    def spy(device: Any, work: Any, lanes: int) -> Any:
-        seen.append(lanes)
-        return side_by_side(device, work, lanes)
-
     def no_queue(*_: Any) -> Any:
         raise DeviceMemoryError("too many")
 
     monkeypatch.setattr(flow, "solve", limited)
-    monkeypatch.setattr(pairflow, "side_by_side", spy)
     if lacks == "a second queue":
         device._free.clear()
         monkeypatch.setattr(opencl, "Lane", no_queue)
     assert np.array_equal(np.concatenate(merge()), np.concatenate(expected))
-    assert seen == [2, 1, 1] and not caplog.records
+    assert lanes == [2, 1, 1] and not caplog.records
 
 
 def test_nothing_goes_on_when_the_run_is_interrupted(device: Device) -> None:
