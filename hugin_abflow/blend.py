@@ -38,8 +38,11 @@ _WHOLE_STRIP = 2 << 20
 _QUARTER_LEVEL = {np.dtype(np.uint8): 0.25 / 255}
 _QUARTER_FINE_LEVEL = 0.25 / 65535
 
+# Pixels of a row for which it is found out first which layers they show.
+_BLOCK = 64
+
 # Build options of what goes over coarse arrays, of floats whatever the layers are.
-_OF_COARSE = "-DPIXEL=float -DSAMPLES=4 -DWHITE=1.0f -DINTEGER=0 -DPIXELS=2"
+_OF_COARSE = f"-DPIXEL=float -DSAMPLES=4 -DWHITE=1.0f -DINTEGER=0 -DPIXELS=2 -DBLOCK={_BLOCK}"
 
 # A row of the table of layers: `blend_layer` of kernels/blend.cl.
 _LAYER = np.dtype(
@@ -168,12 +171,13 @@ def option_sets(device: Device, first: Layer) -> tuple[str, str]:
     """
     pixel, white = pixel_options(first)
     integer, together = int(first.dtype.kind == "u"), _pixels_together(device)
-    return f"{pixel} -DWHITE={white:.1f}f -DINTEGER={integer} -DPIXELS={together}", _OF_COARSE
+    pixel += f" -DWHITE={white:.1f}f -DINTEGER={integer} -DPIXELS={together} -DBLOCK={_BLOCK}"
+    return pixel, _OF_COARSE
 
 
 def _pixels_together(device: Device) -> int:
     """How many pixels of a row are made together."""
-    return 4 if device.has_long_vectors else 2
+    return 4 if device.vector_floats >= 8 else 2
 
 
 def _bands(
@@ -222,14 +226,15 @@ def _bands(
             for name, its_places in zip(("way", "gain", "offset"), places, strict=True):
                 table[name], table[name + "s"] = its_places[:, :4], its_places[:, 4]
             used = [k for k, (start, end) in enumerate(band.rows) if start < end]
+            touched = device.upload(table[used])
+            marks = _mark(device, store.rows, touched, ways.values, full, grid, part, options)
             latitudes = _turn(device, full.lens[2], -full.lens[3], part.top, part.height)
             out = device.empty((part.height, part.width, first.channels + 1), device_dtype(first))
             device.run(
-                "blend", "blend_band", groups, store.rows, device.upload(table[used]), len(used), ways.values,
-                gained.values, added.values, longitudes, latitudes, full.border, full.lens, grid.border,
-                gain_grid.border, offset_grid.border,
-                (part.left, part.top, *size), (region.left, region.top),
-                shoulder, int(settings.interpolation == "nearest"), share, out, options=options,
+                "blend", "blend_band", groups, store.rows, touched, len(used), ways.values, gained.values,
+                added.values, longitudes, latitudes, full.border, full.lens, grid.border, gain_grid.border,
+                offset_grid.border, (part.left, part.top, *size), (region.left, region.top), shoulder,
+                int(settings.interpolation == "nearest"), share, marks, marks.shape[-1], out, options=options,
             )  # fmt: skip
             yield out.get().astype(first.dtype, copy=False)
 
@@ -285,6 +290,30 @@ def _hide(
         "blend", "blend_hide", run[2:], ways, device.upload(places), len(places), run, share,
         options=_OF_COARSE,
     )  # fmt: skip
+
+
+def _mark(
+    device: Device,
+    rows: Buffer,
+    layers: Buffer,
+    ways: Buffer,
+    full: Grid,
+    grid: Grid,
+    part: Box,
+    options: str,
+) -> Buffer:
+    """Which of `layers` blocks of a band show, and which weigh something there: bits of uint32 (rows, blocks,
+    2, words).
+    """
+    count = layers.shape[0]
+    words, blocks = max(1, -(-count // 32)), -(-part.width // _BLOCK)
+    marks = device.empty((part.height, blocks, 2, words), np.uint32)
+    band = part.left, part.top, part.width, part.height
+    device.run(
+        "blend", "blend_mark", (blocks, part.height), rows, layers, count, ways, full.border, grid.border,
+        band, words, marks, options=options,
+    )  # fmt: skip
+    return marks
 
 
 def _coarse_rows(box: tuple[int, int, int, int], part: Box, scale: float) -> Span:

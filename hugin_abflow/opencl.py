@@ -38,13 +38,18 @@ _OF_PIXELS = frozenset({"blend", "working"})
 
 
 def kernel_source(*modules: str) -> str:
-    """Source of ``kernels/<module>.cl`` with common.cl in front; #line keeps messages true."""
-    return "".join(f'#line 1 "{name}.cl"\n{_kernel_files()[name]}\n' for name in ("common", *modules))
+    """Source of ``kernels/<module>.cl``, in front of it common.cl and what is its own, as blend_rows.cl of
+    blend.cl; #line keeps messages true.
+    """
+    files = _kernel_files()
+    parts = [name for one in modules for name in (*sorted(n for n in files if n.startswith(f"{one}_")), one)]
+    return "".join(f'#line 1 "{name}.cl"\n{files[name]}\n' for name in ("common", *parts))
 
 
 def _built_with(module: str, options: str) -> tuple[str, ...]:
     """The modules that are built with this one, and itself."""
-    others = sorted(_kernel_files().keys() - _OF_PIXELS - {"common"})
+    files = (name for name in _kernel_files() if "_" not in name)  # blend_rows.cl is a part of blend.cl
+    others = sorted(set(files) - _OF_PIXELS - {"common"})
     return tuple(others) if module in others and not options else (module,)
 
 
@@ -190,9 +195,9 @@ class Device:
             self._bytes += more
 
     @property
-    def has_long_vectors(self) -> bool:
-        """Whether it calculates with 16 floats at a time, as processors with AVX-512 do."""
-        return bool(self.device.native_vector_width_float >= 16)
+    def vector_floats(self) -> int:
+        """How many floats it calculates with at a time: 8 with AVX, 16 with AVX-512; graphics cards 1."""
+        return int(self.device.native_vector_width_float)
 
     @property
     def kind(self) -> str:

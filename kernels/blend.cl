@@ -1,93 +1,15 @@
 /* The full-resolution pass over one band of rows. Built with PIXEL (stored sample type), SAMPLES (2 or 4, alpha
-   last), WHITE (full scale), INTEGER (1: round and saturate) and PIXELS (2 or 4). Places are pixels of the region.
-
-   A work item makes PIXELS pixels side by side: what is known of each is blend_real or blend_int, their colours are
-   blend_samples, r, g, b and one value more of the first, then of the next. PoCL's compiler makes vectors of no more
-   than what is written as vectors, so these are as long as a processor's: with 4 pixels 64 bytes. */
+   last), WHITE (full scale), INTEGER (1: round and saturate), PIXELS (2 or 4, that a work item makes side by side)
+   and BLOCK (pixels, a multiple of PIXELS). Places are pixels of the region. */
 
 /* Of the cubic that layers are sampled with: Catmull-Rom's -1/2 loses a twentieth of fine texture's gradients over
    all fractions, this next to nothing; a ramp stays one to 0.03 px. */
 #define BLEND_SLOPE (-2.0f / 3.0f)
 
-/* One layer as a band needs it: 96 bytes, made by hugin_abflow/blend.py. */
-typedef struct {
-    int4 place;               /* of its stored rows: left, top, width, height */
-    int4 way, gain, offset;   /* of the rows at hand of its field, gains and offsets, each on its grid */
-    int ways, gains, offsets; /* where these begin; gains, offsets -1: none */
-    int rows, ring, turn;     /* where its stored rows begin, a ring of so many, the first one there */
-    int unused[2];
-} blend_layer;
-
-/* pixel_samples of common.cl for two pixels: in OpenCL C no text says which samples go where for both. */
-static inline float8 blend_pair(blend_two p) {
-#if SAMPLES > 2
-    return convert_float8(p);
-#else
-    return convert_float4(p).s00012223;
-#endif
-}
-
-/* The same for PIXELS, and back. */
-static inline blend_samples blend_colours(blend_pixels p) {
-#if SAMPLES > 2
-    return BLEND_FLOATS(p);
-#else
-    return PIXEL_VECTOR(convert_float, BLEND_STORED)(p).BLEND_SPREAD;
-#endif
-}
-
-static inline blend_pixels blend_stored(blend_samples v) {
-#if SAMPLES > 2
-    return PIXEL_VECTOR(convert_, PIXEL_VECTOR(PIXEL, BLEND_STORED))(v);
-#else
-    return PIXEL_VECTOR(convert_, PIXEL_VECTOR(PIXEL, BLEND_STORED))(v.BLEND_PACKED);
-#endif
-}
-
 /* Where r, g or b is not 0. */
 static inline blend_int blend_any(blend_samples v) {
     const blend_marks set = v != 0.0f;
     return set.REDS | set.GREENS | set.BLUES;
-}
-
-/* Which row of its ring a layer's row is. */
-static inline int blend_turned(__global const blend_layer *layer, int row) {
-    row += layer->turn;
-    return row - (row >= layer->ring ? layer->ring : 0);
-}
-
-/* Where it lies. */
-static inline __global const pixel_stored *blend_line(__global const pixel_stored *stored,
-                                                     __global const blend_layer *layer, int row) {
-    return stored + layer->rows + blend_turned(layer, row) * layer->place.z;
-}
-
-/* r, g, b in stored units and 1 for a valid pixel, else zeros. */
-static inline float4 blend_tap(__global const pixel_stored *stored, __global const blend_layer *layer, int2 p) {
-    const int4 place = layer->place;
-    const int x = p.x - place.x, y = p.y - place.y;
-    if (x < 0 || y < 0 || x >= place.z || y >= place.w)
-        return (float4)(0.0f);
-    const float4 c = pixel_samples(blend_line(stored, layer, y)[x]);
-    return c.w >= 0.5f * WHITE ? (float4)(c.xyz, 1.0f) : (float4)(0.0f);
-}
-
-/* blend_tap for p and the pixels to its right. */
-static inline blend_samples blend_taps(__global const pixel_stored *stored, __global const blend_layer *layer,
-                                       int2 p) {
-    const int4 place = layer->place;
-    const int x = p.x - place.x, y = p.y - place.y;
-    if (x <= -PIXELS || y < 0 || x >= place.z || y >= place.w)
-        return (blend_samples)(0.0f);
-#define BLEND_TAP(n, i) blend_tap(stored, layer, p + (int2)(n, 0))
-    if (x < 0 || x + PIXELS > place.z)
-        return (blend_samples)(BLEND_LIST(BLEND_TAP));
-    __global const pixel_stored *first = blend_line(stored, layer, y) + x;
-#define BLEND_NEXT(n, i) first[n]
-    blend_samples c = blend_colours((blend_pixels)(BLEND_LIST(BLEND_NEXT)));
-    const blend_int valid = c.FOURTHS >= 0.5f * WHITE;
-    c.FOURTHS = (blend_real)(1.0f);
-    return BLEND_EACH(valid) ? c : (blend_samples)(0.0f);
 }
 
 /* Four pixels of a row as stored; handed on by its address, as charts are in common.cl. */
@@ -318,9 +240,83 @@ static inline blend_samples blend_round(blend_samples v, blend_samples threshold
     return dithered ? (off <= 2e-7f * WHITE && off >= -2e-7f * WHITE ? nearest : spread) : nearest;
 }
 
-/* One band of the panorama: each pixel is the mean of the layers that cover it, sampled where their fields
-   say and weighted as they say. The sum is of differences from a reference, the first layer's own pixel, so
-   that equal colours stay equal to the bit; where nothing else is known, that is the result. */
+/* The number of a block of the band, by a place in it. */
+static inline int blend_block(int x, int y, int4 band) {
+    return y * ((band.z + BLOCK - 1) / BLOCK) + x / BLOCK;
+}
+
+/* The first layer from k on that is marked; count: none is. */
+static inline int blend_next(__global const uint *marks, int k, int count) {
+    for (; k < count; k = (k | 31) + 1) {
+        const uint left = marks[k >> 5] >> (k & 31);
+        if (left)
+            return k + popcount((left & -left) - 1u);
+    }
+    return count;
+}
+
+/* Whether one of `width` pixels from p on to the right is valid. */
+static inline int blend_shows(__global const pixel_stored *stored, __global const blend_layer *layer, int2 p,
+                              int width) {
+    const int4 place = layer->place;
+    const int y = p.y - place.y, left = GREATEST(p.x - place.x, 0), right = LEAST(p.x - place.x + width, place.z);
+    if (y < 0 || y >= place.w)
+        return 0;
+    __global const pixel_stored *line = blend_line(stored, layer, y);
+    for (int x = left; x < right; ++x)
+        if (line[x].BLEND_ALPHA >= 0.5f * WHITE)
+            return 1;
+    return 0;
+}
+
+/* Whether a weight that is read between the columns of the first pixel and of the last may be more than 0. */
+static inline int blend_weighs(blend_lines lines, blend_between at) {
+    const int first = at.left.x, last = at.right.y;
+    int some = last < first; /* across the border: not looked at */
+    for (int x = first; x <= last; ++x)
+        some |= lines.upper[x].w > 0.0f || lines.lower[x].w > 0.0f;
+    return some;
+}
+
+/* Which layers a row's blocks of BLOCK pixels show, and which of these may weigh something there: most layers that a
+   band touches are nowhere near, and mostly one alone is left. Bit k % 32 of word k / 32 is layer k's. */
+__kernel void blend_mark(
+    __global const pixel_stored *stored, __global const blend_layer *layers, int count, /* as blend_band has them */
+    __global const float4 *ways, int4 border, int4 field_border,                        /* so are these */
+    int4 band,             /* its place: left, top, width, height; run size: blocks, rows */
+    int words,             /* for a bit of each layer */
+    __global uint *marks)  /* (band.w, blocks, 2, words): shown, weighing */
+{
+    const int x = BLOCK * get_global_id(0), y = get_global_id(1);
+    if (x >= band.z || y >= band.w)
+        return;
+    const int2 place = (int2)(x + band.x, y + band.y);
+    const int width = LEAST(BLOCK, band.z - x);
+    blend_real ends = (blend_real)(place.x + width - 0.5f);
+    ends.x = place.x + 0.5f;
+    /* as blend_band calculates them */
+    const float2 scale = (float2)((float)border.x / field_border.x, (float)border.y / field_border.y);
+    const blend_between column = blend_columns(ends / scale.x);
+    const float row = (place.y + 0.5f) / scale.y;
+    __global uint *shown = marks + 2 * words * blend_block(x, y, band);
+    for (int word = 0; word < words; ++word) {
+        uint seen = 0, weighing = 0;
+        for (int k = 32 * word; k < LEAST(32 * word + 32, count); ++k) {
+            if (!blend_shows(stored, layers + k, place, width))
+                continue;
+            seen |= 1u << (k & 31);
+            const blend_lines beside = blend_beside(ways + layers[k].ways, layers[k].way, row);
+            if (blend_weighs(beside, blend_within(column, layers[k].way.xz, field_border)))
+                weighing |= 1u << (k & 31);
+        }
+        shown[word] = seen;
+        shown[words + word] = weighing;
+    }
+}
+
+/* One band of the panorama: each pixel is the mean of the layers that cover it, sampled where their fields say and
+   weighted as they say. The sum is of differences from the first of these samples, so that equal colours stay equal
+   to the bit. Where one layer is alone, or none weighs anything, a pixel is the first layer's own. */
 __kernel void blend_band(
     __global const pixel_stored *stored, /* a ring of rows for each layer: (ring, width) */
     __global const blend_layer *layers, int count, /* those that the band may touch */
@@ -336,6 +332,7 @@ __kernel void blend_band(
     float shoulder,                      /* of the exposure scale */
     int nearest,                         /* 1: nearest-neighbour sampling */
     float share,                         /* of all weight, below which a layer is hidden */
+    __global const uint *marks, int words, /* from blend_mark */
     __global pixel_stored *out)          /* (band.w, band.z) */
 {
     const int x = PIXELS * get_global_id(0), y = get_global_id(1);
@@ -352,27 +349,16 @@ __kernel void blend_band(
         gains, offsets, blend_within(blend_columns(px * gain_scale.x), (int2)(0, gain_border.x), gain_border),
         blend_columns(px * offset_scale.x), py * gain_scale.y, py * offset_scale.y, offset_border};
 
-    int first = count;
-    blend_correction correction, first_correction;
-    blend_int known = (blend_int)(0), several = (blend_int)(0), corrected = (blend_int)(0);
-    blend_samples reference = (blend_samples)(0.0f);
-    for (int k = 0; k < count && BLEND_SOME(!several); ++k) {
-        blend_samples own = blend_taps(stored, layers + k, place);
-        const blend_int seen = own.FOURTHS != 0.0f, fresh = seen & ~known;
+    /* which pixels any layer covers, and which several do */
+    __global const uint *shown = marks + 2 * words * blend_block(x, y, band);
+    blend_int known = (blend_int)(0), several = (blend_int)(0);
+    for (int k = -1; BLEND_SOME(!several) && (k = blend_next(shown, k + 1, count)) < count;) {
+        const blend_int seen = blend_valid(stored, layers + k, place);
         several |= seen & known;
         known |= seen;
-        if (!BLEND_SOME(fresh))
-            continue;
-        correction = blend_corrected(&corrections, layers + k);
-        if (first == count) {
-            first = k;
-            first_correction = correction;
-        }
-        own = blend_correct(own, correction, shoulder);
-        corrected |= fresh & correction.some;
-        reference = BLEND_EACH(fresh) ? own : reference;
     }
-    blend_samples sum = (blend_samples)(0.0f);
+    blend_int corrected = (blend_int)(0);
+    blend_samples reference = (blend_samples)(0.0f), sum = reference;
     if (BLEND_SOME(several)) {
         const blend_between column = blend_columns(px / scale.x);
         blend_real sl = (blend_real)(0.0f), cl = sl;
@@ -391,8 +377,9 @@ __kernel void blend_band(
         /* a second time with all layers, if most of what is seen lies outside its layer */
         for (int round = 0; round < 2 && BLEND_SOME(open); ++round) {
             blend_real total = (blend_real)(0.0f);
-            blend_samples all = (blend_samples)(0.0f);
-            for (int k = first; k < count; ++k) {
+            blend_samples all = (blend_samples)(0.0f), start = all;
+            __global const uint *marked = round ? shown : shown + words;
+            for (int k = -1; (k = blend_next(marked, k + 1, count)) < count;) {
                 blend_samples c = blend_taps(stored, layers + k, place);
                 blend_int seen = open & (c.FOURTHS != 0.0f);
                 if (!BLEND_SOME(seen))
@@ -423,20 +410,33 @@ __kernel void blend_band(
                 }
                 /* a sample that falls outside its layer counts smoothly less */
                 w *= c.FOURTHS * c.FOURTHS;
-                correction = k == first ? first_correction : blend_corrected(&corrections, layers + k);
+                const blend_correction correction = blend_corrected(&corrections, layers + k);
                 c = blend_correct(c, correction, shoulder);
                 corrected |= correction.some & (w > 0.0f);
-                blend_samples part = (c - reference) * BLEND_EACH(w);
+                start = BLEND_EACH(all.FOURTHS == 0.0f) ? c : start; /* the next, if that weighs nothing */
+                blend_samples part = (c - start) * BLEND_EACH(w);
                 part.FOURTHS = w;
                 all += part;
             }
             sum = BLEND_EACH(open) ? all : sum;
+            reference = BLEND_EACH(open) ? start : reference;
             open &= !(all.FOURTHS >= 0.5f * total);
             hidden = share * total;
         }
     }
     const blend_int mixed = sum.FOURTHS > 1e-30f;
-    blend_samples v = BLEND_EACH(mixed) ? reference + sum / BLEND_EACH(sum.FOURTHS) : reference;
+    blend_samples v = reference + sum / BLEND_EACH(mixed ? sum.FOURTHS : 1.0f);
+    blend_int alone = known & !mixed;
+    for (int k = -1; BLEND_SOME(alone) && (k = blend_next(shown, k + 1, count)) < count;) {
+        const blend_samples own = blend_taps(stored, layers + k, place);
+        const blend_int fresh = alone & (own.FOURTHS != 0.0f);
+        if (!BLEND_SOME(fresh))
+            continue;
+        const blend_correction correction = blend_corrected(&corrections, layers + k);
+        v = BLEND_EACH(fresh) ? blend_correct(own, correction, shoulder) : v;
+        corrected |= fresh & correction.some;
+        alone &= !fresh;
+    }
     v.FOURTHS = known ? (blend_real)(WHITE) : (blend_real)(0.0f);
     if (INTEGER)
         v = blend_round(v, blend_thresholds(place.x + origin.x, place.y + origin.y), BLEND_EACH(corrected));

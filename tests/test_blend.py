@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
-from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -18,16 +16,18 @@ from tolerances import DECISIONS, POSITION, SUM, assert_close
 from hugin_abflow import blend, working
 from hugin_abflow.layer import Box, Layer
 from hugin_abflow.opencl import Device
-from hugin_abflow.settings import Settings
 from hugin_abflow.working import Grid
 
 STORED = [(dtype, channels) for dtype in (np.uint8, np.uint16, np.float32) for channels in (1, 3)]
 GRIDS = {"plane": plane(), "cylinder": plane(wraps=True), "sphere": sphere(), "odd sphere": sphere(77, 39)}
+BLOCK = 16
+MARK = 0xABAD1DEA  # where nothing is written
 
 
 def options_of(layer: Layer, together: int) -> tuple[str, float]:
     pixel, white = working.pixel_options(layer)
-    return f"{pixel} -DWHITE={white:.1f}f -DINTEGER={int(layer.dtype.kind == 'u')} -DPIXELS={together}", white
+    integer = int(layer.dtype.kind == "u")
+    return f"{pixel} -DWHITE={white:.1f}f -DINTEGER={integer} -DPIXELS={together} -DBLOCK={BLOCK}", white
 
 
 def test_twin_of_sample_is_what_its_words_say() -> None:
@@ -112,7 +112,7 @@ def hidden(device: Device, fields: list, boxes: list, part: tuple, share: float)
     ways = device.upload(np.concatenate([field.reshape(-1, 4) for field in fields]))
     device.run(
         "blend", "blend_hide", part[2:], ways, device.upload(table), len(boxes), part, share,
-        options="-DPIXEL=float -DSAMPLES=4 -DWHITE=1.0f -DINTEGER=0 -DPIXELS=2",
+        options=f"-DPIXEL=float -DSAMPLES=4 -DWHITE=1.0f -DINTEGER=0 -DPIXELS=2 -DBLOCK={BLOCK}",
     )  # fmt: skip
     parts = np.split(ways.get(), begins[1:-1])
     return [one.reshape(field.shape) for one, field in zip(parts, fields, strict=True)]
@@ -170,17 +170,33 @@ def test_a_band_of_three_layers_equals_its_twin(
         for arrays in (turned, ways, gains[1:], offsets)
     ]
     rows, lines, factors, summands = (device.upload(a) for a in packed)
+    touched, blocks = device.upload(table), -(-width // BLOCK)
+    marks = device.empty((band[3] + 1, blocks, 2, 1), np.uint32).fill(MARK)
     device.run(
-        "blend", "blend_band", (-(-width // together), band[3]), rows, device.upload(table), 3, lines,
-        factors, summands, *axes, full.border, full.lens, grid.border, cells.border, halves.border, band,
-        origin, shoulder, nearest, share, out, options=options,
+        "blend", "blend_mark", (blocks, band[3]), rows, touched, 3, lines, full.border, grid.border, band, 1,
+        marks, options=options,
     )  # fmt: skip
+    marked = [
+        twin.blend_mark(stored, places, ways, boxes, full.border, grid.border, band, BLOCK, white),
+        np.full((36, blocks, 2, 1), 0b111),
+    ]
+    assert np.array_equal(marks.get(), np.concatenate([marked[0], np.full((1, blocks, 2, 1), MARK)]))
+    assert 0 < (marked[0] != 0b111).mean() < 1
+    made = []
+    for given in marked:
+        device.run(
+            "blend", "blend_band", (-(-width // together), band[3]), rows, touched, 3, lines, factors,
+            summands, *axes, full.border, full.lens, grid.border, cells.border, halves.border, band, origin,
+            shoulder, nearest, share, device.upload(given.astype(np.uint32)), 1, out, options=options,
+        )  # fmt: skip
+        made.append(out.get())
+    assert np.array_equal(*made)  # what is not marked changes nothing
     raised = [(spans[0], offsets[0]), None, (spans[1], offsets[1])]
     expected = twin.blend_band(
         stored, places, ways, boxes, gains, raised, full.border, full.lens, grid.border, cells.border,
         halves.border, band, origin, shoulder, nearest, share, white,
     )  # fmt: skip
-    result, beyond = np.split(out.get(), [36])
+    result, beyond = np.split(made[0], [36])
     assert not beyond.any()
     assert 0.6 < (expected[..., -1] > 0).mean() < 1
     assert np.array_equal(result[..., -1] > 0, expected[..., -1] > 0)
@@ -258,73 +274,6 @@ def test_a_band_sees_the_next_rows_displacements(device: Device) -> None:
         assert np.array_equal(merged(device, [layer, layer], full, grid, rows=rows), whole)
 
 
-def test_bands_are_as_high_as_memory_allows(device: Device, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The result is the same; what cannot be kept is told."""
-    full = plane(500, 400)
-    grid = full.resized(50, 40)
-    pixels = stored_pixels(30, 500, 400, np.uint8, 3, 0.9)
-    layers = [blend_layer(device, pixels, 0, 0, full, grid)] * 2
-    heights, results, warnings = [], [], []
-    monkeypatch.setattr(blend, "_SLACK", 0)
-    monkeypatch.setattr(blend.memory, "resident", lambda: 0)
-    monkeypatch.setattr(blend._log, "warning", lambda *said: warnings.append(said))
-    for limit in (0, 6 << 20, 3 << 20, 1 << 18):
-        settings = Settings(max_memory=limit)
-        cells = grid.resized(7, 5)
-        parts = list(
-            blend.bands(
-                device, layers, full, grid, cells, cells, 1.0, full.region, settings, lambda units: None
-            )
-        )
-        heights.append(len(parts[0]))
-        results.append(np.concatenate(parts))
-    assert heights[0] == 400 > heights[1] > heights[2] > heights[3] == blend._LEAST_ROWS
-    assert all(np.array_equal(result, results[0]) for result in results)
-    assert len(warnings) == 1
-
-
-def test_layers_that_no_band_needs_together_share_memory() -> None:
-    """A column of many small layers takes no more than those that meet; none lies over another in use."""
-    pixels = np.zeros((20, 30, 4), np.uint8)
-    layers = [Layer.from_array("l", pixels, 0, 15 * k) for k in range(40)]
-    spans = [
-        [(max(0, top - layer.box.top), max(0, min(20, top + 10 - layer.box.top))) for layer in layers]
-        for top in range(0, 605, 10)
-    ]
-    spans = [[(a, b) if a < b else (0, 0) for a, b in band] for band in spans]
-    shelves = blend._shelves(layers, spans)
-    assert shelves.total <= 3 * 20 * 30
-    for band in spans:
-        used = [k for k, (start, end) in enumerate(band) if start < end]
-        taken = sorted((shelves.rings[k].start, shelves.rings[k].rows * 30) for k in used)
-        assert all(a + size <= b for (a, size), (b, _) in pairwise(taken))
-        assert all(shelves.rings[k].rows >= band[k][1] - band[k][0] for k in used)
-
-
-@pytest.mark.parametrize(("far", "strip"), [(0.0, 1), (9.0, 1), (9.0, 16)])
-def test_a_band_reads_only_rows_that_it_needs(device: Device, far: float, strip: int) -> None:
-    """Memory grows with the band, not with the picture; and no row is read twice, where one band reaches far
-    back either. Where a file decodes strips, whole ones are asked for."""
-    full = plane(77, 300)
-    grid = full.resized(39, 150)
-    pixels = stored_pixels(14, 77, 300, np.uint8, 3, 1)
-    asked: list[tuple[int, int]] = []
-    field = np.zeros((150, 39, 4), np.float32)
-    field[..., 3] = 1
-    field[70, :, 1] = -far
-    layer = blend_layer(device, pixels, 0, 0, full, grid, field)
-    watched = Layer(
-        "w", layer.layer.box, np.dtype(np.uint8), 3,
-        lambda top, bottom: (asked.append((top, bottom)), pixels[top:bottom])[1], strip=strip,
-    )  # fmt: skip
-    layers = [replace(layer, layer=watched)] * 2
-    assert np.array_equal(merged(device, layers, full, grid, rows=10), pixels) == (far == 0)
-    assert max(bottom - top for top, bottom in asked) <= 10 + 2 * (3 + 2 * far) + strip - 1
-    assert all(top % strip == 0 for top, _ in asked)
-    rows = [row for top, bottom in asked for row in range(top, bottom)]
-    assert sorted(rows) == sorted([*range(300)] * 2)
-
-
 @pytest.mark.parametrize(("dtype", "channels"), [*STORED, (np.float16, 3)])
 @pytest.mark.parametrize("name", ["plane", "sphere"])
 def test_layers_cut_from_one_picture_come_back(device: Device, dtype: type, channels: int, name: str) -> None:
@@ -348,6 +297,42 @@ def test_layers_cut_from_one_picture_come_back(device: Device, dtype: type, chan
     assert np.array_equal(out[..., -1] > 0, covered)
     assert np.array_equal(out[covered], picture[covered])
     assert not out[~covered].any()
+
+
+@pytest.mark.parametrize("count", [32, 33, 70])
+def test_more_layers_than_a_word_has_bits_come_back(device: Device, count: int) -> None:
+    """Which of them a block shows is kept in bits: the first and the last of a word, and the next word's."""
+    full = plane()
+    grid = full.resized(31, 17)
+    picture = stored_pixels(41, 77, 53, np.uint8, 3, 1)
+    covered, layers = np.zeros((53, 77), bool), []
+    for left, top in np.random.default_rng(42).integers(0, (66, 44), (count, 2)).tolist():
+        covered[top : top + 9, left : left + 11] = True
+        layers.append(blend_layer(device, picture[top : top + 9, left : left + 11], left, top, full, grid))
+    out = merged(device, layers, full, grid)
+    assert 0.3 < covered.mean() < 1
+    np.testing.assert_array_equal(out, np.where(covered[..., None], picture, 0))
+
+
+@pytest.mark.parametrize("floats", [1, 4, 8, 16])
+def test_pixels_that_are_made_together_are_the_same(
+    device: Device, monkeypatch: pytest.MonkeyPatch, floats: int
+) -> None:
+    """As many as fit a processor's vectors."""
+    full = GRIDS["sphere"]
+    grid = full.resized(31, 17)
+    layers = [
+        blend_layer(
+            device, stored_pixels(43 + i, full.width, full.height, np.uint8, 3, 0.9), 0, 0, full, grid,
+            field_of(45 + i, grid, (0, 0, 31, 17), 2.0),
+        )
+        for i in (0, 1)
+    ]  # fmt: skip
+    usual = merged(device, layers, full, grid)
+    monkeypatch.setattr(type(device), "vector_floats", floats)
+    assert blend._pixels_together(device) == (2 if floats < 8 else 4)
+    off = merged(device, layers, full, grid) != usual
+    assert off.mean() <= DECISIONS  # compilers may contract sums in another way
 
 
 def test_a_union_pixel_is_never_transparent(device: Device) -> None:

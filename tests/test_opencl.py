@@ -19,7 +19,8 @@ from hugin_abflow.errors import DeviceError
 from hugin_abflow.opencl import Device, kernel_source
 
 KERNELS = Path(__file__).parent.parent / "kernels"
-MODULES = sorted(path.stem for path in KERNELS.glob("*.cl") if path.stem != "common")
+PARTS = {"blend_rows": "blend"}  # files that are no module's own, but in front of one
+MODULES = sorted({path.stem for path in KERNELS.glob("*.cl")} - {"common"} - PARTS.keys())
 
 
 def kernels_of(module: str) -> list[str]:
@@ -32,7 +33,7 @@ def option_sets(module: str) -> list[str]:
         return [""]
     sets = []
     for (name, white), samples, together in product(working.PIXEL.values(), (2, 4), (2, 4)):
-        full_scale = f" -DWHITE={white:.1f}f -DINTEGER={int(white > 1)} -DPIXELS={together}"
+        full_scale = f" -DWHITE={white:.1f}f -DINTEGER={int(white > 1)} -DPIXELS={together} -DBLOCK=64"
         sets.append(f"-DPIXEL={name} -DSAMPLES={samples}{full_scale if module == 'blend' else ''}")
     return sorted(set(sets))
 
@@ -135,6 +136,13 @@ def test_source_lines_keep_their_own_file_and_number() -> None:
     assert source.startswith('#line 1 "common.cl"\n')
     own = source.partition('#line 1 "working.cl"\n')[2]
     assert own.rstrip("\n") == (KERNELS / "working.cl").read_text().rstrip("\n")
+
+
+def test_a_part_is_in_front_of_its_file_alone() -> None:
+    for part, module in PARTS.items():
+        heads = [line for line in kernel_source(module).splitlines() if line.startswith("#line")]
+        assert heads == [f'#line 1 "{name}.cl"' for name in ("common", part, module)]
+        assert all(f'"{part}.cl"' not in kernel_source(other) for other in MODULES if other != module)
 
 
 def test_a_kernel_is_built_once(device: Device) -> None:

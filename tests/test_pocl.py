@@ -117,7 +117,7 @@ def test_what_could_not_run_is_not_guessed() -> None:
 
 
 # With long vectors, of 16 numbers.
-OPTIONS = "-DPIXEL=uchar -DSAMPLES=4 -DWHITE=255.0f -DINTEGER=1 -DPIXELS=4"
+OPTIONS = "-DPIXEL=uchar -DSAMPLES=4 -DWHITE=255.0f -DINTEGER=1 -DPIXELS=4 -DBLOCK=64"
 
 _RENAMED_RUN = """
 import sys

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 import numpy as np
@@ -104,6 +105,41 @@ def blend_hide(fields: Sequence[Array], boxes: Sequence[Sequence[int]], share: f
     return hidden
 
 
+def blend_mark(
+    stored: Sequence[Array],
+    places: Sequence[Sequence[int]],
+    ways: Sequence[Array],
+    boxes: Sequence[Sequence[int]],
+    border: Sequence[int],
+    field_border: Sequence[int],
+    band: Sequence[int],
+    block: int,
+    white: float,
+) -> Array:
+    """Bits of layers that blocks of rows show, and of those with a positive weight among what is read there,
+    or that read across the border: integers (rows, blocks, 2, words).
+    """
+    left, top, width, height = band
+    count = -(-width // block)
+    marks = np.zeros((height, count, 2, max(1, -(-len(stored) // 32))), np.int64)
+    for k, (rows, place, way, box) in enumerate(zip(stored, places, ways, boxes, strict=True)):
+        valid = np.zeros((height, count * block), bool)
+        columns, lines = pixels(width, height, left, top)
+        valid[:, :width] = take(opaque(rows, white), place, columns, lines)[..., 3] > 0
+        shown = valid.reshape(height, count, block).any(-1)
+        for y, b in np.argwhere(shown):
+            ends = np.array([b * block, min(width, (b + 1) * block) - 1]) + left + 0.5
+            q = np.floor(ends * field_border[0] / border[0] - 0.5) - box[0] + [0, 1]
+            if field_border[2] and box[2] == field_border[0]:
+                q %= box[2]
+            first, last = np.clip(q, 0, box[2] - 1).astype(int)
+            q = math.floor((y + top + 0.5) * field_border[1] / border[1] - 0.5) - box[1]
+            upper, lower = (min(max(row, 0), box[3] - 1) for row in (q, q + 1))
+            weighs = last < first or (way[[upper, lower], first : last + 1, 3] > 0).any()
+            marks[y, b, :, k // 32] |= np.array([1, weighs]) << (k % 32)
+    return marks
+
+
 def blend_band(
     stored: Sequence[Array],
     places: Sequence[Sequence[int]],
@@ -154,28 +190,30 @@ def blend_band(
         some = ((exposure != 0) | (raised != 0)).any(-1)
         seen.append((own[..., 3] > 0, looks, f[..., 3], colour[..., 3], some))
     count = sum(layer[0].astype(int) for layer in seen)
-    reference, corrected, known = np.zeros((*x.shape, 3)), np.zeros(x.shape, bool), np.zeros(x.shape, bool)
+    own, corrected, known = np.zeros((*x.shape, 3)), np.zeros(x.shape, bool), np.zeros(x.shape, bool)
     for covered, looks, _, _, exposed in seen:
         fresh = covered & ~known
-        reference = np.where(fresh[..., None], looks[0], reference)
+        own = np.where(fresh[..., None], looks[0], own)
         corrected, known = corrected | (fresh & exposed), known | covered
 
     def mean(hidden: Array) -> tuple[Array, Array, Array, Array]:
-        total, weight, difference, touched = (np.zeros((*x.shape, n)) for n in (1, 1, 3, 1))
+        total, weight, summed, touched = (np.zeros((*x.shape, n)) for n in (1, 1, 3, 1))
         for covered, looks, wanted, valid, exposed in seen:
             w = np.where(covered & (count > 1), np.maximum(wanted + hidden, 0), 0)[..., None]
             total, w = total + w, w * valid[..., None] ** 2
-            weight, difference = weight + w, difference + (looks[1] - reference) * w
+            weight, summed = weight + w, summed + looks[1] * w
             touched = touched + ((w > 0) & exposed[..., None])
-        return total[..., 0], weight, difference, touched[..., 0] > 0
+        return total[..., 0], weight, summed, touched[..., 0] > 0
 
-    total, weight, difference, touched = mean(np.zeros(x.shape))
+    total, weight, summed, touched = mean(np.zeros(x.shape))
     again = weight[..., 0] < 0.5 * total
     _, *second = mean(share * total)
     weight = np.where(again[..., None], second[0], weight)
-    difference = np.where(again[..., None], second[1], difference)
-    corrected |= touched | (again & second[2])
-    colour = reference + np.where(weight > 1e-12, difference / np.where(weight > 1e-12, weight, 1), 0.0)
+    summed = np.where(again[..., None], second[1], summed)
+    touched |= again & second[2]
+    mixed = weight > 1e-12
+    colour = np.where(mixed, summed / np.where(mixed, weight, 1), own)
+    corrected = touched | (corrected & ~mixed[..., 0])
     alpha = np.where(known, white, 0.0)[..., None]
     out = np.concatenate([colour if stored[0].shape[-1] == 4 else colour[..., :1], alpha], -1)
     if white == 1:
