@@ -1,5 +1,6 @@
 """The commands: to load what they need takes a while, in which Ctrl-C may come."""
 
+import gc
 import os
 import sys
 from importlib import import_module
@@ -23,11 +24,14 @@ def setup() -> int:
 def _run(program: str, module: str) -> int:
     # before NumPy is loaded: idle threads of its BLAS turn round and round, on cores that others need
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    gc.disable()  # what is loaded stays: there is nothing to be found, now or later
     try:
         command = import_module(module).main
     except KeyboardInterrupt:
         print(f"{program}: interrupted", file=sys.stderr)
         return 130  # ExitCode.INTERRUPTED
+    gc.freeze()
+    gc.enable()
     try:
         return int(command())
     finally:

@@ -247,10 +247,11 @@ static inline int blend_block(int x, int y, int4 band) {
 
 /* The first layer from k on that is marked; count: none is. */
 static inline int blend_next(__global const uint *marks, int k, int count) {
-    for (; k < count; k = (k | 31) + 1) {
-        const uint left = marks[k >> 5] >> (k & 31);
-        if (left)
-            return k + popcount((left & -left) - 1u);
+    for (; k < count; ++k) {
+        const uint rest = marks[k >> 5] >> (k & 31);
+        if (rest & 1u)
+            return k;
+        k |= rest ? 0 : 31; /* a word may be all that is left of many layers */
     }
     return count;
 }

@@ -189,6 +189,8 @@ __kernel void geometry_reach(__global const float4 *field, /* (box.w, box.z) */
     float longest = 0.0f, furthest = 0.0f;
     for (int x = 0; x < box.z; ++x) {
         const float3 d = field[y * box.z + x].xyz;
+        if (d.x == 0.0f && d.y == 0.0f && d.z == 0.0f)
+            continue; /* as most of a layer */
         const float2 q = (float2)(x + box.x, y + box.y) + 0.5f;
         longest = GREATEST(longest, square3(d));
         furthest = GREATEST(furthest, MAGNITUDE(layer_position(q, d, lens).y - q.y));
