@@ -41,15 +41,20 @@ def kernel_source(*modules: str) -> str:
     """Source of ``kernels/<module>.cl``, in front of it common.cl and what is its own, as blend_rows.cl of
     blend.cl; #line keeps messages true.
     """
-    files = _kernel_files()
-    parts = [name for one in modules for name in (*sorted(n for n in files if n.startswith(f"{one}_")), one)]
-    return "".join(f'#line 1 "{name}.cl"\n{files[name]}\n' for name in ("common", *parts))
+    names = ["common", *(name for one in modules for name in (*_parts(one), one))]
+    return "".join(f'#line 1 "{name}.cl"\n{_kernel_files()[name]}\n' for name in names)
+
+
+def _parts(module: str) -> list[str]:
+    """The files that are in front of a module's own, whose names begin with its name."""
+    return sorted(name for name in _kernel_files() if name.startswith(f"{module}_"))
 
 
 def _built_with(module: str, options: str) -> tuple[str, ...]:
     """The modules that are built with this one, and itself."""
-    files = (name for name in _kernel_files() if "_" not in name)  # blend_rows.cl is a part of blend.cl
-    others = sorted(set(files) - _OF_PIXELS - {"common"})
+    files = _kernel_files().keys()
+    parts = {part for one in files for part in _parts(one)}
+    others = sorted(files - parts - _OF_PIXELS - {"common"})
     return tuple(others) if module in others and not options else (module,)
 
 

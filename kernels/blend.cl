@@ -251,7 +251,7 @@ static inline int blend_next(__global const uint *marks, int k, int count) {
         const uint rest = marks[k >> 5] >> (k & 31);
         if (rest & 1u)
             return k;
-        k |= rest ? 0 : 31; /* a word may be all that is left of many layers */
+        k |= rest ? 0 : 31; /* none is left in this word: on to the next */
     }
     return count;
 }
@@ -270,10 +270,12 @@ static inline int blend_shows(__global const pixel_stored *stored, __global cons
     return 0;
 }
 
-/* Whether a weight that is read between the columns of the first pixel and of the last may be more than 0. */
-static inline int blend_weighs(blend_lines lines, blend_between at) {
+/* Whether a weight that is read between the columns of a first pixel, as x, and of a last one, as y, may be more than
+   0. All round a canvas, or across its border, is not looked at: it may. */
+static inline int blend_weighs(blend_lines lines, blend_between columns, int2 span, int4 border) {
+    const blend_between at = blend_within(columns, span, border);
     const int first = at.left.x, last = at.right.y;
-    int some = last < first; /* across the border: not looked at */
+    int some = columns.right.y - columns.left.x >= border.x || last < first;
     for (int x = first; x <= last; ++x)
         some |= lines.upper[x].w > 0.0f || lines.lower[x].w > 0.0f;
     return some;
@@ -293,11 +295,11 @@ __kernel void blend_mark(
         return;
     const int2 place = (int2)(x + band.x, y + band.y);
     const int width = LEAST(BLOCK, band.z - x);
-    blend_real ends = (blend_real)(place.x + width - 0.5f);
+    blend_real ends = (blend_real)(place.x + width - 0.5f); /* the last pixel's, and as x the first one's */
     ends.x = place.x + 0.5f;
     /* as blend_band calculates them */
     const float2 scale = (float2)((float)border.x / field_border.x, (float)border.y / field_border.y);
-    const blend_between column = blend_columns(ends / scale.x);
+    const blend_between columns = blend_columns(ends / scale.x);
     const float row = (place.y + 0.5f) / scale.y;
     __global uint *shown = marks + 2 * words * blend_block(x, y, band);
     for (int word = 0; word < words; ++word) {
@@ -307,7 +309,7 @@ __kernel void blend_mark(
                 continue;
             seen |= 1u << (k & 31);
             const blend_lines beside = blend_beside(ways + layers[k].ways, layers[k].way, row);
-            if (blend_weighs(beside, blend_within(column, layers[k].way.xz, field_border)))
+            if (blend_weighs(beside, columns, layers[k].way.xz, field_border))
                 weighing |= 1u << (k & 31);
         }
         shown[word] = seen;
@@ -317,7 +319,7 @@ __kernel void blend_mark(
 
 /* One band of the panorama: each pixel is the mean of the layers that cover it, sampled where their fields say and
    weighted as they say. The sum is of differences from the first of these samples, so that equal colours stay equal
-   to the bit. Where one layer is alone, or none weighs anything, a pixel is the first layer's own. */
+   to the bit. Where only one covers it, or none weighs anything, a pixel is the first layer's own. */
 __kernel void blend_band(
     __global const pixel_stored *stored, /* a ring of rows for each layer: (ring, width) */
     __global const blend_layer *layers, int count, /* those that the band may touch */

@@ -335,6 +335,49 @@ def test_pixels_that_are_made_together_are_the_same(
     assert off.mean() <= DECISIONS  # compilers may contract sums in another way
 
 
+@pytest.mark.parametrize(("width", "columns"), [(64, 64), (30, 30), (76, 8), (94, 2), (77, 3)])
+def test_a_block_that_goes_round_the_canvas_finds_all_weights(
+    device: Device, monkeypatch: pytest.MonkeyPatch, width: int, columns: int
+) -> None:
+    """Its first column and its last may be the same, or in order, and yet all are read between them."""
+    full = Grid(Box(0, 0, width, 12), width, 12, True, 0, (0.0, 0.0, 0.0, 0.0))
+    grid = full.resized(columns, 12)
+    fields = np.zeros((2, 12, columns, 4), np.float32)
+    fields[0, :, 0, 3] = fields[1, :, 1:, 3] = 1
+    layers = [
+        blend_layer(device, np.full((12, width, 4), (*[value] * 3, 255), np.uint8), 0, 0, full, grid, field)
+        for value, field in zip((50, 200), fields, strict=True)
+    ]
+    crop = Box(-20, 0, width + 20, 12)
+    found = merged(device, layers, full, grid, crop)
+    real = blend._mark
+    monkeypatch.setattr(blend, "_mark", lambda *told: real(*told).fill(0xFFFFFFFF))
+    assert np.array_equal(merged(device, layers, full, grid, crop), found)
+    assert found[5, 20:-20, 0].min() < 80 < 180 < found[5, 20:-20, 0].max()
+
+
+def test_a_layer_of_one_column_is_found_anywhere_in_a_block(device: Device) -> None:
+    full = plane()
+    grid = full.resized(31, 17)
+    pixels = stored_pixels(47, 1, 53, np.uint8, 3, 1)
+    for column in (0, 1, 62, 63, 64, 65, 76):
+        out = merged(device, [blend_layer(device, pixels, column, 0, full, grid)], full, grid)
+        assert np.array_equal(out[:, column : column + 1], pixels)
+        assert not np.delete(out, column, 1).any()
+
+
+def test_one_sample_that_counts_is_the_pixel(device: Device) -> None:
+    """To the bit, where an earlier layer weighs something too, but is sampled outside itself."""
+    full = plane()
+    grid = full.resized(77, 53)
+    pixels = [stored_pixels(48 + i, 77, 53, np.float32, 3, 1) for i in (0, 1)]
+    lost = np.zeros((53, 77, 4), np.float32)
+    lost[...] = 500, 0, 0, 0.3
+    still = np.float32([0, 0, 0, 0.7]) + np.zeros_like(lost)
+    layers = [blend_layer(device, p, 0, 0, full, grid, f) for p, f in zip(pixels, (lost, still), strict=True)]
+    assert np.array_equal(merged(device, layers, full, grid), pixels[1])
+
+
 def test_a_union_pixel_is_never_transparent(device: Device) -> None:
     """Even where both layers are sampled far outside themselves, or nobody has any weight."""
     full = plane()

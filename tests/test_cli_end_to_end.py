@@ -299,6 +299,16 @@ def test_interruption_while_modules_load_is_no_traceback(
     assert done.returncode == 0 and done.stdout.startswith(program)
 
 
+def test_garbage_is_looked_for_in_a_run_but_not_among_modules(tmp_path: Path) -> None:
+    stub = "import gc\nloading = gc.isenabled()\ndef main():\n"
+    stub += "    print(loading, gc.isenabled(), gc.get_freeze_count())\n    return 0\n"
+    (tmp_path / "stub.py").write_text(stub)
+    command = [sys.executable, "-c", "from hugin_abflow.__main__ import _run; exit(_run('stub', 'stub'))"]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=60, check=True)
+    loading, running, frozen = done.stdout.split()
+    assert (loading, running) == ("False", "True") and int(frozen) > 1000
+
+
 @pytest.mark.skipif(os.name == "nt", reason="Windows has no such signals")
 @pytest.mark.parametrize(
     ("number", "line", "jobs"), [(signal.SIGINT, 1, 1), (signal.SIGTERM, 8, 1), (signal.SIGTERM, 12, 3)]

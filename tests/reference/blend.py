@@ -117,7 +117,7 @@ def blend_mark(
     white: float,
 ) -> Array:
     """Bits of layers that blocks of rows show, and of those with a positive weight among what is read there,
-    or that read across the border: integers (rows, blocks, 2, words).
+    or that read across the border or all round: integers (rows, blocks, 2, words).
     """
     left, top, width, height = band
     count = -(-width // block)
@@ -130,12 +130,13 @@ def blend_mark(
         for y, b in np.argwhere(shown):
             ends = np.array([b * block, min(width, (b + 1) * block) - 1]) + left + 0.5
             q = np.floor(ends * field_border[0] / border[0] - 0.5) - box[0] + [0, 1]
+            all_round = q[1] - q[0] >= field_border[0]
             if field_border[2] and box[2] == field_border[0]:
                 q %= box[2]
             first, last = np.clip(q, 0, box[2] - 1).astype(int)
             q = math.floor((y + top + 0.5) * field_border[1] / border[1] - 0.5) - box[1]
             upper, lower = (min(max(row, 0), box[3] - 1) for row in (q, q + 1))
-            weighs = last < first or (way[[upper, lower], first : last + 1, 3] > 0).any()
+            weighs = all_round or last < first or (way[[upper, lower], first : last + 1, 3] > 0).any()
             marks[y, b, :, k // 32] |= np.array([1, weighs]) << (k % 32)
     return marks
 
