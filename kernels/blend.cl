@@ -297,8 +297,7 @@ __kernel void blend_mark(
     const int width = LEAST(BLOCK, band.z - x);
     blend_real ends = (blend_real)(place.x + width - 0.5f); /* the last pixel's, and as x the first one's */
     ends.x = place.x + 0.5f;
-    /* as blend_band calculates them */
-    const float2 scale = (float2)((float)border.x / field_border.x, (float)border.y / field_border.y);
+    const float2 scale = blend_scale(border, field_border);
     const blend_between columns = blend_columns(ends / scale.x);
     const float row = (place.y + 0.5f) / scale.y;
     __global uint *shown = marks + 2 * words * blend_block(x, y, band);
@@ -345,9 +344,8 @@ __kernel void blend_band(
 #define BLEND_NUMBER(n, i) n
     const blend_real px = BLEND_REALS(place.x + (blend_int)(BLEND_LIST(BLEND_NUMBER))) + 0.5f;
     const float py = place.y + 0.5f;
-    const float2 scale = (float2)((float)border.x / field_border.x, (float)border.y / field_border.y);
-    const float2 gain_scale = (float2)((float)gain_border.x / border.x, (float)gain_border.y / border.y);
-    const float2 offset_scale = (float2)((float)offset_border.x / border.x, (float)offset_border.y / border.y);
+    const float2 scale = blend_scale(border, field_border), gain_scale = blend_scale(gain_border, border);
+    const float2 offset_scale = blend_scale(offset_border, border);
     const blend_corrections corrections = {
         gains, offsets, blend_within(blend_columns(px * gain_scale.x), (int2)(0, gain_border.x), gain_border),
         blend_columns(px * offset_scale.x), py * gain_scale.y, py * offset_scale.y, offset_border};
