@@ -41,10 +41,15 @@ def on_cells(values: npt.NDArray[_Kind], cells: Grid, rule: np.ufunc) -> npt.NDA
     """What any finer grid over the region of `cells` has, (n, height, width), per cell. Of masks
     `np.logical_or` tells cells that they reach into, `np.logical_and` those that they cover whole.
     """
-    for axis, count in ((1, cells.height), (2, cells.width)):
-        starts = np.arange(count) * values.shape[axis] // count
-        values = rule.reduceat(values, starts, axis)
-    return values
+    values = _on_rows(values, cells.height, rule).transpose(0, 2, 1)
+    return np.ascontiguousarray(_on_rows(np.ascontiguousarray(values), cells.width, rule).transpose(0, 2, 1))
+
+
+def _on_rows(values: npt.NDArray[_Kind], count: int, rule: np.ufunc) -> npt.NDArray[_Kind]:
+    """(n, height, width) as (n, count, width). By whole rows: `reduceat` takes eight times as long."""
+    starts = np.arange(count) * values.shape[1] // count
+    ends = np.maximum(np.append(starts[1:], values.shape[1]), starts + 1)
+    return np.stack([rule.reduce(values[:, a:b], 1) for a, b in zip(starts, ends, strict=True)], 1)
 
 
 def masks(device: Device, layers: Sequence[WorkingLayer], grid: Grid) -> Masks:

@@ -98,19 +98,20 @@ def _displacement(
     layer = layers[index]
     width, height = layer.box[2:]
     four_at_a_time = (-(-width // 4), height)
+    its = [pair for pair in flows if index in (pair.a, pair.b)]
+    if not its:
+        return device.zeros((height, width, 4))
     guess: Buffer | None = None
     for _ in range(1 + settings.fixed_point_steps):
-        field = device.zeros((height, width, 4))
-        for pair in flows:
-            if index not in (pair.a, pair.b):
-                continue
+        field = device.empty((height, width, 4))
+        for number, pair in enumerate(its):
             other = pair.b if index == pair.a else pair.a
             flow, back = pair.between(other), pair.between(index)
             start = _GUESSED if guess else _BOTH if settings.both_flows else _THERE
             device.run(
                 "geometry", "geometry_add", four_at_a_time, coefficients[other], layers[other].box,
                 layer.pixels, layer.box, grid.border, grid.lens, flow, back, pair.chart.border,
-                pair.chart.transform, start, guess or field, field,
+                pair.chart.transform, start, guess or field, number == 0, field,
             )  # fmt: skip
         guess = field
     return field

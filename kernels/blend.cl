@@ -2,75 +2,10 @@
    last), WHITE (full scale), INTEGER (1: round and saturate), PIXELS (2 or 4, that a work item makes side by side)
    and BLOCK (pixels, a multiple of PIXELS). Places are pixels of the region. */
 
-/* Of the cubic that layers are sampled with: Catmull-Rom's -1/2 loses a twentieth of fine texture's gradients over
-   all fractions, this next to nothing; a ramp stays one to 0.03 px. */
-#define BLEND_SLOPE (-2.0f / 3.0f)
-
 /* Where r, g or b is not 0. */
 static inline blend_int blend_any(blend_samples v) {
     const blend_marks set = v != 0.0f;
     return set.REDS | set.GREENS | set.BLUES;
-}
-
-/* Four pixels of a row as stored; handed on by its address, as charts are in common.cl. */
-static inline void blend_row(__global const pixel_stored *p, blend_four *row) {
-    *row = (blend_four)(p[0], p[1], p[2], p[3]);
-}
-
-/* Sample where taps may be missing or go across the canvas's border: bicubic if all are there, else bilinear over the
-   valid ones, whose share is w. corner: the pixel up and left of the position, t: how far from there. */
-static float4 blend_rim(__global const pixel_stored *stored, __global const blend_layer *layer, int2 corner, float2 t,
-                        int4 border) {
-    const float4 wx = cubic_taps(t.x, BLEND_SLOPE), wy = cubic_taps(t.y, BLEND_SLOPE);
-    const float ax[4] = {wx.x, wx.y, wx.z, wx.w}, ay[4] = {wy.x, wy.y, wy.z, wy.w};
-    float4 cubic = (float4)(0.0f), linear = (float4)(0.0f);
-    int missing = 0;
-    for (int j = 0; j < 4; ++j)
-        for (int i = 0; i < 4; ++i) {
-            int2 p = corner + (int2)(i - 1, j - 1);
-            const float4 c = grid_border(&p, border) ? blend_tap(stored, layer, p) : (float4)(0.0f);
-            missing += c.w == 0.0f;
-            cubic += ax[i] * ay[j] * c;
-            if (i > 0 && i < 3 && j > 0 && j < 3)
-                linear += (i == 1 ? 1.0f - t.x : t.x) * (j == 1 ? 1.0f - t.y : t.y) * c;
-        }
-    if (missing == 0)
-        return (float4)(cubic.xyz, 1.0f);
-    return linear.w > 0.0f ? (float4)(linear.xyz / linear.w, linear.w) : (float4)(0.0f);
-}
-
-/* Sample at position q. */
-static inline float4 blend_sample(__global const pixel_stored *stored, __global const blend_layer *layer, float2 q,
-                                  int4 border, int nearest) {
-    int2 corner = floor_int2(nearest ? q : q - 0.5f);
-    if (nearest)
-        return grid_border(&corner, border) ? blend_tap(stored, layer, corner) : (float4)(0.0f);
-    const float2 t = q - 0.5f - convert_float2(corner);
-    const int4 place = layer->place;
-    const int2 first = corner - 1 - place.xy;
-    if (first.x >= 0 && first.y >= 0 && first.x + 3 < place.z && first.y + 3 < place.w) {
-        /* nearly all samples: every tap is stored, no border rule is needed */
-        blend_four r0, r1, r2, r3;
-        const int wide = place.z, all = layer->ring * wide;
-        const int rest = layer->ring - blend_turned(layer, first.y); /* rows until they begin anew */
-        __global const pixel_stored *p = blend_line(stored, layer, first.y) + first.x;
-        blend_row(p, &r0);
-        blend_row(p + (rest > 1 ? wide : wide - all), &r1);
-        blend_row(p + (rest > 2 ? 2 * wide : 2 * wide - all), &r2);
-        blend_row(p + (rest > 3 ? 3 * wide : 3 * wide - all), &r3);
-        const blend_four least = LEAST(LEAST(r0, r1), LEAST(r2, r3));
-        const int4 valid = convert_float4(least.BLEND_ALPHAS) >= 0.5f * WHITE;
-        if (valid.x & valid.y & valid.z & valid.w) {
-            const float4 wx = cubic_taps(t.x, BLEND_SLOPE), wy = cubic_taps(t.y, BLEND_SLOPE);
-            const float8 left = wy.x * blend_pair(r0.lo) + wy.y * blend_pair(r1.lo) + wy.z * blend_pair(r2.lo) +
-                                wy.w * blend_pair(r3.lo);
-            const float8 right = wy.x * blend_pair(r0.hi) + wy.y * blend_pair(r1.hi) + wy.z * blend_pair(r2.hi) +
-                                 wy.w * blend_pair(r3.hi);
-            const float4 sum = wx.x * left.lo + wx.y * left.hi + wx.z * right.lo + wx.w * right.hi;
-            return (float4)(sum.xyz, 1.0f);
-        }
-    }
-    return blend_rim(stored, layer, corner, t, border);
 }
 
 /* Weights of fields that are less than a share of their sum, which nobody sees, become negative. */
@@ -96,21 +31,7 @@ __kernel void blend_hide(__global float4 *ways,      /* fields, one after the ot
     }
 }
 
-/* Which columns of a coarse grid PIXELS positions lie between, and how far. */
-typedef struct {
-    blend_int left, right;
-    blend_real t;
-} blend_between;
-
-/* The columns of a whole grid. */
-static inline blend_between blend_columns(blend_real q) {
-    const blend_real p = q - 0.5f;
-    blend_int left = BLEND_INTS(p);
-    left += p < BLEND_REALS(left); /* true is -1 */
-    return (blend_between){left, left + 1, p - BLEND_REALS(left)};
-}
-
-/* The same in an array of the columns from span.x on, span.y of them; beyond it, its rim. */
+/* Columns in an array of those from span.x on, span.y of them; beyond it, its rim. */
 static inline blend_between blend_within(blend_between at, int2 span, int4 border) {
     blend_int left = at.left - span.x, right = at.right - span.x; /* Mesa 22 would change the caller's at */
     if (border.z && span.y == border.x) {
@@ -161,7 +82,7 @@ typedef struct {
     int4 offset_border;
 } blend_corrections;
 
-static inline blend_correction blend_corrected(const blend_corrections *from, __global const blend_layer *layer) {
+BLEND_INLINE blend_correction blend_corrected(const blend_corrections *from, __global const blend_layer *layer) {
     blend_correction result = {(blend_samples)(0.0f), (blend_samples)(0.0f), (blend_int)(0)};
     if (layer->gains >= 0) {
         const blend_lines lines = blend_beside(from->gains + layer->gains, layer->gain, from->gain_height);
@@ -298,7 +219,7 @@ __kernel void blend_mark(
     blend_real ends = (blend_real)(place.x + width - 0.5f); /* the last pixel's, and as x the first one's */
     ends.x = place.x + 0.5f;
     const float2 scale = blend_scale(border, field_border);
-    const blend_between columns = blend_columns(ends / scale.x);
+    const blend_between columns = blend_split(ends / scale.x);
     const float row = (place.y + 0.5f) / scale.y;
     __global uint *shown = marks + 2 * words * blend_block(x, y, band);
     for (int word = 0; word < words; ++word) {
@@ -341,14 +262,13 @@ __kernel void blend_band(
     if (x >= band.z || y >= band.w)
         return;
     const int2 place = (int2)(x + band.x, y + band.y);
-#define BLEND_NUMBER(n, i) n
-    const blend_real px = BLEND_REALS(place.x + (blend_int)(BLEND_LIST(BLEND_NUMBER))) + 0.5f;
+    const blend_real px = BLEND_REALS(place.x + BLEND_COUNT) + 0.5f;
     const float py = place.y + 0.5f;
     const float2 scale = blend_scale(border, field_border), gain_scale = blend_scale(gain_border, border);
     const float2 offset_scale = blend_scale(offset_border, border);
     const blend_corrections corrections = {
-        gains, offsets, blend_within(blend_columns(px * gain_scale.x), (int2)(0, gain_border.x), gain_border),
-        blend_columns(px * offset_scale.x), py * gain_scale.y, py * offset_scale.y, offset_border};
+        gains, offsets, blend_within(blend_split(px * gain_scale.x), (int2)(0, gain_border.x), gain_border),
+        blend_split(px * offset_scale.x), py * gain_scale.y, py * offset_scale.y, offset_border};
 
     /* which pixels any layer covers, and which several do */
     __global const uint *shown = marks + 2 * words * blend_block(x, y, band);
@@ -361,7 +281,7 @@ __kernel void blend_band(
     blend_int corrected = (blend_int)(0);
     blend_samples reference = (blend_samples)(0.0f), sum = reference;
     if (BLEND_SOME(several)) {
-        const blend_between column = blend_columns(px / scale.x);
+        const blend_between column = blend_split(px / scale.x);
         blend_real sl = (blend_real)(0.0f), cl = sl;
         float sp = 0.0f, cp = 0.0f;
         if (lens.y != 0.0f) {
@@ -398,16 +318,7 @@ __kernel void blend_band(
                 if (BLEND_SOME(moved)) {
                     blend_real qx, qy;
                     blend_positions(px, py, way, scale, lens, sl, cl, sp, cp, &qx, &qy);
-                    if (moved.x)
-                        c.s0123 = blend_sample(stored, layers + k, (float2)(qx.x, qy.x), border, nearest);
-                    if (moved.y)
-                        c.s4567 = blend_sample(stored, layers + k, (float2)(qx.y, qy.y), border, nearest);
-#if PIXELS == 4
-                    if (moved.z)
-                        c.s89ab = blend_sample(stored, layers + k, (float2)(qx.z, qy.z), border, nearest);
-                    if (moved.w)
-                        c.scdef = blend_sample(stored, layers + k, (float2)(qx.w, qy.w), border, nearest);
-#endif
+                    blend_sample_all(stored, layers + k, qx, qy, moved, border, nearest, &c);
                 }
                 /* a sample that falls outside its layer counts smoothly less */
                 w *= c.FOURTHS * c.FOURTHS;

@@ -52,6 +52,10 @@ EXPOSURE_RAISE(8)
 #define BLEND_STORED BLEND_TWO
 #endif
 
+/* For what is called from several places: PoCL's compiler would leave calls, around which all that is in vector
+   registers is saved, and what is handed on by its address would lie in memory for each work item of a group. */
+#define BLEND_INLINE static inline __attribute__((always_inline))
+
 typedef PIXEL_VECTOR(float, PIXELS) blend_real;
 typedef PIXEL_VECTOR(int, PIXELS) blend_int;
 typedef PIXEL_VECTOR(float, BLEND_SAMPLES) blend_samples;
@@ -64,6 +68,10 @@ typedef PIXEL_VECTOR(PIXEL, BLEND_STORED) blend_pixels;
 #define BLEND_FLOATS PIXEL_VECTOR(convert_float, BLEND_SAMPLES)
 #define BLEND_EXPONENTIAL PIXEL_VECTOR(exponential, BLEND_SAMPLES)
 #define BLEND_RAISE PIXEL_VECTOR(exposure_raise, BLEND_SAMPLES)
+
+/* 0, 1 and so on. */
+#define BLEND_NUMBER(n, i) n
+#define BLEND_COUNT ((blend_int)(BLEND_LIST(BLEND_NUMBER)))
 
 /* One layer as a band needs it: 96 bytes, made by hugin_abflow/blend.py. */
 typedef struct {
@@ -127,9 +135,14 @@ static inline float4 blend_tap(__global const pixel_stored *stored, __global con
     return c.w >= 0.5f * WHITE ? (float4)(c.xyz, 1.0f) : (float4)(0.0f);
 }
 
+/* PIXELS stored pixels side by side. */
+static inline blend_pixels blend_run(__global const pixel_stored *first) {
+#define BLEND_NEXT(n, i) first[n]
+    return (blend_pixels)(BLEND_LIST(BLEND_NEXT));
+}
+
 /* blend_tap for p and the pixels to its right. */
-static inline blend_samples blend_taps(__global const pixel_stored *stored, __global const blend_layer *layer,
-                                       int2 p) {
+BLEND_INLINE blend_samples blend_taps(__global const pixel_stored *stored, __global const blend_layer *layer, int2 p) {
     const int4 place = layer->place;
     const int x = p.x - place.x, y = p.y - place.y;
     if (x <= -PIXELS || y < 0 || x >= place.z || y >= place.w)
@@ -137,9 +150,7 @@ static inline blend_samples blend_taps(__global const pixel_stored *stored, __gl
 #define BLEND_TAP(n, i) blend_tap(stored, layer, p + (int2)(n, 0))
     if (x < 0 || x + PIXELS > place.z)
         return (blend_samples)(BLEND_LIST(BLEND_TAP));
-    __global const pixel_stored *first = blend_line(stored, layer, y) + x;
-#define BLEND_NEXT(n, i) first[n]
-    blend_samples c = blend_colours((blend_pixels)(BLEND_LIST(BLEND_NEXT)));
+    blend_samples c = blend_colours(blend_run(blend_line(stored, layer, y) + x));
     const blend_int valid = c.FOURTHS >= 0.5f * WHITE;
     c.FOURTHS = (blend_real)(1.0f);
     return BLEND_EACH(valid) ? c : (blend_samples)(0.0f);

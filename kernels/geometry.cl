@@ -102,6 +102,7 @@ __kernel void geometry_add(__global const float *blend_j,   /* (box_j.w, box_j.z
                            int4 grid, float16 chart,        /* chart */
                            int from,                        /* GEOMETRY_... */
                            __global const float4 *guess,    /* (box_k.w, box_k.z) displacement */
+                           int first,                       /* 1: nothing is in the field yet */
                            __global float4 *field)          /* (box_k.w, box_k.z) displacement is added */
 {
     const int x = get_global_id(0) * GEOMETRY_CHUNK, y = get_global_id(1);
@@ -110,6 +111,8 @@ __kernel void geometry_add(__global const float *blend_j,   /* (box_j.w, box_j.z
     const int at = y * box_k.z + x, last = box_k.z - 1 - x;
     float share[GEOMETRY_CHUNK], most = 0.0f;
     for (int k = 0; k < GEOMETRY_CHUNK; ++k) {
+        if (first && k <= last)
+            field[at + k] = (float4)(0.0f);
         share[k] = k <= last ? geometry_share(blend_j, box_j, layer_k, box_k, x + k, y) : 0.0f;
         most = GREATEST(most, share[k]);
     }
