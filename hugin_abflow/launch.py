@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -23,23 +22,25 @@ def set_arguments(kernel: cl.Kernel, values: Sequence[object]) -> None:
     arguments = [value if isinstance(value, cl.Buffer) else argument(value) for value in values]
     if not hasattr(kernel, "abflow_typed"):
         # told once: to find types out each time takes forty times as long as all that is left
-        kernel.set_arg_types([None if isinstance(one, cl.Buffer) else one.dtype for one in arguments])
+        kernel.set_arg_types([None if isinstance(one, cl.Buffer) else _type(one) for one in arguments])
         kernel.abflow_typed = True
     kernel.set_args(*arguments)
 
 
 def argument(value: Any) -> Any:
-    """A number or several as a kernel takes them."""
+    """A number or several, int32 or float32, as a kernel takes them."""
     if isinstance(value, bool | int | np.integer):
         return np.int32(value)
     if isinstance(value, float | np.floating):
         return np.float32(value)
-    kind = "int" if np.asarray(value).dtype.kind in "iu" else "float"
-    return _vector(kind, tuple(value))
+    several = np.asarray(value)
+    return several.astype(np.int32 if several.dtype.kind in "iu" else np.float32)
 
 
-# pyopencl takes a tenth of a millisecond for each, and grids come again and again. The kind is part of the
-# key, because (1, 1) equals (1.0, 1.0)
-@lru_cache(maxsize=1024)
-def _vector(kind: str, values: tuple[float, ...]) -> Any:
-    return getattr(cl.cltypes, f"make_{kind}{len(values)}")(*(np.asarray(values).tolist()))
+def _type(value: Any) -> np.dtype[Any]:
+    """What `argument` gave, as OpenCL's types. A vector's bytes are taken as they are: pyopencl's own way to
+    make one takes thirty times as long.
+    """
+    kind = "int" if value.dtype.kind == "i" else "float"
+    vector: np.dtype[Any] = getattr(cl.cltypes, f"{kind}{value.size}") if value.ndim else value.dtype
+    return vector
