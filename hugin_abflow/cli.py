@@ -9,7 +9,7 @@ from typing import Any, get_args
 
 import click
 
-from hugin_abflow import memory
+from hugin_abflow import process
 from hugin_abflow.batch.config import NAME, find_config
 from hugin_abflow.batch.queue import find_projects, refuse_same_output
 from hugin_abflow.batch.run import Run, default_jobs, run, show
@@ -442,6 +442,6 @@ def _run(arguments: Sequence[str] | None) -> int:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run ``hugin-abflow`` with `arguments` (default: the process's own) and return its exit code."""
-    memory.manage()
+    process.own()
     with interruptible():
         return _run(arguments)

@@ -16,7 +16,7 @@ from contextlib import nullcontext
 from multiprocessing.connection import Connection
 from typing import Any
 
-from hugin_abflow import memory, scratch, trace
+from hugin_abflow import memory, process, scratch, trace
 from hugin_abflow.batch.task import Task, perform
 from hugin_abflow.signals import interruptible
 
@@ -79,7 +79,7 @@ def work(pipe: Connection, level: int, traced: bool, sharers: int) -> None:
     level       of the messages that are sent. traced: send what is done and when as well.
     sharers     processes that share the memory that may be taken.
     """
-    memory.manage()
+    process.own()
     memory.share(sharers)
     orders: queue.SimpleQueue[Task | None] = queue.SimpleQueue()
     sender = _Sender(pipe)

@@ -10,7 +10,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
 
-from hugin_abflow import memory
+from hugin_abflow import process
 from hugin_abflow.dropin.request import HELP, Request, read_command_line
 from hugin_abflow.dropin.weights import MaskedMerge
 from hugin_abflow.errors import CommandLineError, ExitCode, LayersMismatchError, LayersMissingError
@@ -40,7 +40,7 @@ _log = logging.getLogger(__name__)
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run ``abflow-enblend`` with `arguments` (default: the process's own); gives 0, or 1 as enblend does."""
-    memory.manage()
+    process.own()
     with interruptible():
         try:
             succeeded = _run(sys.argv[1:] if arguments is None else arguments)

@@ -1,0 +1,17 @@
+"""What the commands set for their process, which is theirs alone; programs with the library keep theirs."""
+
+from __future__ import annotations
+
+import sys
+
+from hugin_abflow import memory
+
+# Seconds until a thread that waits for Python's lock gets it. By itself 5 ms: as long as a decoder takes for
+# a strip, or the device for dozens of kernels, in which a core has nothing to do.
+_SWITCH = 2e-4
+
+
+def own() -> None:
+    """Keep less of what is freed, and let threads that decode, start kernels and encode take turns soon."""
+    memory.manage()
+    sys.setswitchinterval(_SWITCH)
