@@ -23,7 +23,7 @@ PROGRAMS := nona pano_trafo hugin_executor enblend enfuse exiftool
 
 # Several tests at a time: most of them leave one core idle. No more than four, whatever the machine has, as each
 # process holds kernels and panoramas of its own.
-PYTEST_ARGS := --numprocesses logical --maxprocesses 4 --dist worksteal
+PYTEST_ARGS ?= --numprocesses logical --maxprocesses 4 --dist worksteal
 
 .PHONY: sample test lint clean programs FORCE
 

@@ -442,6 +442,6 @@ def _run(arguments: Sequence[str] | None) -> int:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run ``hugin-abflow`` with `arguments` (default: the process's own) and return its exit code."""
-    process.own()
+    process.set_up()
     with interruptible():
         return _run(arguments)

@@ -29,12 +29,15 @@ def set_arguments(kernel: cl.Kernel, values: Sequence[object]) -> None:
 
 def argument(value: Any) -> Any:
     """A number or several, int32 or float32, as a kernel takes them."""
-    if isinstance(value, bool | int | np.integer):
+    if isinstance(value, int | np.integer | np.bool_):
         return np.int32(value)
     if isinstance(value, float | np.floating):
         return np.float32(value)
     several = np.asarray(value)
-    return several.astype(np.int32 if several.dtype.kind in "iu" else np.float32)
+    if several.ndim != 1 or several.dtype.kind not in "biuf":
+        raise TypeError(f"no kernel takes {value!r}")
+    # from Python's numbers: of NumPy's those that are too large would become others
+    return np.array(several.tolist(), np.float32 if several.dtype.kind == "f" else np.int32)
 
 
 def _type(value: Any) -> np.dtype[Any]:

@@ -11,7 +11,7 @@ from hugin_abflow import memory
 _SWITCH = 2e-4
 
 
-def own() -> None:
+def set_up() -> None:
     """Keep less of what is freed, and let threads that decode, start kernels and encode take turns soon."""
     memory.manage()
     sys.setswitchinterval(_SWITCH)

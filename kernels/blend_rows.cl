@@ -52,8 +52,8 @@ EXPOSURE_RAISE(8)
 #define BLEND_STORED BLEND_TWO
 #endif
 
-/* For what is called from several places: PoCL's compiler would leave calls, around which all that is in vector
-   registers is saved, and what is handed on by its address would lie in memory for each work item of a group. */
+/* For what PoCL's compiler would leave as calls: around these all that is in vector registers is saved, and what is
+   handed on by its address lies in memory, for each work item of a group. What is hardly ever needed stays a call. */
 #define BLEND_INLINE static inline __attribute__((always_inline))
 
 typedef PIXEL_VECTOR(float, PIXELS) blend_real;
@@ -72,6 +72,19 @@ typedef PIXEL_VECTOR(PIXEL, BLEND_STORED) blend_pixels;
 /* 0, 1 and so on. */
 #define BLEND_NUMBER(n, i) n
 #define BLEND_COUNT ((blend_int)(BLEND_LIST(BLEND_NUMBER)))
+
+/* Between which pixels of a grid PIXELS positions lie along one axis, and how far. */
+typedef struct {
+    blend_int left, right;
+    blend_real t;
+} blend_between;
+
+static inline blend_between blend_split(blend_real q) {
+    const blend_real p = q - 0.5f;
+    blend_int left = BLEND_INTS(p);
+    left += p < BLEND_REALS(left); /* true is -1 */
+    return (blend_between){left, left + 1, p - BLEND_REALS(left)};
+}
 
 /* One layer as a band needs it: 96 bytes, made by hugin_abflow/blend.py. */
 typedef struct {

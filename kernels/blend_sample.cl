@@ -4,20 +4,18 @@
    all fractions, this next to nothing; a ramp stays one to 0.03 px. */
 #define BLEND_SLOPE (-2.0f / 3.0f)
 
-/* Between which pixels of a grid PIXELS positions lie along one axis, and how far. */
-typedef struct {
-    blend_int left, right;
-    blend_real t;
-} blend_between;
+/* What is kept for PIXELS sets of four taps, or of their weights, is blend_samples too. */
+#define FIRSTS REDS
+#define SECONDS GREENS
+#define THIRDS BLUES
 
-static inline blend_between blend_split(blend_real q) {
-    const blend_real p = q - 0.5f;
-    blend_int left = BLEND_INTS(p);
-    left += p < BLEND_REALS(left); /* true is -1 */
-    return (blend_between){left, left + 1, p - BLEND_REALS(left)};
+/* Whether a layer holds four rows of so many columns from `first` on, a place in it. */
+static inline int blend_sample_stored(__global const blend_layer *layer, int2 first, int columns) {
+    const int4 place = layer->place;
+    return first.x >= 0 && first.y >= 0 && first.x + columns <= place.z && first.y + 4 <= place.w;
 }
 
-/* Four rows of a layer from `first` on, a place in it; their ring may begin anew among them. */
+/* Those rows; their ring may begin anew among them. */
 typedef struct {
     __global const pixel_stored *a, *b, *c, *d;
 } blend_sample_lines;
@@ -65,10 +63,8 @@ static inline float4 blend_sample(__global const pixel_stored *stored, __global 
     if (nearest)
         return grid_border(&corner, border) ? blend_tap(stored, layer, corner) : (float4)(0.0f);
     const float2 t = q - 0.5f - convert_float2(corner);
-    const int4 place = layer->place;
-    const int2 first = corner - 1 - place.xy;
-    if (first.x >= 0 && first.y >= 0 && first.x + 3 < place.z && first.y + 3 < place.w) {
-        /* nearly all samples: every tap is stored, no border rule is needed */
+    const int2 first = corner - 1 - layer->place.xy;
+    if (blend_sample_stored(layer, first, 4)) { /* mostly: then no border rule is needed */
         const blend_sample_lines lines = blend_sample_rows(stored, layer, first);
         blend_four r0, r1, r2, r3;
         blend_row(lines.a, &r0);
@@ -98,21 +94,19 @@ BLEND_INLINE blend_samples blend_sample_column(blend_sample_lines lines, int col
     const blend_pixels c = blend_run(lines.c + column), d = blend_run(lines.d + column);
     const blend_pixels upper = LEAST(a, b), lower = LEAST(c, d), all = LEAST(upper, lower);
     *least = column ? LEAST(*least, all) : all;
-    return BLEND_EACH(weights.REDS) * blend_colours(a) + BLEND_EACH(weights.GREENS) * blend_colours(b) +
-           BLEND_EACH(weights.BLUES) * blend_colours(c) + BLEND_EACH(weights.FOURTHS) * blend_colours(d);
+    return BLEND_EACH(weights.FIRSTS) * blend_colours(a) + BLEND_EACH(weights.SECONDS) * blend_colours(b) +
+           BLEND_EACH(weights.THIRDS) * blend_colours(c) + BLEND_EACH(weights.FOURTHS) * blend_colours(d);
 }
 
-/* Samples at PIXELS positions, into c where they are wanted. Most pixels move as their neighbours do: then their taps
-   lie side by side as they do, and are taken together. Each sum is that of blend_sample, to the bit. */
+/* Samples at PIXELS positions, into c where they are wanted. Nearly all pixels move as their neighbours do: then their
+   taps lie side by side as they do, and are taken together. Each sum is that of blend_sample, to the bit. */
 BLEND_INLINE void blend_sample_all(__global const pixel_stored *stored, __global const blend_layer *layer,
                                    blend_real qx, blend_real qy, blend_int wanted, int4 border, int nearest,
                                    blend_samples *c) {
     const blend_between across = blend_split(qx), down = blend_split(qy);
     const blend_int apart = (across.left - across.left.x - BLEND_COUNT) | (down.left - down.left.x);
-    const int4 place = layer->place;
-    const int2 first = (int2)(across.left.x, down.left.x) - 1 - place.xy;
-    if (!nearest && !BLEND_SOME(apart) && first.x >= 0 && first.y >= 0 && first.x + PIXELS + 2 < place.z &&
-        first.y + 3 < place.w) {
+    const int2 first = (int2)(across.left.x, down.left.x) - 1 - layer->place.xy;
+    if (!nearest && !BLEND_SOME(apart) && blend_sample_stored(layer, first, PIXELS + 3)) {
         const blend_sample_lines lines = blend_sample_rows(stored, layer, first);
 #define BLEND_SAMPLE_ACROSS(n, i) cubic_taps(across.t.i, BLEND_SLOPE)
 #define BLEND_SAMPLE_DOWN(n, i) cubic_taps(down.t.i, BLEND_SLOPE)
@@ -124,7 +118,7 @@ BLEND_INLINE void blend_sample_all(__global const pixel_stored *stored, __global
         const blend_samples c2 = blend_sample_column(lines, 2, wy, &least);
         const blend_samples c3 = blend_sample_column(lines, 3, wy, &least);
         if (!BLEND_SOME(blend_colours(least).FOURTHS < 0.5f * WHITE)) {
-            blend_samples sum = BLEND_EACH(wx.REDS) * c0 + BLEND_EACH(wx.GREENS) * c1 + BLEND_EACH(wx.BLUES) * c2 +
+            blend_samples sum = BLEND_EACH(wx.FIRSTS) * c0 + BLEND_EACH(wx.SECONDS) * c1 + BLEND_EACH(wx.THIRDS) * c2 +
                                 BLEND_EACH(wx.FOURTHS) * c3;
             sum.FOURTHS = (blend_real)(1.0f);
             *c = BLEND_EACH(wanted) ? sum : *c;

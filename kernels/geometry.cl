@@ -103,7 +103,7 @@ __kernel void geometry_add(__global const float *blend_j,   /* (box_j.w, box_j.z
                            int from,                        /* GEOMETRY_... */
                            __global const float4 *guess,    /* (box_k.w, box_k.z) displacement */
                            int first,                       /* 1: nothing is in the field yet */
-                           __global float4 *field)          /* (box_k.w, box_k.z) displacement is added */
+                           __global float4 *field)          /* (box_k.w, box_k.z) displacement is added, or set */
 {
     const int x = get_global_id(0) * GEOMETRY_CHUNK, y = get_global_id(1);
     if (x >= box_k.z || y >= box_k.w)

@@ -5,28 +5,38 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from bands import blend_layer, field_of, merged, stored_pixels
-from grids import plane, sphere
+from grids import patches, plane, sphere, window
 
-from hugin_abflow.layer import Box
+from hugin_abflow.layer import Box, full_scale
 from hugin_abflow.opencl import Device
 
-GRIDS = {"plane": plane(71, 43), "cylinder": plane(71, 43, wraps=True), "sphere": sphere(86, 43)}
+GRIDS = {
+    "plane": plane(71, 43),
+    "cylinder": plane(71, 43, wraps=True),
+    "sphere": sphere(86, 43),
+    "window": window(71, 43),
+}
 
 
+@pytest.mark.parametrize("channels", [1, 3])
 @pytest.mark.parametrize("dtype", [np.uint8, np.uint16, np.float32])
 @pytest.mark.parametrize("name", list(GRIDS))
-def test_a_crop_elsewhere_takes_other_pixels_together(device: Device, name: str, dtype: type) -> None:
-    """Pixels that are sampled at once for one crop, and each alone for another, are the same to the bit."""
+def test_a_crop_elsewhere_takes_other_pixels_together(
+    device: Device, name: str, dtype: type, channels: int
+) -> None:
+    """Pixels that are sampled at once for one crop, and each alone for another, are the same to the bit: also
+    beside those that do not move, and beside taps that are not valid enough.
+    """
     full = GRIDS[name]
     grid = full.resized(24, 15)
-    box = (0, 0, 24, 15)
-    layers = [
-        blend_layer(
-            device, stored_pixels(seed, full.width, full.height, dtype, 3, 0.95), 0, 0, full, grid,
-            field=field_of(seed + 10, grid, box, 0.7),
-        )
-        for seed in (1, 2)
-    ]  # fmt: skip
+    layers = []
+    for seed in (1, 2):
+        pixels = stored_pixels(seed, full.width, full.height, dtype, channels, 0.95)
+        faint = patches(seed + 5, full.width, full.height, 0.2, 3) > 0
+        pixels[faint, -1] = (0.3 * full_scale(dtype) * (pixels[faint, -1] > 0)).astype(dtype)
+        field = field_of(seed + 10, grid, (0, 0, 24, 15), 0.7)
+        field[:, 4:9, :3] = 0
+        layers.append(blend_layer(device, pixels, 0, 0, full, grid, field=field))
     whole = merged(device, layers, full, grid)
     region = full.region
     for left in (1, 2, 3):

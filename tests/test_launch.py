@@ -25,7 +25,10 @@ def test_vectors_are_of_their_numbers_kind() -> None:
         vector = launch.argument(values)
         kind = np.int32 if isinstance(values[0], int) else np.float32
         assert vector.tobytes()[: 4 * len(values)] == np.array(values, kind).tobytes()
-    assert launch.argument(True).dtype == np.int32
+    assert launch.argument(np.arange(4, dtype=np.uint32)).dtype == np.int32
+    assert launch.argument((True, False)).dtype == np.int32
+    for truth in (True, np.True_):
+        assert launch.argument(truth).dtype == np.int32
     assert launch.argument(2).dtype == np.int32
     assert launch.argument(2.0).dtype == np.float32
 
@@ -44,6 +47,18 @@ def test_arguments_arrive_each_time(device: Device) -> None:
         launch.set_arguments(kernel, [result.data, *values])
         cl.enqueue_nd_range_kernel(device.current.queue, kernel, *launch.work_groups((1,), 1))
         np.testing.assert_array_equal(result.get(), expected)
+
+
+@pytest.mark.parametrize("wrong", [1 << 40, (1 << 40, 2), np.array([4e9, 2]).astype(np.uint32)])
+def test_a_number_that_is_too_large_is_told(wrong: object) -> None:
+    with pytest.raises(OverflowError):
+        launch.argument(wrong)
+
+
+@pytest.mark.parametrize("wrong", [None, "3", 1j, np.eye(4), (1.0, None)])
+def test_what_is_no_number_is_told(wrong: object) -> None:
+    with pytest.raises(TypeError):
+        launch.argument(wrong)
 
 
 def test_a_fraction_is_no_whole_number(device: Device) -> None:

@@ -7,14 +7,17 @@ import sys
 
 import pytest
 
+from hugin_abflow import process
+
 COMMANDS = {
-    "hugin-abflow": "from hugin_abflow import cli; cli.main(['--version'])",
-    "abflow-enblend": "from hugin_abflow.dropin import enblend; enblend.main(['--version'])",
-    "a worker": "from hugin_abflow.batch import worker; other.close(); worker.work(pipe, 20, False, 1)",
+    "hugin-abflow": ("hugin_abflow.cli", "module.main(['--version'])"),
+    "abflow-enblend": ("hugin_abflow.dropin.enblend", "module.main(['--version'])"),
+    "a worker": ("hugin_abflow.batch.worker", "other.close(); module.work(pipe, 20, False, 1)"),
 }
 CHILD = """
 import multiprocessing, sys
-import hugin_abflow
+from importlib import import_module
+module = import_module("{module}")
 pipe, other = multiprocessing.Pipe()
 before = sys.getswitchinterval()
 {run}
@@ -24,7 +27,16 @@ print("switched:", before, sys.getswitchinterval())
 
 @pytest.mark.parametrize("name", list(COMMANDS))
 def test_threads_take_turns_soon(name: str) -> None:
-    child = [sys.executable, "-c", CHILD.format(run=COMMANDS[name])]
+    module, run = COMMANDS[name]
+    child = [sys.executable, "-c", CHILD.format(module=module, run=run)]
     said = subprocess.run(child, check=True, capture_output=True, text=True, timeout=60).stdout
     before, after = map(float, said.rpartition("switched:")[2].split())
     assert before == 0.005 > 10 * after > 0
+
+
+def test_memory_is_managed(monkeypatch: pytest.MonkeyPatch) -> None:
+    done: list[object] = []
+    monkeypatch.setattr(process.memory, "manage", lambda: done.append("memory"))
+    monkeypatch.setattr(process.sys, "setswitchinterval", done.append)
+    process.set_up()
+    assert len(done) == 2 and "memory" in done

@@ -79,7 +79,7 @@ def work(pipe: Connection, level: int, traced: bool, sharers: int) -> None:
     level       of the messages that are sent. traced: send what is done and when as well.
     sharers     processes that share the memory that may be taken.
     """
-    process.own()
+    process.set_up()
     memory.share(sharers)
     orders: queue.SimpleQueue[Task | None] = queue.SimpleQueue()
     sender = _Sender(pipe)

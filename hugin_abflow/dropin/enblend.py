@@ -40,7 +40,7 @@ _log = logging.getLogger(__name__)
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run ``abflow-enblend`` with `arguments` (default: the process's own); gives 0, or 1 as enblend does."""
-    process.own()
+    process.set_up()
     with interruptible():
         try:
             succeeded = _run(sys.argv[1:] if arguments is None else arguments)
