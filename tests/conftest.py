@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import tifffile
+from hypothesis import settings
 
 from hugin_abflow.batch import pool, run, task
 from hugin_abflow.layer import Layer, full_scale
@@ -21,6 +22,10 @@ from hugin_abflow.project import Plan
 
 DTYPES = [np.uint8, np.uint16, np.float16, np.float32]
 ICC = bytes(range(256)) * 3  # carried, never interpreted
+
+# The same examples each time; how long one takes is the machine's affair.
+settings.register_profile("deterministic", derandomize=True, deadline=None)
+settings.load_profile("deterministic")
 
 # Programs that tests start write as a user's do, not as where containers and CI set it.
 os.environ.pop("PYTHONUNBUFFERED", None)

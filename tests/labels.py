@@ -56,7 +56,7 @@ def problems(draw, layers: int, most: int):
     return rows, columns, residual, shares, cover, wraps
 
 
-many = settings(max_examples=150, deadline=None, derandomize=True)
+many = settings(max_examples=150)
 
 
 def alike(residual: np.ndarray) -> seam.Residuals:

@@ -23,7 +23,7 @@ def seen(seed: int, count: int, move: Points, around: Points, nearest: float = 2
     return unit(places), unit(places - move)
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(seed=st.integers(0, 10_000))
 def test_the_move_is_found_among_things_that_move_otherwise(seed: int) -> None:
     """A fifth of the points moves at random, by as much as the others."""
@@ -64,7 +64,7 @@ def test_still_points_are_not_led_away() -> None:
     assert np.allclose(epipolar.across(v, u, move), motion, rtol=0.01)
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(seed=st.integers(0, 10_000), size=st.floats(1e-4, 0.05), turn=st.floats(-np.pi, np.pi))
 def test_what_leads_away_is_told_in_radians(seed: int, size: float, turn: float) -> None:
     """A step at an angle to the motion of still things: its sine, or all of it beyond a right angle."""

@@ -28,7 +28,7 @@ WIDTH, HEIGHT = 323, 141
 BORDERS = 100, 220
 # What is behind shifts by so many px, and a thing by as many more.
 BEHIND, OWN = np.array([2.0, 1.0]), np.array([18.0, -3.0])
-few = settings(max_examples=20, deadline=None, derandomize=True)
+few = settings(max_examples=20)
 
 
 @dataclass(frozen=True)

@@ -137,7 +137,7 @@ SMALL = {
     "cylinder": Canvas.plane(131, 77, True),
     "sphere": Canvas.sphere(130, 65),
 }
-few_examples = settings(max_examples=8, deadline=None, derandomize=True)
+few_examples = settings(max_examples=8)
 
 
 @pytest.fixture(scope="module")

@@ -29,7 +29,7 @@ def grid_graph(height: int, width: int, labels: int, rng: np.random.Generator, s
     return Graph(rows, columns, price, possible, first, second, rough[first] + rough[second])
 
 
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=150)
 @given(
     st.tuples(st.integers(1, 3), st.integers(1, 3)),
     st.integers(1, 3),

@@ -58,7 +58,7 @@ def assert_found(found: Whole | None, of: Scene, *numbers: int) -> None:
 
 AHEAD = (0.0, 1.0, 0.0)
 BOTH = pytest.mark.parametrize("wraps", [False, True])
-few = settings(max_examples=20, deadline=None, derandomize=True)
+few = settings(max_examples=20)
 
 
 @BOTH

@@ -58,7 +58,7 @@ def test_a_field_of_view_that_cannot_be_is_unknown(projection: int, hfov: float)
     assert Eye.of(projection, 801, 401, hfov) is None
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(
     projection=st.integers(0, 5),
     hfov=st.floats(5, 170),

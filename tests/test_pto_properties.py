@@ -39,7 +39,7 @@ SNIPPETS = st.sampled_from([*LINE_STARTS, *COMMENT_STARTS, *FIELD_TEXTS, *ODDITI
 
 
 # The same examples on every run, and no deadline: the machine may be busy.
-THOROUGH = settings(max_examples=60, derandomize=True, deadline=None)
+THOROUGH = settings(max_examples=60)
 BRIEF = settings(THOROUGH, max_examples=10)
 
 
