@@ -58,7 +58,7 @@ def test_twin_of_flow_reading_is_linear_interpolation(wraps: bool) -> None:
 @pytest.mark.parametrize("start", [twin.THERE, twin.GUESSED, twin.BOTH])
 @pytest.mark.parametrize("first", [0, 1])
 def test_add_equals_its_twin(device: Device, name: str, start: int, first: int) -> None:
-    """On a chart of its own axis, for boxes that overlap in part. What the first one finds does not count."""
+    """On a chart of its own axis, for boxes that overlap in part. What a first one finds does not count."""
     grid = GRIDS[name]
     overlap = np.zeros(grid.shape, bool)
     overlap[: grid.height // 2, 20:40] = True

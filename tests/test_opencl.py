@@ -19,10 +19,8 @@ from hugin_abflow.errors import DeviceError
 from hugin_abflow.opencl import Device, kernel_source
 
 KERNELS = Path(__file__).parent.parent / "kernels"
-PARTS = {
-    "blend_rows": "blend",
-    "blend_sample": "blend",
-}  # files that are no module's own, but in front of one
+# files that are no module's own, but in front of one
+PARTS = {"blend_rows": "blend", "blend_sample": "blend"}
 MODULES = sorted({path.stem for path in KERNELS.glob("*.cl")} - {"common"} - PARTS.keys())
 
 

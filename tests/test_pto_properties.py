@@ -38,7 +38,6 @@ ODDITIES = [
 SNIPPETS = st.sampled_from([*LINE_STARTS, *COMMENT_STARTS, *FIELD_TEXTS, *ODDITIES])
 
 
-# The same examples on every run, and no deadline: the machine may be busy.
 THOROUGH = settings(max_examples=60)
 BRIEF = settings(THOROUGH, max_examples=10)
 
