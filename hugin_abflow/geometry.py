@@ -1,8 +1,7 @@
 """Where each layer is sampled and how much its colour counts (kernels/geometry.cl).
 
-x_k(p) = p + sum_j w_j(p) F_jk(p), and the softmax of Code 1 of Meng & Liu 2020, for any number of layers. Of
-F_jk(p) a part is read as -F_kj(p): so nothing is lost to first order where flow changes, and what is straight
-stays so beside the outlines of near things, see `geometry_add`.
+x_k(p) = p + sum_j w_j(p) F_jk(p), and the softmax of Code 1 of Meng & Liu 2020, for any number of layers;
+F_jk as it passes through p (intermediate.py), or, as published, as it starts there.
 """
 
 from __future__ import annotations
@@ -22,8 +21,6 @@ from hugin_abflow.working import Grid, WorkingLayer
 # Flow longer than this share of the canvas's width is implausible; it does not sharpen the softmax further.
 _PLAUSIBLE = 0.1
 _FOLLOWING_STEPS = 8
-# Where `geometry_add` reads flow, as of kernels/geometry.cl.
-_THERE, _GUESSED, _BOTH = range(3)
 
 
 @dataclass(frozen=True)
@@ -65,7 +62,7 @@ def fields(
     """
     result = list[Buffer]()
     for index in range(len(layers)):
-        result.append(_displacement(device, index, layers, coefficients, flows, grid, settings))
+        result.append(_displacement(device, index, layers, coefficients, flows, grid))
         flows[:] = [flow for flow in flows if max(flow.a, flow.b) > index]
         device.give_back()
     highest = device.zeros(grid.shape)
@@ -92,7 +89,6 @@ def _displacement(
     coefficients: Sequence[Buffer],
     flows: Sequence[PairFlow],
     grid: Grid,
-    settings: Settings,
 ) -> Buffer:
     """One layer's field, in which the fourth component is 0."""
     layer = layers[index]
@@ -101,19 +97,14 @@ def _displacement(
     its = [pair for pair in flows if index in (pair.a, pair.b)]
     if not its:
         return device.zeros((height, width, 4))
-    guess: Buffer | None = None
-    for _ in range(1 + settings.fixed_point_steps):
-        field = device.empty((height, width, 4))
-        for number, pair in enumerate(its):
-            other = pair.b if index == pair.a else pair.a
-            flow, back = pair.between(other), pair.between(index)
-            start = _GUESSED if guess else _BOTH if settings.both_flows else _THERE
-            device.run(
-                "geometry", "geometry_add", four_at_a_time, coefficients[other], layers[other].box,
-                layer.pixels, layer.box, grid.border, grid.lens, flow, back, pair.chart.border,
-                pair.chart.transform, start, guess or field, number == 0, field,
-            )  # fmt: skip
-        guess = field
+    field = device.empty((height, width, 4))
+    for number, pair in enumerate(its):
+        other = pair.b if index == pair.a else pair.a
+        device.run(
+            "geometry", "geometry_add", four_at_a_time, coefficients[other], layers[other].box, layer.pixels,
+            layer.box, grid.border, grid.lens, pair.between(other), pair.chart.border, pair.chart.transform,
+            number == 0, field,
+        )  # fmt: skip
     return field
 
 

@@ -25,6 +25,7 @@ from hugin_abflow import (
     flow,
     geometry,
     highlights,
+    intermediate,
     memory,
     multiband,
     pairflow,
@@ -248,6 +249,7 @@ def _align(
     clipped = highlights.excess(device, layers, masks, grid, settings)
     if settled:
         transition.settle(device, layers, coefficients, flows, masks, grid, settings, clipped.max(0))
+    intermediate.settle(device, layers, coefficients, flows, grid, settings)
     fields = geometry.fields(device, layers, coefficients, flows, grid, settings)
     del coefficients
     device.give_back()
@@ -367,8 +369,7 @@ def _redundant(index: int, layers: Sequence[WorkingLayer], masks: Masks) -> bool
 
 def _unblended(device: Device, layer: WorkingLayer) -> BlendLayer:
     """A layer without weight: it shows only where no other layer is."""
-    left, top = layer.box[:2]
-    return BlendLayer(layer.layer, (left, top, 1, 1), device.zeros((1, 1, 4)), [0.0], None, None)
+    return BlendLayer(layer.layer, (*layer.box[:2], 1, 1), device.zeros((1, 1, 4)), [0.0], None, None)
 
 
 def _overlaps(

@@ -50,10 +50,8 @@ class Settings:
     interpolation       how layers are sampled; "nearest" is for comparison with the paper's own code.
     working_pixels      upper bound of the pixels of the working canvas (flow, coefficients, colour), at least
                         1024; 0: chosen by flow_quality.
-    both_flows          where layer k is sampled is told by F_kj(p), too, by each as far as the flows at the
-                        ends of its way say the same; else by F_jk(p) alone, as published.
-    fixed_point_steps   times that x_k <- p - sum_j w_j F_kj(x_k) is iterated from there; 0: flow is read at
-                        p alone, as published.
+    intermediate        where layer k is sampled is told by the flows that pass through p on their way from
+                        one layer to the other; else by F_jk, which starts at p, as published.
     band_rows           rows of a full-resolution band; 0: chosen from the canvas width and `max_memory`.
     max_memory          bytes that host and device may take together; 0: half of the machine's memory. It
                         changes no pixel.
@@ -79,8 +77,7 @@ class Settings:
     guides: bool = True
     interpolation: Interpolation = "bicubic"
     working_pixels: int = 0
-    both_flows: bool = True
-    fixed_point_steps: int = 0
+    intermediate: bool = True
     band_rows: int = 0
     max_memory: int = 0
     threads: int = 0
@@ -92,7 +89,6 @@ class Settings:
             ("flow_magnitude", 0, 10_000),
             ("working_pixels", _LEAST_WORKING_PIXELS if self.working_pixels else 0, 1 << 28),
             ("transition_strain", 0, 1),
-            ("fixed_point_steps", 0, 20),
             ("band_rows", 0, 1 << 20),
             ("max_memory", 0, MOST_MEMORY),
             ("threads", 0, 1024),
@@ -118,7 +114,8 @@ class Settings:
                 expected = " or ".join(map(repr, choices))
                 raise SettingsError(f"{name} is {value!r}; choose {expected}")
         for name in (
-            "flow", "exposure", "highlights", "seam", "movers", "foreground", "relay", "guides", "both_flows",
+            "flow", "exposure", "highlights", "seam", "movers", "foreground", "relay", "guides",
+            "intermediate",
         ):  # fmt: skip
             if not isinstance(getattr(self, name), bool):
                 raise SettingsError(f"{name} is {getattr(self, name)!r}; choose True or False")

@@ -23,15 +23,6 @@ static inline float4 chart_weights(float t, int coarse) {
 /* Pixels of a row that a work item takes: compilers for CPUs make vectors only of what is written as vectors. */
 #define CHART_CHUNK 4
 
-/* Where four pixels of a chart's row lie on the canvas grid: x, and by its address y. */
-static inline float4 chart_places(float4 u, float4 v, const float16 *chart, float4 lens, float4 *y) {
-    if (lens.y == 0.0f) {
-        *y = (v - chart->sc) / chart->sa;
-        return (u - chart->sb) / chart->s9;
-    }
-    return canvas_sphere_position4(chart_sphere4(u, v, chart), lens, y);
-}
-
 /* Brightness of a layer at position p of the canvas grid, by these weights where all taps are valid, bilinear at
    the rim of the mask; negative where there is none. */
 static float chart_brightness(__global const float4 *layer, int4 box, int4 border, float2 p, int coarse) {

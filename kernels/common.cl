@@ -263,6 +263,15 @@ static inline float2 chart_position(float3 q, const float16 *chart) {
     return u;
 }
 
+/* Where four positions of a chart lie on the canvas grid: x, and by its address y. */
+static inline float4 chart_places(float4 u, float4 v, const float16 *chart, float4 lens, float4 *y) {
+    if (lens.y == 0.0f) {
+        *y = (v - chart->sc) / chart->sa;
+        return (u - chart->sb) / chart->s9;
+    }
+    return canvas_sphere_position4(chart_sphere4(u, v, chart), lens, y);
+}
+
 /* Weights of the four pixels from `corner` on, to read between them at the fraction t, and their indices; weight
    and index 0 for those that do not lie on the grid. */
 static inline float4 grid_taps(int2 corner, float2 t, int4 grid, int4 *at) {

@@ -1,6 +1,6 @@
-/* Where each layer is sampled: x_k(p) = p + sum over j of w_j(p) F_jk(p), or that with the mean of both flows of a
-   pair that geometry_add tells. A field holds, on the box of one layer of the working grid, (displacement, colour
-   weight); the displacement is a difference of points, so that it is continuous over the poles. */
+/* Where each layer is sampled: x_k(p) = p + sum over j of w_j(p) F_jk(p). A field holds, on the box of one layer of the
+   working grid, (displacement, colour weight); the displacement is a difference of points, so that it is continuous
+   over the poles. */
 
 /* Coefficients below this move nothing by as much as a thousandth of a pixel. */
 #define GEOMETRY_NEGLIGIBLE 1e-5f
@@ -16,41 +16,9 @@ static inline float geometry_share(__global const float *blend_j, int4 box_j, __
     return w < GEOMETRY_NEGLIGIBLE || layer_k[y * box_k.z + x].w == 0.0f ? 0.0f : w;
 }
 
-/* Where geometry_add reads flow. */
-#define GEOMETRY_THERE 0   /* F_jk at p: first order, as published */
-#define GEOMETRY_GUESSED 1 /* F_kj at the place where layer k is guessed to be sampled */
-#define GEOMETRY_BOTH 2    /* F_jk and F_kj at p, each as far as the flows at its ends say the same */
-
-/* Squared px of a chart: the two flows' difference up to which there is nothing to choose, and how far the flows at
-   a way's ends lead elsewhere where it is doubted by half of the most. */
-#define GEOMETRY_ALIKE 1.0f
-#define GEOMETRY_OFF 16.0f
-/* Doubt is from 1 to one more than this; a way counts by the other one's squared. */
-#define GEOMETRY_DOUBT 6.0f
-
-/* Flow at four places of a chart. */
-static inline float4 geometry_read(__global const float2 *flow, float4 u, float4 v, int4 grid, float4 *fy) {
-    const float2 a = bilinear_flow(flow, (float2)(u.x, v.x), grid), b = bilinear_flow(flow, (float2)(u.y, v.y), grid);
-    const float2 c = bilinear_flow(flow, (float2)(u.z, v.z), grid), d = bilinear_flow(flow, (float2)(u.w, v.w), grid);
-    *fy = (float4)(a.y, b.y, c.y, d.y);
-    return (float4)(a.x, b.x, c.x, d.x);
-}
-
-/* How much a way from what layer j shows at the place p to what layer k shows is doubted, where that is at (u, v) of a
-   chart: by how far the flows at its ends, F_jk where j and F_kj where k is sampled then, lead elsewhere. */
-static inline float4 geometry_doubt(__global const float2 *flow, __global const float2 *back, float4 u, float4 v,
-                                    float4 wx, float4 wy, float4 share, int4 grid) {
-    float4 fy, by;
-    const float4 fx = geometry_read(flow, u - (1.0f - share) * wx, v - (1.0f - share) * wy, grid, &fy);
-    const float4 bx = geometry_read(back, u + share * wx, v + share * wy, grid, &by);
-    const float4 off = (fx - wx) * (fx - wx) + (fy - wy) * (fy - wy) + (bx + wx) * (bx + wx) + (by + wy) * (by + wy);
-    return 1.0f + GEOMETRY_DOUBT * off * off / (off * off + GEOMETRY_OFF * GEOMETRY_OFF);
-}
-
-/* From four points q the ways that flow leads, by its chart; with `back`, a share of it and for the rest `back`,
-   turned round, each the less the more it is doubted; moves: where it leads anywhere. */
-static inline points4 geometry_ways(points4 q, __global const float2 *flow, __global const float2 *back, float4 share,
-                                    int4 grid, const float16 *chart, int4 *moves) {
+/* From four points q the ways that flow leads, by its chart; moves: where it leads anywhere. */
+static inline points4 geometry_ways(points4 q, __global const float2 *flow, int4 grid, const float16 *chart,
+                                    int4 *moves) {
     const bool plane = chart->sd == 0.0f;
     float4 u, v;
     if (plane) {
@@ -63,21 +31,9 @@ static inline points4 geometry_ways(points4 q, __global const float2 *flow, __gl
     } else {
         u = chart_sphere_position4(q, chart, &v);
     }
-    float4 fy, fx = geometry_read(flow, u, v, grid, &fy);
-    if (back) {
-        float4 by;
-        const float4 bx = geometry_read(back, u, v, grid, &by);
-        const int4 apart = (fx + bx) * (fx + bx) + (fy + by) * (fy + by) > GEOMETRY_ALIKE;
-        float4 part = share;
-        if (any(apart)) {
-            const float4 doubt = geometry_doubt(flow, back, u, v, fx, fy, share, grid);
-            const float4 doubt_back = geometry_doubt(flow, back, u, v, -bx, -by, share, grid);
-            const float4 its = share * doubt_back * doubt_back, rest = (1.0f - share) * doubt * doubt;
-            part = apart ? its / (its + rest) : share;
-        }
-        fx = part * fx - (1.0f - part) * bx;
-        fy = part * fy - (1.0f - part) * by;
-    }
+    const float2 a = bilinear_flow(flow, (float2)(u.x, v.x), grid), b = bilinear_flow(flow, (float2)(u.y, v.y), grid);
+    const float2 c = bilinear_flow(flow, (float2)(u.z, v.z), grid), d = bilinear_flow(flow, (float2)(u.w, v.w), grid);
+    const float4 fx = (float4)(a.x, b.x, c.x, d.x), fy = (float4)(a.y, b.y, c.y, d.y);
     *moves = fx != 0.0f || fy != 0.0f;
     if (plane) /* on one that wraps, u may be of a copy of q */
         return (points4){fx / chart->s9, fy / chart->sa, (float4)(0.0f)};
@@ -85,12 +41,7 @@ static inline points4 geometry_ways(points4 q, __global const float2 *flow, __gl
     return (points4){to.x - q.x, to.y - q.y, to.z - q.z};
 }
 
-/* Add one other layer's part. At the place x_k where layer k is sampled, F_kj is the way to what layer j shows of it,
-   so that x_k = p - w_j F_kj(x_k), in which `guess` may say where x_k is. At p one flow alone is too long or too
-   short where it changes: with g its gradient along itself, f its length, x_k is missed by g f w_j^2 with F_kj, and
-   on the other side by g f w_j (1 - w_j) with F_jk. So of -F_kj a share of 1 - w_j is read, and of F_jk one of w_j:
-   that leaves nothing of these. Beside things that hide others, where flow is no change but a step, one of the two may
-   be the thing's and the other that of what is behind: the one counts that is the same at both ends. */
+/* Add one other layer's part. */
 __kernel void geometry_add(__global const float *blend_j,   /* (box_j.w, box_j.z) */
                            int4 box_j,                      /* place on the working grid */
                            __global const float4 *layer_k,  /* (box_k.w, box_k.z) r, g, b, valid */
@@ -98,10 +49,7 @@ __kernel void geometry_add(__global const float *blend_j,   /* (box_j.w, box_j.z
                                                                by GEOMETRY_CHUNK, rounded up */
                            int4 border, float4 lens,        /* working grid */
                            __global const float2 *flow,     /* chart grid, px: F_jk */
-                           __global const float2 *back,     /* chart grid, px: F_kj */
                            int4 grid, float16 chart,        /* chart */
-                           int from,                        /* GEOMETRY_... */
-                           __global const float4 *guess,    /* (box_k.w, box_k.z) displacement */
                            int first,                       /* 1: nothing is in the field yet */
                            __global float4 *field)          /* (box_k.w, box_k.z) displacement is added, or set */
 {
@@ -120,26 +68,15 @@ __kernel void geometry_add(__global const float *blend_j,   /* (box_j.w, box_j.z
         return;
     const float4 px = convert_float4(x + (int4)(0, 1, 2, 3) + box_k.x) + 0.5f;
     const float4 py = (float4)(y + box_k.y + 0.5f);
-    points4 q = lens.y == 0.0f ? (points4){px, py, (float4)(0.0f)} : canvas_sphere4(px, py, lens);
-    if (from == GEOMETRY_GUESSED) {
-        const float4 a = guess[at], b = guess[at + LEAST(1, last)];
-        const float4 c = guess[at + LEAST(2, last)], d = guess[at + LEAST(3, last)];
-        q = (points4){q.x + (float4)(a.x, b.x, c.x, d.x), q.y + (float4)(a.y, b.y, c.y, d.y),
-                      q.z + (float4)(a.z, b.z, c.z, d.z)};
-        if (lens.y != 0.0f) {
-            const float4 length = root4(q.x * q.x + q.y * q.y + q.z * q.z);
-            q = (points4){q.x / length, q.y / length, q.z / length};
-        }
-    }
+    const points4 q = lens.y == 0.0f ? (points4){px, py, (float4)(0.0f)} : canvas_sphere4(px, py, lens);
     int4 moves;
-    const points4 d = geometry_ways(q, from == GEOMETRY_GUESSED ? back : flow, from == GEOMETRY_BOTH ? back : 0,
-                                    (float4)(share[0], share[1], share[2], share[3]), grid, &chart, &moves);
+    const points4 d = geometry_ways(q, flow, grid, &chart, &moves);
     const float3 way[GEOMETRY_CHUNK] = {(float3)(d.x.x, d.y.x, d.z.x), (float3)(d.x.y, d.y.y, d.z.y),
                                         (float3)(d.x.z, d.y.z, d.z.z), (float3)(d.x.w, d.y.w, d.z.w)};
     const int moved[GEOMETRY_CHUNK] = {moves.x, moves.y, moves.z, moves.w};
     for (int k = 0; k < GEOMETRY_CHUNK; ++k)
         if (share[k] > 0.0f && moved[k])
-            field[at + k].xyz += (from == GEOMETRY_GUESSED ? -share[k] : share[k]) * way[k];
+            field[at + k].xyz += share[k] * way[k];
 }
 
 /* a_k = sharpness * w_k * (1 + magnitude * f_k / width), with f_k = |displacement| / (1 - w_k); and the maximum

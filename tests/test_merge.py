@@ -246,7 +246,7 @@ def test_layers_that_do_not_belong_together(other, message):
         {"flow_magnitude": 1j},
         {"flow_magnitude": float("inf")},
         {"working_pixels": 2e6},
-        {"fixed_point_steps": "1"},
+        {"threads": "1"},
         {"band_rows": False},
         {"merge": ["joint"]},
         {"merge": np.array(["joint", "joint"])},
@@ -369,9 +369,9 @@ def test_working_resolution_falls_where_memory_ends(small_memory, caplog):
     canvas = CANVASES["plane"]
     layers = with_parallax(canvas)
     peak = small_memory(1 << 40)
-    expected = merged(layers, canvas, band_rows=16)
+    expected = merged(layers, canvas, band_rows=16, threads=1)
     peak = small_memory(peak[0] * 2 // 3)
-    result = merged(layers, canvas, band_rows=16)
+    result = merged(layers, canvas, band_rows=16, threads=1)
     (record,) = caplog.records
     assert record.levelno == logging.WARNING and "lower working resolution" in record.message
     np.testing.assert_array_equal(result[..., 3], expected[..., 3])

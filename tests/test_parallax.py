@@ -56,9 +56,9 @@ def check(result: np.ndarray, truth: np.ndarray) -> None:
 
 
 @pytest.mark.parametrize("motion", [(0.0, 0.0), (1.5, 0.0), (6.0, -2.0), (-9.0, 3.0)])
-@pytest.mark.parametrize("steps", [0, 2])
-def test_geometry_moves_over_with_the_coefficient(motion, steps):
-    result = merged(pair(*motion), PLANE, fixed_point_steps=steps)
+@pytest.mark.parametrize("intermediate", [False, True])
+def test_geometry_moves_over_with_the_coefficient(motion, intermediate):
+    result = merged(pair(*motion), PLANE, intermediate=intermediate)
     check(result, blended(*motion))
 
 
@@ -186,3 +186,28 @@ def test_floats_keep_their_range(dtype):
     result = merged(bright, PLANE).astype(np.float32)
     check(result / 20 * 255, blended(3.0, 0.0))
     assert result[..., :3].max() > 15
+
+
+def cable_pair(thick: float, way: float) -> list[Layer]:
+    """A dark cable before a wall that stands still; R shows it `way` px lower."""
+    y, x = pixel_places(HEIGHT, WIDTH)
+    layers = []
+    for name, down, where in (("left", 0.0, x < RIGHT), ("right", way, x >= LEFT)):
+        pixels = 0.4 + 0.2 * texture(y, x, np.float32)
+        cable = np.clip(thick / 2 + 0.5 - np.abs(y - down - 55.5), 0, 1)[..., None]
+        pixels[..., :3] = pixels[..., :3] * (1 - cable) + 0.05 * cable
+        pixels[..., 3] = 1
+        layers.append(masked((pixels * 255).round().astype(np.uint8), where, name))
+    return layers
+
+
+@pytest.mark.parametrize(("thick", "way"), [(5, 10), (4, 8)])
+def test_a_cable_thinner_than_its_way_goes_over_whole(thick, way):
+    """Halfway no flow that starts at a place knows of it."""
+    layers = cable_pair(thick, way)
+    thinnest = {}
+    for between in (False, True):
+        result = merged(layers, PLANE, intermediate=between)
+        thinnest[between] = (result[..., :3].mean(-1) < 70).sum(0).min()
+    assert thinnest[False] == 0
+    assert thinnest[True] >= 0.6 * thick

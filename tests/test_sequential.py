@@ -23,8 +23,7 @@ AS_PUBLISHED = {
     "exposure": False,
     "highlights": False,
     "transition_strain": 0.0,
-    "both_flows": False,
-    "fixed_point_steps": 0,
+    "intermediate": False,
 }
 
 # Where p + F * Blend falls within float32's rounding (2e-5 px) of a pixel's edge, either pixel is nearest;

@@ -20,10 +20,6 @@ from reference.common import (
 
 # Coefficients below this move nothing.
 NEGLIGIBLE = 1e-5
-# Where flow is read.
-THERE, GUESSED, BOTH = range(3)
-# Squared difference of two flows up to which none of them is doubted.
-ALIKE = 1.0
 
 
 def flow_at(flow: Array, u: Array, v: Array, grid: Sequence[int]) -> Array:
@@ -33,17 +29,6 @@ def flow_at(flow: Array, u: Array, v: Array, grid: Sequence[int]) -> Array:
     return np.where(known[..., None], total / np.where(known, share, 1)[..., None], 0.0)
 
 
-def doubt(
-    flow: Array, back: Array, u: Array, v: Array, way: Array, share: Array, grid: Sequence[int]
-) -> Array:
-    """How far flows at the ends of a way, of which layer k goes `share`, lead elsewhere: 1 to 7."""
-    dx, dy = way[..., 0], way[..., 1]
-    start = flow_at(flow, u - (1 - share) * dx, v - (1 - share) * dy, grid)
-    end = flow_at(back, u + share * dx, v + share * dy, grid)
-    off = ((start - way) ** 2).sum(-1) + ((end + way) ** 2).sum(-1)
-    return 1 + 6 * off**2 / (off**2 + 256)
-
-
 def geometry_add(
     blend_j: Array,
     box_j: Sequence[int],
@@ -51,11 +36,8 @@ def geometry_add(
     box_k: Sequence[int],
     lens: Numbers,
     flow: Array,
-    back: Array,
     grid: Sequence[int],
     chart: Numbers,
-    start: int,
-    guess: Array,
     field: Array,
 ) -> Array:
     """Field of layer k with the part of layer j added to its displacement."""
@@ -63,22 +45,11 @@ def geometry_add(
     weight = np.where(layer_k[..., 3] != 0, take(blend_j, box_j, x, y), 0.0)
     weight[weight < NEGLIGIBLE] = 0
     point = canvas_point(x + 0.5, y + 0.5, lens)
-    if start == GUESSED:
-        point = point + guess[..., :3]
-        if lens[1]:
-            point = point / np.linalg.norm(point, axis=-1, keepdims=True)
     u, v = chart_position(point, chart)
-    moved = flow_at(back if start == GUESSED else flow, u, v, grid)
-    if start == BOTH:
-        other = -flow_at(back, u, v, grid)
-        doubts = [doubt(flow, back, u, v, way, weight, grid) for way in (moved, other)]
-        its, rest = weight * doubts[1] ** 2, (1 - weight) * doubts[0] ** 2
-        apart = ((moved - other) ** 2).sum(-1) > ALIKE
-        part = np.where(apart, its / (its + rest), weight)[..., None]
-        moved = part * moved + (1 - part) * other
+    moved = flow_at(flow, u, v, grid)
     way = chart_point(u + moved[..., 0], v + moved[..., 1], chart) - chart_point(u, v, chart)
     result = field.astype(np.float64)
-    result[..., :3] += (-1 if start == GUESSED else 1) * weight[..., None] * way
+    result[..., :3] += weight[..., None] * way
     return result
 
 

@@ -1,0 +1,75 @@
+"""Flow as it passes through the view between two layers (kernels/intermediate.cl).
+
+Flow starts on a layer: at a place p, F_ab tells of what layer a shows at p, which is not what is to be seen
+there. That is what is on its way from where a shows it to where b shows it, and has come as far as b's share
+at p: the intermediate flow of frame interpolation. Both flows that start at p most often tell it well enough.
+Where a near thing is narrower than its way, neither does: a cable that lies 20 px lower in the other photo
+would be cut halfway. So flows that lead back to their start are followed to where they pass (forward
+splatting). Of two that meet there, the one is seen that hides the other: if what is behind is seen beside it
+in a layer, and leads to behind it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from hugin_abflow.geometry import PairFlow
+from hugin_abflow.opencl import Buffer, Device
+from hugin_abflow.settings import Settings
+from hugin_abflow.working import Grid, WorkingLayer
+
+
+def settle(
+    device: Device,
+    layers: Sequence[WorkingLayer],
+    coefficients: Sequence[Buffer],
+    flows: list[PairFlow],
+    grid: Grid,
+    settings: Settings,
+) -> None:
+    """Make each pair's flows those that pass through places, in place: what is to be seen at p, layer a shows
+    at p + w_b `backward`(p), and layer b at p + w_a `forward`(p), and `backward` is -`forward`. With
+    `settings.intermediate` off they stay as they start at places.
+
+    coefficients    w_k on each layer's box. Where more than two layers are, a pair's are taken for all.
+    """
+    for number, pair in enumerate(flows if settings.intermediate else ()):
+        a, b = layers[pair.a], layers[pair.b]
+        width, height = pair.chart.width, pair.chart.height
+        share, four_at_a_time = device.empty((height, width)), (-(-width // 4), height)
+        device.run(
+            "intermediate", "intermediate_share", four_at_a_time, coefficients[pair.a], a.box,
+            coefficients[pair.b], b.box, grid.border, grid.lens, pair.chart.border, pair.chart.transform,
+            share,
+        )  # fmt: skip
+        flows[number] = _passing(device, pair, share)
+
+
+def _passing(device: Device, pair: PairFlow, share: Buffer) -> PairFlow:
+    flow, back = pair.forward, pair.backward
+    shape, border = share.shape, pair.chart.border
+    size = shape[::-1]
+    through = device.empty(flow.shape)
+    device.run("intermediate", "intermediate_direct", size, flow, back, border, share, through)
+    furthest, source = device.zeros(shape, np.uint32), device.zeros(shape, np.uint32)
+    for named in (0, 1):
+        for other, way in enumerate(((flow, back), (back, flow))):
+            device.run(
+                "intermediate", "intermediate_pass", size, *way, border, share, through, other, named,
+                furthest, source,
+            )  # fmt: skip
+    del furthest
+    passing, seen, kept = (
+        device.empty(flow.shape),
+        device.empty(shape, np.uint8),
+        device.empty(shape, np.uint8),
+    )
+    device.run(
+        "intermediate", "intermediate_choose", size, flow, back, border, share, through, source, passing, seen
+    )
+    device.run("intermediate", "intermediate_keep", size, seen, border, kept)
+    forward, backward = device.empty(flow.shape), device.empty(flow.shape)
+    device.run("intermediate", "intermediate_settle", size, through, passing, kept, border, forward, backward)
+    return PairFlow(pair.a, pair.b, pair.chart, forward, backward)

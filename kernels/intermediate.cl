@@ -1,0 +1,240 @@
+/* The flow of a pair of layers, a and b, as it passes through each place between them. A chart's pixel p has a share s
+   of b: the flow V(p) comes from p - s V(p), where layer a shows what is to be at p, and goes to p + (1 - s) V(p),
+   where layer b shows it. */
+
+/* Squared px of a chart: the two flows' difference up to which there is nothing to choose, and how far the flows at
+   a way's ends lead elsewhere where it is doubted by half of the most. */
+#define INTERMEDIATE_ALIKE 1.0f
+#define INTERMEDIATE_OFF 16.0f
+/* Doubt is from 1 to one more than this; a way counts by the other one's squared. */
+#define INTERMEDIATE_DOUBT 6.0f
+
+/* Squared px of a chart: how far a flow that leads back may miss its start, and a way's ends may lead elsewhere, if it
+   is to be trusted; and by how much it has to differ from what is there already. */
+#define INTERMEDIATE_TRUSTED 4.0f
+#define INTERMEDIATE_APART 4.0f
+/* Steps in which it is found where a flow passes. */
+#define INTERMEDIATE_STEPS 4
+/* Of a pixel and its eight neighbours as many have to be passed for it to stay so, and for it to become so. */
+#define INTERMEDIATE_KEEP 4
+#define INTERMEDIATE_GROW 3
+
+/* Coefficients below this tell nothing. */
+#define INTERMEDIATE_LEAST 1e-5f
+
+/* The coefficient of a layer in the pixel of the working grid in which p lies; 0 where it has none. */
+static inline float intermediate_coefficient(__global const float *blend, int4 box, int2 p, int4 border) {
+    const int at = grid_border(&p, border) ? box_index(p, box) : -1;
+    return at < 0 ? 0.0f : blend[at];
+}
+
+/* Pixels of a row that a work item takes: compilers for CPUs make vectors only of what is written as vectors. */
+#define INTERMEDIATE_CHUNK 4
+
+/* The share of layer b in what both show; a half where none of them shows anything. */
+__kernel void intermediate_share(__global const float *blend_a, int4 box_a, /* (box_a.w, box_a.z) w_a, its place */
+                                 __global const float *blend_b, int4 box_b, /* (box_b.w, box_b.z) w_b, its place */
+                                 int4 border, float4 lens,                  /* working grid */
+                                 int4 grid, float16 chart,                  /* chart; run size, its columns by
+                                                                               INTERMEDIATE_CHUNK, rounded up */
+                                 __global float *share)                     /* (grid.y, grid.x) */
+{
+    const int x = get_global_id(0) * INTERMEDIATE_CHUNK, y = get_global_id(1);
+    if (x >= grid.x || y >= grid.y)
+        return;
+    float4 py;
+    const float4 px = chart_places(convert_float4(x + (int4)(0, 1, 2, 3)) + 0.5f, (float4)(y + 0.5f), &chart, lens, &py);
+    const float2 places[INTERMEDIATE_CHUNK] = {(float2)(px.x, py.x), (float2)(px.y, py.y), (float2)(px.z, py.z),
+                                               (float2)(px.w, py.w)};
+    for (int k = 0; k < INTERMEDIATE_CHUNK && x + k < grid.x; ++k) {
+        const int2 p = floor_int2(places[k]);
+        const float a = intermediate_coefficient(blend_a, box_a, p, border);
+        const float b = intermediate_coefficient(blend_b, box_b, p, border);
+        share[y * grid.x + x + k] = a + b > INTERMEDIATE_LEAST ? b / (a + b) : 0.5f;
+    }
+}
+
+/* How far the flows at the ends of a way through u lead elsewhere, squared px: in x where it comes from, F_ab, and in y
+   where it goes to, F_ba. */
+static inline float2 intermediate_off(__global const float2 *flow, __global const float2 *back, float2 u, float2 way,
+                                      float share, int4 grid) {
+    return (float2)(square2(bilinear_flow(flow, u - share * way, grid) - way),
+                    square2(bilinear_flow(back, u + (1.0f - share) * way, grid) + way));
+}
+
+static inline float intermediate_doubt(float2 off) {
+    const float both = off.x + off.y;
+    return 1.0f + INTERMEDIATE_DOUBT * both * both / (both * both + INTERMEDIATE_OFF * INTERMEDIATE_OFF);
+}
+
+/* What the two flows that start at a place itself tell of the one that passes through it. With g a flow's gradient
+   along itself and f its length, F_ab misses V by g f s, and -F_ba on the other side by g f (1 - s): so of F_ab a
+   share of 1 - s counts, and of -F_ba one of s; that leaves nothing of these. Beside things that hide others, where
+   flow is no change but a step, one of the two may be the thing's and the other that of what is behind: the one counts
+   that is the same at both ends. */
+__kernel void intermediate_direct(__global const float2 *flow, /* (grid.y, grid.x) F_ab, px */
+                                  __global const float2 *back, /* (grid.y, grid.x) F_ba, px */
+                                  int4 grid,                   /* chart; run size */
+                                  __global const float *share, /* (grid.y, grid.x) */
+                                  __global float2 *through)    /* (grid.y, grid.x) px */
+{
+    const int x = get_global_id(0), y = get_global_id(1);
+    if (x >= grid.x || y >= grid.y)
+        return;
+    const int at = y * grid.x + x;
+    const float2 u = (float2)(x + 0.5f, y + 0.5f), first = flow[at], second = -back[at];
+    const float s = share[at];
+    float part = 1.0f - s;
+    if (square2(first - second) > INTERMEDIATE_ALIKE) {
+        const float doubt = intermediate_doubt(intermediate_off(flow, back, u, first, s, grid));
+        const float doubt_back = intermediate_doubt(intermediate_off(flow, back, u, second, s, grid));
+        const float its = part * doubt_back * doubt_back, rest = s * doubt * doubt;
+        part = its / (its + rest);
+    }
+    through[at] = part * first + (1.0f - part) * second;
+}
+
+/* The pixel of a chart in which u lies, or the nearest one. */
+static inline int intermediate_nearest(float2 u, int4 grid) {
+    int2 p = floor_int2(u);
+    p.x = grid.z ? (p.x % grid.x + grid.x) % grid.x : LIMITED(p.x, 0, grid.x - 1);
+    p.y = LIMITED(p.y, 0, grid.y - 1);
+    return p.y * grid.x + p.x;
+}
+
+/* Where a thing that is narrower than its way passes, no flow that starts there is the thing's. So each flow that leads
+   back tells the four pixels around the place through which it passes; of those that differ from what is there already
+   a pixel listens to the one that differs most. It is called for the flow of a and for that of b, to find by how much;
+   and then once more, to find the flows. */
+__kernel void intermediate_pass(__global const float2 *flow, /* (grid.y, grid.x) of one layer to the other, px */
+                                __global const float2 *back, /* (grid.y, grid.x) the other layer's */
+                                int4 grid,                   /* chart; run size */
+                                __global const float *share, /* (grid.y, grid.x) of b */
+                                __global const float2 *through, /* (grid.y, grid.x) what is there, from a to b */
+                                int other,                   /* 0: the flow is that of a; 1: of b */
+                                int named,                   /* 0: the difference is found; 1: whose it is */
+                                __global uint *furthest,     /* (grid.y, grid.x) bits of the squared difference */
+                                __global uint *source)       /* (grid.y, grid.x) 0: none; 1 + pixel, of b: + all */
+{
+    const int x = get_global_id(0), y = get_global_id(1);
+    if (x >= grid.x || y >= grid.y)
+        return;
+    const int at = y * grid.x + x;
+    const float2 f = flow[at], start = (float2)(x + 0.5f, y + 0.5f);
+    if (square2(f) <= INTERMEDIATE_ALIKE || square2(f + bilinear_flow(back, start + f, grid)) >= INTERMEDIATE_TRUSTED)
+        return;
+    float2 u = start;
+    for (int step = 0; step < INTERMEDIATE_STEPS; ++step) {
+        const float s = share[intermediate_nearest(u, grid)];
+        u = start + (other ? 1.0f - s : s) * f;
+    }
+    const int2 corner = floor_int2(u - 0.5f);
+    for (int tap = 0; tap < 4; ++tap) {
+        const int there = grid_index(corner + (int2)(tap & 1, tap >> 1), grid);
+        if (there < 0)
+            continue;
+        const float apart = square2((other ? -f : f) - through[there]);
+        if (apart <= INTERMEDIATE_APART)
+            continue;
+        /* of numbers above 0, those that are larger have larger bits */
+        if (!named)
+            atomic_max(furthest + there, as_uint(apart));
+        else if (furthest[there] == as_uint(apart))
+            atomic_max(source + there, (uint)(1 + at + other * grid.x * grid.y));
+    }
+}
+
+/* What hides the other of two flows that both pass through u: in how many layers the other one leads from what it shows
+   to where the first one's thing is. A thing that is hidden by what moves otherwise is seen beside it. */
+static inline int intermediate_hides(__global const float2 *flow, __global const float2 *back, float2 u, float2 way,
+                                     float2 hidden, float share, int4 grid) {
+    const float2 a = u - share * way, b = a + way;
+    return (square2(bilinear_flow(flow, b - hidden, grid) - hidden) < INTERMEDIATE_TRUSTED) +
+           (square2(bilinear_flow(back, a + hidden, grid) + hidden) < INTERMEDIATE_TRUSTED);
+}
+
+/* Where what passes is to be seen: where it is the same at both of its ends, and what is there already is not, or is
+   hidden by it. */
+__kernel void intermediate_choose(__global const float2 *flow,    /* (grid.y, grid.x) F_ab, px */
+                                  __global const float2 *back,    /* (grid.y, grid.x) F_ba, px */
+                                  int4 grid,                      /* chart; run size */
+                                  __global const float *share,    /* (grid.y, grid.x) */
+                                  __global const float2 *through, /* (grid.y, grid.x) what is there */
+                                  __global const uint *source,    /* (grid.y, grid.x) of intermediate_pass */
+                                  __global float2 *passing,       /* (grid.y, grid.x) px; 0 where nothing is seen */
+                                  __global uchar *seen)           /* (grid.y, grid.x) 0 or 1 */
+{
+    const int x = get_global_id(0), y = get_global_id(1);
+    if (x >= grid.x || y >= grid.y)
+        return;
+    const int at = y * grid.x + x, all = grid.x * grid.y;
+    const int from = (int)source[at] - 1;
+    float2 way = (float2)(0.0f);
+    bool chosen = false;
+    if (from >= 0) {
+        const float2 u = (float2)(x + 0.5f, y + 0.5f), there = through[at];
+        const float s = share[at];
+        way = from < all ? flow[from] : -back[from - all];
+        const float2 off = intermediate_off(flow, back, u, way, s, grid);
+        if (GREATEST(off.x, off.y) < INTERMEDIATE_TRUSTED) {
+            const float2 its = intermediate_off(flow, back, u, there, s, grid);
+            chosen = GREATEST(its.x, its.y) >= INTERMEDIATE_TRUSTED ||
+                     intermediate_hides(flow, back, u, way, there, s, grid) >
+                         intermediate_hides(flow, back, u, there, way, s, grid);
+        }
+    }
+    passing[at] = chosen ? way : (float2)(0.0f);
+    seen[at] = chosen;
+}
+
+/* How many of a pixel and its eight neighbours are marked. */
+static inline int intermediate_count(__global const uchar *marks, int x, int y, int4 grid) {
+    int count = 0;
+    for (int j = -1; j <= 1; ++j)
+        for (int i = -1; i <= 1; ++i) {
+            const int at = grid_index((int2)(x + i, y + j), grid);
+            count += at >= 0 && marks[at];
+        }
+    return count;
+}
+
+/* Single pixels are chance. */
+__kernel void intermediate_keep(__global const uchar *seen, /* (grid.y, grid.x) */
+                                int4 grid,                  /* chart; run size */
+                                __global uchar *kept)       /* (grid.y, grid.x) */
+{
+    const int x = get_global_id(0), y = get_global_id(1);
+    if (x >= grid.x || y >= grid.y)
+        return;
+    const int at = y * grid.x + x;
+    kept[at] = seen[at] && intermediate_count(seen, x, y, grid) >= INTERMEDIATE_KEEP;
+}
+
+/* What passes where it is seen, and its mean beside that: holes are filled, and an outline is a pixel further out, where
+   the photos have its soft edge. Both ways, as flows at p itself. */
+__kernel void intermediate_settle(__global const float2 *through, /* (grid.y, grid.x) what is there, px */
+                                  __global const float2 *passing, /* (grid.y, grid.x) px */
+                                  __global const uchar *kept,     /* (grid.y, grid.x) where that is seen */
+                                  int4 grid,                      /* chart; run size */
+                                  __global float2 *forward,       /* (grid.y, grid.x) V, px */
+                                  __global float2 *backward)      /* (grid.y, grid.x) -V, px */
+{
+    const int x = get_global_id(0), y = get_global_id(1);
+    if (x >= grid.x || y >= grid.y)
+        return;
+    const int at = y * grid.x + x;
+    float2 way = kept[at] ? passing[at] : through[at];
+    const int count = kept[at] ? 0 : intermediate_count(kept, x, y, grid);
+    if (count >= INTERMEDIATE_GROW) {
+        way = (float2)(0.0f);
+        for (int j = -1; j <= 1; ++j)
+            for (int i = -1; i <= 1; ++i) {
+                const int beside = grid_index((int2)(x + i, y + j), grid);
+                if (beside >= 0 && kept[beside])
+                    way += passing[beside];
+            }
+        way /= (float)count;
+    }
+    forward[at] = way;
+    backward[at] = -way;
+}
