@@ -35,7 +35,8 @@ class Pair:
 class PairFlow(Pair):
     """Flow between the layers of a pair on their chart: float32 (height, width, 2), chart px.
 
-    `forward` is F_ab: what a shows at q, b shows at q + F_ab(q); `backward` is F_ba.
+    `forward` is F_ab: what a shows at q, b shows at q + F_ab(q); `backward` is F_ba. After intermediate.py
+    they are ways through q, no longer from q.
     """
 
     chart: Chart

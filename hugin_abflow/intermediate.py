@@ -20,6 +20,9 @@ from hugin_abflow.opencl import Buffer, Device
 from hugin_abflow.settings import Settings
 from hugin_abflow.working import Grid, WorkingLayer
 
+# Times that each place listens to what passes there.
+_ROUNDS = 2
+
 
 def settle(
     device: Device,
@@ -33,7 +36,8 @@ def settle(
     at p + w_b `backward`(p), and layer b at p + w_a `forward`(p), and `backward` is -`forward`. With
     `settings.intermediate` off they stay as they start at places.
 
-    coefficients    w_k on each layer's box. Where more than two layers are, a pair's are taken for all.
+    coefficients    w_k on each layer's box; where more than two layers are, a pair's as if they were the only
+                    ones.
     """
     for number, pair in enumerate(flows if settings.intermediate else ()):
         a, b = layers[pair.a], layers[pair.b]
@@ -45,31 +49,29 @@ def settle(
             share,
         )  # fmt: skip
         flows[number] = _passing(device, pair, share)
+        device.give_back()
 
 
 def _passing(device: Device, pair: PairFlow, share: Buffer) -> PairFlow:
     flow, back = pair.forward, pair.backward
     shape, border = share.shape, pair.chart.border
     size = shape[::-1]
-    through = device.empty(flow.shape)
-    device.run("intermediate", "intermediate_direct", size, flow, back, border, share, through)
-    furthest, source = device.zeros(shape, np.uint32), device.zeros(shape, np.uint32)
-    for named in (0, 1):
-        for other, way in enumerate(((flow, back), (back, flow))):
-            device.run(
-                "intermediate", "intermediate_pass", size, *way, border, share, through, other, named,
-                furthest, source,
-            )  # fmt: skip
-    del furthest
-    passing, seen, kept = (
-        device.empty(flow.shape),
-        device.empty(shape, np.uint8),
-        device.empty(shape, np.uint8),
-    )
-    device.run(
-        "intermediate", "intermediate_choose", size, flow, back, border, share, through, source, passing, seen
-    )
-    device.run("intermediate", "intermediate_keep", size, seen, border, kept)
+    direct = device.empty(flow.shape)
+    device.run("intermediate", "intermediate_direct", size, flow, back, border, share, direct)
+    passing, seen = device.copy(direct), device.zeros(shape, np.uint8)
+    for _ in range(_ROUNDS):
+        furthest, source = device.zeros(shape, np.uint32), device.zeros(shape, np.uint32)
+        for named in (0, 1):
+            for other, way in enumerate(((flow, back), (back, flow))):
+                device.run(
+                    "intermediate", "intermediate_pass", size, *way, border, share, passing, other, named,
+                    furthest, source,
+                )  # fmt: skip
+        device.run(
+            "intermediate", "intermediate_choose", size, flow, back, border, share, source, passing, seen
+        )
+    kept = device.empty(shape, np.uint8)
+    device.run("intermediate", "intermediate_keep", size, passing, seen, border, kept)
     forward, backward = device.empty(flow.shape), device.empty(flow.shape)
-    device.run("intermediate", "intermediate_settle", size, through, passing, kept, border, forward, backward)
+    device.run("intermediate", "intermediate_settle", size, direct, passing, kept, border, forward, backward)
     return PairFlow(pair.a, pair.b, pair.chart, forward, backward)

@@ -276,7 +276,7 @@ static inline float4 chart_places(float4 u, float4 v, const float16 *chart, floa
    and index 0 for those that do not lie on the grid. */
 static inline float4 grid_taps(int2 corner, float2 t, int4 grid, int4 *at) {
     const float4 weights = (float4)(1.0f - t.x, t.x, 1.0f - t.x, t.x) * (float4)(1.0f - t.y, 1.0f - t.y, t.y, t.y);
-    if (corner.x >= 0 && corner.y >= 0 && corner.x + 1 < grid.x && corner.y + 1 < grid.y) {
+    if (corner.x >= 0 && corner.y >= 0 && corner.x < grid.x - 1 && corner.y < grid.y - 1) {
         *at = corner.y * grid.x + corner.x + (int4)(0, 1, grid.x, grid.x + 1);
         return weights;
     }

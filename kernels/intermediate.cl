@@ -9,13 +9,16 @@
 /* Doubt is from 1 to one more than this; a way counts by the other one's squared. */
 #define INTERMEDIATE_DOUBT 6.0f
 
-/* Squared px of a chart: how far a flow that leads back may miss its start, and a way's ends may lead elsewhere, if it
-   is to be trusted; and by how much it has to differ from what is there already. */
+/* Squared px of a chart: how far a flow that leads back may miss its start, and the flows at a way's ends may lead
+   elsewhere, if it is trusted; and by how much a way has to differ from what is there already. */
 #define INTERMEDIATE_TRUSTED 4.0f
 #define INTERMEDIATE_APART 4.0f
+/* Of a squared difference what two launches agree on. */
+#define INTERMEDIATE_SAME 0.99999f
 /* Steps in which it is found where a flow passes. */
 #define INTERMEDIATE_STEPS 4
-/* Of a pixel and its eight neighbours as many have to be passed for it to stay so, and for it to become so. */
+/* Of a pixel and its eight neighbours so many have to be alike for what passes it to stay, and of its neighbours so many
+   to be passed for it to become so. */
 #define INTERMEDIATE_KEEP 4
 #define INTERMEDIATE_GROW 3
 
@@ -76,7 +79,7 @@ __kernel void intermediate_direct(__global const float2 *flow, /* (grid.y, grid.
                                   __global const float2 *back, /* (grid.y, grid.x) F_ba, px */
                                   int4 grid,                   /* chart; run size */
                                   __global const float *share, /* (grid.y, grid.x) */
-                                  __global float2 *through)    /* (grid.y, grid.x) px */
+                                  __global float2 *direct)     /* (grid.y, grid.x) px */
 {
     const int x = get_global_id(0), y = get_global_id(1);
     if (x >= grid.x || y >= grid.y)
@@ -91,7 +94,7 @@ __kernel void intermediate_direct(__global const float2 *flow, /* (grid.y, grid.
         const float its = part * doubt_back * doubt_back, rest = s * doubt * doubt;
         part = its / (its + rest);
     }
-    through[at] = part * first + (1.0f - part) * second;
+    direct[at] = part * first + (1.0f - part) * second;
 }
 
 /* The pixel of a chart in which u lies, or the nearest one. */
@@ -121,8 +124,8 @@ __kernel void intermediate_pass(__global const float2 *flow, /* (grid.y, grid.x)
         return;
     const int at = y * grid.x + x;
     const float2 f = flow[at], start = (float2)(x + 0.5f, y + 0.5f);
-    if (square2(f) <= INTERMEDIATE_ALIKE || square2(f + bilinear_flow(back, start + f, grid)) >= INTERMEDIATE_TRUSTED)
-        return;
+    if (!(square2(f) > INTERMEDIATE_ALIKE && square2(f + bilinear_flow(back, start + f, grid)) < INTERMEDIATE_TRUSTED))
+        return; /* nor for what is not a number */
     float2 u = start;
     for (int step = 0; step < INTERMEDIATE_STEPS; ++step) {
         const float s = share[intermediate_nearest(u, grid)];
@@ -134,12 +137,12 @@ __kernel void intermediate_pass(__global const float2 *flow, /* (grid.y, grid.x)
         if (there < 0)
             continue;
         const float apart = square2((other ? -f : f) - through[there]);
-        if (apart <= INTERMEDIATE_APART)
+        if (!(apart > INTERMEDIATE_APART))
             continue;
         /* of numbers above 0, those that are larger have larger bits */
         if (!named)
             atomic_max(furthest + there, as_uint(apart));
-        else if (furthest[there] == as_uint(apart))
+        else if (apart >= INTERMEDIATE_SAME * as_float(furthest[there]))
             atomic_max(source + there, (uint)(1 + at + other * grid.x * grid.y));
     }
 }
@@ -153,67 +156,60 @@ static inline int intermediate_hides(__global const float2 *flow, __global const
            (square2(bilinear_flow(back, a + hidden, grid) + hidden) < INTERMEDIATE_TRUSTED);
 }
 
-/* Where what passes is to be seen: where it is the same at both of its ends, and what is there already is not, or is
-   hidden by it. */
+/* What passes is seen where it is the same at both of its ends, and what is there already is not, or is hidden by it. A
+   pixel has listened to one way alone, and where outlines meet, that of what is behind may differ most: so it listens
+   once more, when that is there, for what hides it. */
 __kernel void intermediate_choose(__global const float2 *flow,    /* (grid.y, grid.x) F_ab, px */
                                   __global const float2 *back,    /* (grid.y, grid.x) F_ba, px */
                                   int4 grid,                      /* chart; run size */
                                   __global const float *share,    /* (grid.y, grid.x) */
-                                  __global const float2 *through, /* (grid.y, grid.x) what is there */
                                   __global const uint *source,    /* (grid.y, grid.x) of intermediate_pass */
-                                  __global float2 *passing,       /* (grid.y, grid.x) px; 0 where nothing is seen */
-                                  __global uchar *seen)           /* (grid.y, grid.x) 0 or 1 */
+                                  __global float2 *through,       /* (grid.y, grid.x) what is there, in place */
+                                  __global uchar *seen)           /* (grid.y, grid.x) 1 where something passes */
 {
     const int x = get_global_id(0), y = get_global_id(1);
     if (x >= grid.x || y >= grid.y)
         return;
-    const int at = y * grid.x + x, all = grid.x * grid.y;
-    const int from = (int)source[at] - 1;
-    float2 way = (float2)(0.0f);
-    bool chosen = false;
-    if (from >= 0) {
-        const float2 u = (float2)(x + 0.5f, y + 0.5f), there = through[at];
-        const float s = share[at];
-        way = from < all ? flow[from] : -back[from - all];
-        const float2 off = intermediate_off(flow, back, u, way, s, grid);
-        if (GREATEST(off.x, off.y) < INTERMEDIATE_TRUSTED) {
-            const float2 its = intermediate_off(flow, back, u, there, s, grid);
-            chosen = GREATEST(its.x, its.y) >= INTERMEDIATE_TRUSTED ||
-                     intermediate_hides(flow, back, u, way, there, s, grid) >
-                         intermediate_hides(flow, back, u, there, way, s, grid);
-        }
-    }
-    passing[at] = chosen ? way : (float2)(0.0f);
-    seen[at] = chosen;
+    const int at = y * grid.x + x, all = grid.x * grid.y, from = (int)source[at] - 1;
+    if (from < 0)
+        return;
+    const float2 u = (float2)(x + 0.5f, y + 0.5f), there = through[at];
+    const float2 way = from < all ? flow[from] : -back[from - all];
+    const float s = share[at];
+    const float2 off = intermediate_off(flow, back, u, way, s, grid);
+    if (!(GREATEST(off.x, off.y) < INTERMEDIATE_TRUSTED))
+        return;
+    const float2 its = intermediate_off(flow, back, u, there, s, grid);
+    if (GREATEST(its.x, its.y) < INTERMEDIATE_TRUSTED &&
+        intermediate_hides(flow, back, u, way, there, s, grid) <= intermediate_hides(flow, back, u, there, way, s, grid))
+        return;
+    through[at] = way;
+    seen[at] = 1;
 }
 
-/* How many of a pixel and its eight neighbours are marked. */
-static inline int intermediate_count(__global const uchar *marks, int x, int y, int4 grid) {
-    int count = 0;
-    for (int j = -1; j <= 1; ++j)
-        for (int i = -1; i <= 1; ++i) {
-            const int at = grid_index((int2)(x + i, y + j), grid);
-            count += at >= 0 && marks[at];
-        }
-    return count;
-}
-
-/* Single pixels are chance. */
-__kernel void intermediate_keep(__global const uchar *seen, /* (grid.y, grid.x) */
-                                int4 grid,                  /* chart; run size */
-                                __global uchar *kept)       /* (grid.y, grid.x) */
+/* What passes single pixels is chance: where it differs from what is around. */
+__kernel void intermediate_keep(__global const float2 *passing, /* (grid.y, grid.x) what is there, px */
+                                __global const uchar *seen,     /* (grid.y, grid.x) where that is what passes */
+                                int4 grid,                      /* chart; run size */
+                                __global uchar *kept)           /* (grid.y, grid.x) */
 {
     const int x = get_global_id(0), y = get_global_id(1);
     if (x >= grid.x || y >= grid.y)
         return;
     const int at = y * grid.x + x;
-    kept[at] = seen[at] && intermediate_count(seen, x, y, grid) >= INTERMEDIATE_KEEP;
+    int alike = 0;
+    for (int j = -1; j <= 1 && seen[at]; ++j)
+        for (int i = -1; i <= 1; ++i) {
+            const int beside = grid_index((int2)(x + i, y + j), grid);
+            alike += beside >= 0 && square2(passing[beside] - passing[at]) < INTERMEDIATE_APART;
+        }
+    kept[at] = alike >= INTERMEDIATE_KEEP;
 }
 
 /* What passes where it is seen, and its mean beside that: holes are filled, and an outline is a pixel further out, where
    the photos have its soft edge. Both ways, as flows at p itself. */
-__kernel void intermediate_settle(__global const float2 *through, /* (grid.y, grid.x) what is there, px */
-                                  __global const float2 *passing, /* (grid.y, grid.x) px */
+__kernel void intermediate_settle(__global const float2 *direct,  /* (grid.y, grid.x) what starts there, px */
+                                  __global const float2 *passing, /* (grid.y, grid.x) what passes, px */
                                   __global const uchar *kept,     /* (grid.y, grid.x) where that is seen */
                                   int4 grid,                      /* chart; run size */
                                   __global float2 *forward,       /* (grid.y, grid.x) V, px */
@@ -223,18 +219,18 @@ __kernel void intermediate_settle(__global const float2 *through, /* (grid.y, gr
     if (x >= grid.x || y >= grid.y)
         return;
     const int at = y * grid.x + x;
-    float2 way = kept[at] ? passing[at] : through[at];
-    const int count = kept[at] ? 0 : intermediate_count(kept, x, y, grid);
-    if (count >= INTERMEDIATE_GROW) {
-        way = (float2)(0.0f);
-        for (int j = -1; j <= 1; ++j)
-            for (int i = -1; i <= 1; ++i) {
-                const int beside = grid_index((int2)(x + i, y + j), grid);
-                if (beside >= 0 && kept[beside])
-                    way += passing[beside];
+    float2 way = kept[at] ? passing[at] : direct[at], sum = (float2)(0.0f);
+    int count = 0;
+    for (int j = -1; j <= 1 && !kept[at]; ++j)
+        for (int i = -1; i <= 1; ++i) {
+            const int beside = grid_index((int2)(x + i, y + j), grid);
+            if (beside >= 0 && kept[beside]) {
+                sum += passing[beside];
+                ++count;
             }
-        way /= (float)count;
-    }
+        }
+    if (count >= INTERMEDIATE_GROW)
+        way = sum / (float)count;
     forward[at] = way;
     backward[at] = -way;
 }

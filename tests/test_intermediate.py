@@ -104,28 +104,28 @@ def test_kernels_equal_their_twins(device: Device, wraps: bool, seed: int) -> No
     assert_close(furthest.get().view(np.float32), apart, SUM, decisions=DECISIONS)
     assert (source.get() != sources).mean() <= DECISIONS
 
+    sources[0, :2] = WIDTH * HEIGHT + 1, WIDTH * HEIGHT  # the first pixel of b, the last one of a
     source.set(sources.astype(np.uint32))
-    passing, seen = device.empty((HEIGHT, WIDTH, 2)), device.empty((HEIGHT, WIDTH), np.uint8)
-    device.run(
-        "intermediate", "intermediate_choose", size, *ways, grid, shares, through, source, passing, seen
-    )
-    chosen, visible = twin.intermediate_choose(flow, back, grid, share, direct, sources)
+    seen = device.zeros((HEIGHT, WIDTH), np.uint8)
+    device.run("intermediate", "intermediate_choose", size, *ways, grid, shares, source, through, seen)
+    passing, visible = twin.intermediate_choose(flow, back, grid, share, sources, direct)
     assert 0.02 < visible.mean() < 0.5
-    assert_close(passing.get(), chosen, SUM, decisions=DECISIONS)
+    assert_close(through.get(), passing, SUM, decisions=DECISIONS)
     assert (seen.get() != visible).mean() <= DECISIONS
 
+    visible[:2, :2], passing[:2, :2] = True, 9  # the corner counts as well
+    passing = passing.astype(np.float32)
+    through.set(passing)
     seen.set(visible.astype(np.uint8))
     kept = device.empty((HEIGHT, WIDTH), np.uint8)
-    device.run("intermediate", "intermediate_keep", size, seen, grid, kept)
-    held = twin.intermediate_keep(visible, grid)
-    assert 0 < held.sum() < visible.sum()
+    device.run("intermediate", "intermediate_keep", size, through, seen, grid, kept)
+    held = twin.intermediate_keep(passing, visible, grid)
+    assert held[0, 0] and 0 < held.sum() < visible.sum()
     assert np.array_equal(kept.get(), held)
 
-    chosen = chosen.astype(np.float32)
-    passing.set(chosen)
     ends = device.empty((HEIGHT, WIDTH, 2)), device.empty((HEIGHT, WIDTH, 2))
-    device.run("intermediate", "intermediate_settle", size, through, passing, kept, grid, *ends)
-    settled = twin.intermediate_settle(direct, chosen, held, grid)
+    device.run("intermediate", "intermediate_settle", size, device.upload(direct), through, kept, grid, *ends)
+    settled = twin.intermediate_settle(direct, passing, held, grid)
     assert_close(ends[0].get(), settled, SUM)
     assert np.array_equal(ends[1].get(), -ends[0].get())
 
@@ -177,6 +177,66 @@ def test_a_bar_narrower_than_its_way_is_seen_once_between_its_places(
     # but where a photo has it, and what it hides there the other one shows, that is not sure
     ends = [(50 <= x < 55) or (50 + way <= x < 55 + way) for x in places]
     assert all(ends)
+
+
+def wrong(forward: np.ndarray, left: float, width: int, way: float, around: float, share: float) -> float:
+    """The share of a bar's pixels, where it is to be seen, whose flow is not the bar's."""
+    columns = np.arange(120) + 0.5 - share * way
+    its = (columns >= left) & (columns < left + width)
+    off = np.abs(forward[4:-4, :, 0] - np.where(its, way, around)) > 2
+    return float(off[:, its].mean())
+
+
+@pytest.mark.parametrize(("width", "way", "around"), [(8, 4, 20), (8, -4, -20), (6, 4, 16), (6, -3, 14)])
+@pytest.mark.parametrize("share", [0.35, 0.5, 0.65])
+def test_a_bar_hides_what_moves_further(
+    device: Device, width: int, way: float, around: float, share: float
+) -> None:
+    """What is behind differs more from what both flows tell there, and is the same at its ends, too."""
+    forward, _ = settled(device, PLANE, ALL, bar(50, width, way, around), share)
+    assert wrong(forward, 50, width, way, around, share) == 0
+
+
+def test_single_pixels_that_lead_back_by_chance_change_nothing(device: Device) -> None:
+    flow, back = np.zeros((31, 120, 2)), np.zeros((31, 120, 2))
+    random = np.random.default_rng(5)
+    for x, y in zip(range(10, 90, 9), random.permutation(9) * 3 + 2, strict=True):
+        way = random.integers(4, 12)
+        flow[y, x, 0], back[y, x + way, 0] = way, -way
+    forward, _ = settled(device, PLANE, ALL, (flow, back), 0.5)
+    assert (np.abs(forward[..., 0]) < 1e-3).mean() > 0.98
+
+
+def test_layers_may_come_in_any_order(device: Device) -> None:
+    """Of a bar whose own place in one of them is beside the chart's border as well."""
+    for left in (50, 20, 1):
+        flow, back = bar(left, 5, 14.0, -2.0)
+        forward, _ = settled(device, PLANE, ALL, (flow, back), 0.5)
+        swapped, _ = settled(device, PLANE, ALL, (back, flow), 0.5)
+        assert np.allclose(forward, -swapped, atol=1e-5)
+
+
+@pytest.mark.parametrize("columns", [5, 23])
+def test_where_it_begins_does_not_matter_on_a_cylinder(device: Device, columns: int) -> None:
+    grid = plane(128, 31, wraps=True)
+    found = pair_chart(np.ones(grid.shape, bool), grid, grid)
+    assert found.wraps and found.width == 128
+    flow, back = (np.zeros((31, 128, 2)) for _ in range(2))
+    flow[:, 60:65, 0], back[:, 74:79, 0] = 14, -14
+    first, _ = settled(device, grid, found, (flow, back), 0.5)
+    flow, back = (np.roll(one, 60 + columns, 1) for one in (flow, back))
+    rolled, _ = settled(device, grid, found, (flow, back), 0.5)
+    assert (np.abs(first[4:-4, 68:71, 0] - 14) < 1).all()
+    assert np.allclose(np.roll(first, 60 + columns, 1), rolled, atol=1e-4)
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf, 3e9, -1e30])
+def test_what_is_no_flow_does_not_spread(device: Device, value: float) -> None:
+    flow, back = bar(50, 5, 14.0, 0.0)
+    flow[15, 20] = value
+    forward, _ = settled(device, PLANE, ALL, (flow, back), 0.5)
+    near = forward[4:-4, 57:62][..., 0]
+    assert (np.abs(near - 14) < 1)[:, 1:4].all()
 
 
 @pytest.mark.parametrize("share", [0.3, 0.5])

@@ -369,6 +369,7 @@ def test_working_resolution_falls_where_memory_ends(small_memory, caplog):
     canvas = CANVASES["plane"]
     layers = with_parallax(canvas)
     peak = small_memory(1 << 40)
+    # with more threads the peak varies from run to run
     expected = merged(layers, canvas, band_rows=16, threads=1)
     peak = small_memory(peak[0] * 2 // 3)
     result = merged(layers, canvas, band_rows=16, threads=1)

@@ -2,12 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 import numpy as np
-from scipy import ndimage
 
-from reference.common import Array, Numbers, canvas_position, chart_point, grid_border, on_grid, pixels, take
+from reference.common import (
+    Array,
+    Numbers,
+    canvas_position,
+    chart_point,
+    four_taps,
+    grid_border,
+    on_grid,
+    pixels,
+    take,
+)
 from reference.geometry import flow_at
 
 # Squared px: up to which flows are alike, differ less than counts, and are trusted.
@@ -66,41 +75,29 @@ def intermediate_pass(
     flows: tuple[Array, Array], grid: Sequence[int], share: Array, through: Array
 ) -> tuple[Array, Array]:
     """Both passes over both flows: the largest squared differences, and whose they are."""
-    width, height = grid[:2]
-    found = np.zeros((height, width)), np.zeros((height, width), np.int64)
-    for y in range(height):
-        for x in range(width):
-            for other in (0, 1):
-                _one(x, y, other, flows, grid, share, through, found)
-    return found
-
-
-def _one(x, y, other, flows, grid, share, through, found) -> None:
-    """What the flow of one pixel tells others."""
     width, height, wraps, _ = grid
-    furthest, source = found
-    f = flows[other][y, x].astype(np.float64)
-    back = flow_at(flows[1 - other], np.array([x + 0.5 + f[0]]), np.array([y + 0.5 + f[1]]), grid)[0]
-    if square(f) <= ALIKE or square(f + back) >= TRUSTED:
-        return
-    u, v = x + 0.5, y + 0.5
-    for _ in range(STEPS):
-        column = int(np.floor(u)) % width if wraps else int(np.clip(np.floor(u), 0, width - 1))
-        s = float(share[int(np.clip(np.floor(v), 0, height - 1)), column])
-        s = 1 - s if other else s
-        u, v = x + 0.5 + s * f[0], y + 0.5 + s * f[1]
-    for j in (0, 1):
-        for i in (0, 1):
-            column, row, inside = grid_border(
-                np.array(int(np.floor(u - 0.5)) + i), np.array(int(np.floor(v - 0.5)) + j), grid
-            )
-            if not inside:
-                continue
-            at = int(row), int(column)
-            apart = square((-f if other else f) - through[at])
-            name = 1 + y * width + x + other * width * height
-            if apart > APART and (apart, name) > (furthest[at], source[at]):
-                furthest[at], source[at] = apart, name
+    x, y = (n + 0.5 for n in pixels(width, height))
+    furthest, source = np.zeros(width * height), np.zeros(width * height, np.int64)
+    for other in (0, 1):
+        f = flows[other].astype(np.float64)
+        back = flow_at(flows[1 - other], x + f[..., 0], y + f[..., 1], grid)
+        told = (square(f) > ALIKE) & (square(f + back) < TRUSTED)
+        u, v = x, y
+        for _ in range(STEPS):
+            column, row = np.floor(u).astype(int), np.clip(np.floor(v).astype(int), 0, height - 1)
+            s = share[row, column % width if wraps else np.clip(column, 0, width - 1)]
+            s = (1 - s if other else s)[..., None]
+            u, v = np.moveaxis(np.stack([x, y], -1) + s * f, -1, 0)
+        names = 1 + np.arange(width * height).reshape(height, width) + other * width * height
+        for column, row, _ in four_taps(u, v):
+            column, row, inside = grid_border(column, row, grid)
+            at = np.where(inside, row * width + column, 0)
+            apart = square((-f if other else f) - through.reshape(-1, 2)[at])
+            counts = told & inside & (apart > APART)
+            for place, how, name in zip(at[counts], apart[counts], names[counts], strict=True):
+                if (how, name) > (furthest[place], source[place]):
+                    furthest[place], source[place] = how, name
+    return furthest.reshape(height, width), source.reshape(height, width)
 
 
 def hides(
@@ -115,9 +112,9 @@ def hides(
 
 
 def intermediate_choose(
-    flow: Array, back: Array, grid: Sequence[int], share: Array, through: Array, source: Array
+    flow: Array, back: Array, grid: Sequence[int], share: Array, source: Array, through: Array
 ) -> tuple[Array, Array]:
-    """What passes, and where it is to be seen."""
+    """What is there, and where it is what passes."""
     u, v = (n + 0.5 for n in pixels(grid[0], grid[1]))
     ways = np.concatenate([flow.reshape(-1, 2), -back.reshape(-1, 2)]).astype(np.float64)
     way = ways[np.maximum(source - 1, 0)]
@@ -125,28 +122,27 @@ def intermediate_choose(
     over = hides(flow, back, u, v, way, through, share, grid)
     under = hides(flow, back, u, v, through, way, share, grid)
     seen = (source > 0) & (its < TRUSTED) & ((there >= TRUSTED) | (over > under))
-    return np.where(seen[..., None], way, 0.0), seen
+    return np.where(seen[..., None], way, through), seen
 
 
-def count(marks: Array, wraps: bool) -> Array:
-    """How many of each pixel and its eight neighbours are marked."""
-    rows = ndimage.convolve1d(marks.astype(int), [1, 1, 1], axis=0, mode="constant")
-    return ndimage.convolve1d(rows, [1, 1, 1], axis=1, mode="wrap" if wraps else "constant")
-
-
-def intermediate_keep(seen: Array, grid: Sequence[int]) -> Array:
-    """Marks of which enough are together."""
-    return (seen != 0) & (count(seen != 0, bool(grid[2])) >= KEEP)
-
-
-def intermediate_settle(through: Array, passing: Array, kept: Array, grid: Sequence[int]) -> Array:
-    """What passes where it is kept, and its mean beside that."""
+def around(values: Array, grid: Sequence[int]) -> Iterator[tuple[Array, Array]]:
+    """Values of each pixel and its eight neighbours, and which of these lie on the grid."""
     x, y = pixels(grid[0], grid[1])
-    total, number = np.zeros(through.shape), count(kept != 0, bool(grid[2]))
     for j in (-1, 0, 1):
         for i in (-1, 0, 1):
-            its, inside = on_grid(passing * (kept != 0)[..., None], grid, x + i, y + j)
-            total += its * inside[..., None]
-    beside = (kept == 0) & (number >= GROW)
-    result = np.where((kept != 0)[..., None], passing, through)
+            yield on_grid(values, grid, x + i, y + j)
+
+
+def intermediate_keep(passing: Array, seen: Array, grid: Sequence[int]) -> Array:
+    """Marks of what is alike in enough pixels around."""
+    alike = sum(inside & (square(its - passing) < APART) for its, inside in around(passing, grid))
+    return (seen != 0) & (alike >= KEEP)
+
+
+def intermediate_settle(direct: Array, passing: Array, kept: Array, grid: Sequence[int]) -> Array:
+    """What passes where it is kept, and its mean beside that."""
+    total = sum(its for its, _ in around(passing * kept[..., None], grid))
+    number = sum(its for its, _ in around(kept.astype(int), grid))
+    beside = ~kept & (number >= GROW)
+    result = np.where(kept[..., None], passing, direct)
     return np.where(beside[..., None], total / np.maximum(number, 1)[..., None], result)
