@@ -291,6 +291,6 @@ def test_a_near_things_outline_goes_with_the_thing(device: Device, share: float)
     flow[..., 0], back[..., 0] = np.where(columns < 50, 8, 0), np.where(columns < 58, -8, 0)
     forward, _ = settled(device, PLANE, ALL, (flow, back), share)
     between = forward[5:-5, 51 : math.floor(50 + 8 * share) - 1, 0]
-    assert np.abs(between - 8).max() < 0.6
+    assert np.abs(between - 8).max() < 0.3
     for far, way in ((np.s_[:, 10:40], 8), (np.s_[:, 70:110], 0)):
         assert np.allclose(forward[far][..., 0], way)
