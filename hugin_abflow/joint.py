@@ -319,8 +319,8 @@ def _tell_overlaps(
 def _read(
     device: Device, layers: Sequence[Layer], grid: Grid, progress: Progress, cores: int
 ) -> list[WorkingLayer]:
-    """The layers on the working grid, several decoded at a time, in an order that does not depend on the
-    caller's: by place and size, and by what they show where these are the same.
+    """The layers on the working grid, several decoded at a time, the largest first: none is last alone. Their
+    order does not depend on the caller's: by place and size, and by what they show where these are the same.
     """
     lock = threading.Lock()
 
@@ -336,7 +336,7 @@ def _read(
                 decoders.submit(
                     working.reduce_layer, device, layer, grid, told, checked=places[layer.box] > 1
                 )
-                for layer in layers
+                for layer in sorted(layers, key=lambda one: -one.box.width * one.box.height)
             ]
             reduced = [job.result() for job in jobs]
         finally:
