@@ -99,10 +99,8 @@ __kernel void intermediate_direct(__global const float2 *flow, /* (grid.y, grid.
 
 /* The pixel of a chart in which u lies, or the nearest one. */
 static inline int intermediate_nearest(float2 u, int4 grid) {
-    int2 p = floor_int2(u);
-    p.x = grid.z ? (p.x % grid.x + grid.x) % grid.x : LIMITED(p.x, 0, grid.x - 1);
-    p.y = LIMITED(p.y, 0, grid.y - 1);
-    return p.y * grid.x + p.x;
+    const int2 p = floor_int2(u);
+    return grid_index((int2)(grid.z ? p.x : LIMITED(p.x, 0, grid.x - 1), LIMITED(p.y, 0, grid.y - 1)), grid);
 }
 
 /* Where a thing that is narrower than its way passes, no flow that starts there is the thing's. So each flow that leads

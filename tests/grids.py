@@ -6,8 +6,9 @@ import math
 
 import numpy as np
 
+from hugin_abflow.chart import Chart, pair_chart
 from hugin_abflow.layer import Box, Layer
-from hugin_abflow.opencl import Device
+from hugin_abflow.opencl import Buffer, Device
 from hugin_abflow.working import Grid, WorkingLayer
 
 WIDTH, HEIGHT = 77, 53
@@ -75,3 +76,15 @@ def on_device(
     )
     box = (left, top, width, height)
     return WorkingLayer(layer, box, device.upload(pixels.astype(np.float32)), 0)
+
+
+def whole(device: Device, grid: Grid, blend: float | np.ndarray) -> tuple[WorkingLayer, Buffer]:
+    """A layer that covers the grid, with a coefficient."""
+    layer = on_device(device, np.ones((*grid.shape, 4)))
+    blends = np.broadcast_to(np.float32(blend), grid.shape)
+    return layer, device.upload(blends)
+
+
+def whole_chart(grid: Grid) -> Chart:
+    """The chart of a pair that overlaps everywhere."""
+    return pair_chart(np.ones(grid.shape, bool), grid, grid)

@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 import pytest
-from grids import patches, plane, sphere
+from grids import patches, plane, sphere, whole_chart
 from reference import common
 from reference import consistency as twin
 from scipy import ndimage
@@ -14,7 +14,7 @@ from tolerances import SUM, assert_close
 
 from hugin_abflow import consistency
 from hugin_abflow.cells import CELL, Whole
-from hugin_abflow.chart import Chart, pair_chart
+from hugin_abflow.chart import Chart
 from hugin_abflow.geometry import PairFlow
 from hugin_abflow.opencl import Device
 from hugin_abflow.pyramid import Level
@@ -187,10 +187,6 @@ def test_flow_equals_its_twin(device: Device) -> None:
 # The module
 
 
-def chart_of(grid: Grid) -> Chart:
-    return pair_chart(np.ones(grid.shape, bool), grid, grid)
-
-
 def mended(
     device: Device,
     grid: Grid,
@@ -201,7 +197,7 @@ def mended(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Both flows mended; images: what the layers show, on the chart; None: nothing."""
     flows = [device.upload(flow.astype(np.float32)) for flow in (forward, backward)]
-    pair = PairFlow(0, 1, chart_of(grid), *flows)
+    pair = PairFlow(0, 1, whole_chart(grid), *flows)
     nothing = np.zeros(forward.shape[:2])
     shown = [device.upload((nothing if one is None else one).astype(np.float32)) for one in images]
     levels = [Level(one, device.zeros(nothing.shape), pair.chart.wraps) for one in shown]
@@ -220,14 +216,14 @@ CANVASES = {"plane": plane(97, 61), "cylinder": plane(128, 61, wraps=True), "sph
 @pytest.mark.parametrize("name", list(CANVASES))
 def test_no_flow_stays_exactly_none(device: Device, name: str) -> None:
     grid = CANVASES[name]
-    nothing = still(chart_of(grid))
+    nothing = still(whole_chart(grid))
     for flow in mended(device, grid, nothing, nothing):
         assert not flow.any()
 
 
 @pytest.mark.parametrize("name", ["cylinder", "sphere"])
 def test_a_flow_that_leads_back_exactly_stays_to_the_bit(device: Device, name: str) -> None:
-    there = np.add(still(chart_of(CANVASES[name])), [2.5, -1.25])
+    there = np.add(still(whole_chart(CANVASES[name])), [2.5, -1.25])
     forward, backward = mended(device, CANVASES[name], there, -there)
     assert np.array_equal(forward, there)
     assert np.array_equal(backward, -there)
@@ -237,7 +233,7 @@ def test_a_flow_that_leads_back_exactly_stays_to_the_bit(device: Device, name: s
 def test_consistent_flows_come_out_unchanged(device: Device, name: str) -> None:
     """Of a smooth field, whose inverse is found by iteration: nearly within the interpolation's own error,
     though pixels of it become a quarter smaller."""
-    found = chart_of(CANVASES[name])
+    found = whole_chart(CANVASES[name])
     columns, rows = common.pixels(found.width, found.height)
     turn = 4 * math.pi / found.width
     forward = 2 * np.stack([np.sin(turn * columns + rows / 27), np.cos(rows / 21 - turn * columns)], -1)
@@ -281,7 +277,7 @@ def test_a_patch_of_wrong_flow_is_filled_from_around(device: Device, centre: tup
 def test_flow_of_what_moved_is_filled_from_around(device: Device, name: str, column: int) -> None:
     """It leads there and back exactly, each way from the place where that photo shows it, across the border
     too; what is around stands still."""
-    found = chart_of(CANVASES[name])
+    found = whole_chart(CANVASES[name])
     places, flows = [], []
     for at, way in ((column, 7 * CELL), (column + 7, -7 * CELL)):
         cells = np.zeros((found.height // CELL, found.width // CELL), bool)
@@ -364,7 +360,7 @@ def test_a_line_on_which_wrong_flows_lead_back_counts_little(device: Device) -> 
 
 def moved_place(grid: Grid) -> tuple[Whole, np.ndarray]:
     """Cells that moved, and their pixels."""
-    found = chart_of(grid)
+    found = whole_chart(grid)
     cells = np.zeros((found.height // CELL, found.width // CELL), bool)
     cells[5:11, 2:8] = True
     place = np.zeros((found.height, found.width), bool)

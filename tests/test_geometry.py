@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 import pytest
-from grids import GRIDS, on_device, patches, plane, random_layer, sphere
+from grids import GRIDS, on_device, patches, plane, random_layer, sphere, whole, whole_chart
 from reference import common
 from reference import geometry as twin
 from scipy import ndimage
@@ -16,9 +16,9 @@ from hugin_abflow import geometry
 from hugin_abflow.chart import Chart, pair_chart
 from hugin_abflow.geometry import PairFlow
 from hugin_abflow.layer import Box
-from hugin_abflow.opencl import Buffer, Device
+from hugin_abflow.opencl import Device
 from hugin_abflow.settings import Settings
-from hugin_abflow.working import Grid, WorkingLayer
+from hugin_abflow.working import Grid
 
 NAMES = list(GRIDS)
 
@@ -241,17 +241,6 @@ def reached(
 
 def pair(device: Device, a: int, b: int, found: Chart, forward: np.ndarray, backward: np.ndarray) -> PairFlow:
     return PairFlow(a, b, found, device.upload(forward), device.upload(backward))
-
-
-def whole(device: Device, grid: Grid, blend: float | np.ndarray) -> tuple[WorkingLayer, Buffer]:
-    """A layer that covers the grid, with a coefficient."""
-    layer = on_device(device, np.ones((*grid.shape, 4)))
-    blends = np.broadcast_to(np.float32(blend), grid.shape)
-    return layer, device.upload(blends)
-
-
-def whole_chart(grid: Grid) -> Chart:
-    return pair_chart(np.ones(grid.shape, bool), grid, grid)
 
 
 def test_two_layers_move_as_published(device: Device) -> None:

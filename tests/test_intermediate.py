@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 import numpy as np
 import pytest
-from grids import GRIDS, on_device, patches, plane
+from grids import GRIDS, patches, plane, whole, whole_chart
 from reference import common
 from reference import intermediate as twin
 from tolerances import DECISIONS, POSITION, SUM, assert_close
@@ -15,9 +15,9 @@ from tolerances import DECISIONS, POSITION, SUM, assert_close
 from hugin_abflow import geometry, intermediate
 from hugin_abflow.chart import Chart, pair_chart
 from hugin_abflow.geometry import PairFlow
-from hugin_abflow.opencl import Buffer, Device
+from hugin_abflow.opencl import Device
 from hugin_abflow.settings import Settings
-from hugin_abflow.working import Grid, WorkingLayer
+from hugin_abflow.working import Grid
 
 WIDTH, HEIGHT = 61, 43
 WAY, AROUND = np.array([7.25, -3.5]), np.array([-2.5, 0.75])
@@ -130,12 +130,6 @@ def test_kernels_equal_their_twins(device: Device, wraps: bool, seed: int) -> No
     assert np.array_equal(ends[1].get(), -ends[0].get())
 
 
-def whole(device: Device, grid: Grid, blend: float) -> tuple[WorkingLayer, Buffer]:
-    """A layer that covers the grid, with a coefficient."""
-    layer = on_device(device, np.ones((*grid.shape, 4)))
-    return layer, device.upload(np.full(grid.shape, blend, np.float32))
-
-
 def settled(
     device: Device, grid: Grid, found: Chart, ways: Sequence[np.ndarray], share: float
 ) -> tuple[np.ndarray, np.ndarray]:
@@ -156,7 +150,7 @@ def bar(left: float, width: int, way: float, around: float) -> tuple[np.ndarray,
 
 
 PLANE = plane(120, 31)
-ALL = pair_chart(np.ones(PLANE.shape, bool), PLANE, PLANE)
+ALL = whole_chart(PLANE)
 
 
 @pytest.mark.parametrize("share", [0.25, 0.5, 0.8])
@@ -219,7 +213,7 @@ def test_layers_may_come_in_any_order(device: Device) -> None:
 @pytest.mark.parametrize("columns", [5, 23])
 def test_where_it_begins_does_not_matter_on_a_cylinder(device: Device, columns: int) -> None:
     grid = plane(128, 31, wraps=True)
-    found = pair_chart(np.ones(grid.shape, bool), grid, grid)
+    found = whole_chart(grid)
     assert found.wraps and found.width == 128
     flow, back = (np.zeros((31, 128, 2)) for _ in range(2))
     flow[:, 60:65, 0], back[:, 74:79, 0] = 14, -14
@@ -257,7 +251,7 @@ def test_what_the_other_layer_hides_is_not_seen_through_it(device: Device) -> No
 def test_flows_that_undo_each_other_are_met_on_their_way(device: Device) -> None:
     """With F_ab and F_ba inverse to each other, but not constant, x_b = x_a + F_ab(x_a); p is between."""
     grid = plane(120, 90)
-    found = pair_chart(np.ones(grid.shape, bool), grid, grid)
+    found = whole_chart(grid)
     x, y = common.pixels(120, 90)
     bend, offset = np.array([0.001, -0.001]), np.array([1.0, 2.0])
     place = np.stack([x, y], -1) + 0.5

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 import numpy as np
 import pytest
-from grids import GRIDS, on_device, patches, plane, random_layer, sphere
+from grids import GRIDS, on_device, patches, plane, random_layer, sphere, whole_chart
 from reference import transition as twin
 from scipy import ndimage
 from tolerances import POSITION, SUM, TRIGONOMETRY, assert_close
@@ -244,7 +244,7 @@ def scene(device: Device, grid: Grid, covers: Sequence[np.ndarray], shift: np.nd
     flows = []
     for a in range(len(covers)):
         for b in range(a + 1, len(covers)):
-            chart = pair_chart(np.ones(grid.shape, bool), grid, grid)
+            chart = whole_chart(grid)
             x = np.arange(chart.width) - chart.transform[11]
             y = np.arange(chart.height) - chart.transform[12]
             read = [np.clip(np.rint(n).astype(int), 0, m - 1) for n, m in ((y, grid.height), (x, grid.width))]
