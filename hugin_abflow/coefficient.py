@@ -75,9 +75,8 @@ def _table(grid: Grid) -> npt.NDArray[np.float32]:
     rows, columns = np.arange(grid.height), np.arange(grid.width)
     if not grid.lens[1]:
         return np.concatenate([rows, columns, np.ones(grid.height)]).astype(np.float32)
-    _, dlon, lat, dlat = grid.lens
-    latitudes = lat - (rows + 0.5) * dlat
-    parts = [np.sin(rows * dlat / 2), np.sin(columns * dlon / 2), np.cos(latitudes)]
+    _, dlon, _, dlat = grid.lens
+    parts = [np.sin(rows * dlat / 2), np.sin(columns * dlon / 2), grid.row_widths]
     return np.concatenate(parts).astype(np.float32)
 
 

@@ -240,8 +240,7 @@ def _shoulder(overlaps: Sequence[_Overlap]) -> float:
 def solve(measured: Measured, rounds: Sequence[tuple[float, float]] = _ROUNDS) -> npt.NDArray[np.float64]:
     """Gains (layers, height, width, 3) for differences."""
     cells, inside, differences = measured.grid, measured.inside, measured.differences
-    latitude = cells.lens[2] - (np.arange(cells.height) + 0.5) * cells.lens[3]
-    area = np.maximum(np.cos(latitude), 0.02)[:, None] if cells.lens[1] else np.ones((cells.height, 1))
+    area = np.maximum(cells.row_widths, 0.02)[:, None]
     # a cell's sides: steps along a row are shorter near a pole, so neighbours there are bound closer
     east = (inside & np.roll(inside, -1, 2)) / area
     if not cells.wraps:

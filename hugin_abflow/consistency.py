@@ -68,6 +68,24 @@ def weigh(device: Device, pair: PairFlow, images: Sequence[Level], whole: Whole 
     return Weighed(pair.a, pair.b, pair.chart, forward, backward, bool(whole))
 
 
+def unknown(device: Device, pair: Pair, chart: Chart, images: Sequence[Level]) -> Weighed:
+    """A pair of whose flow nothing is known. images: log brightness of both layers on the chart."""
+
+    def way(image: Level) -> Buffer:
+        values = np.zeros((chart.height, chart.width, 4), np.float32)
+        values[..., 3] = image.image.get()
+        return device.upload(values)
+
+    return Weighed(pair.a, pair.b, chart, way(images[0]), way(images[1]), whole=False)
+
+
+def known(found: Weighed) -> float:
+    """The share of an overlap, 0..1, in which its flow is trusted."""
+    forward, backward = (way.get()[..., 2:] for way in (found.forward, found.backward))
+    both = (forward[..., 1] != 0) & (backward[..., 1] != 0)
+    return float(np.minimum(forward, backward)[both, 0].mean()) if both.any() else 1.0
+
+
 def mend(device: Device, found: Weighed) -> PairFlow:
     """The pair's flows, filled where they are not trusted, and in the place of what is taken from one."""
     forward, backward = (

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -9,11 +10,11 @@ import numpy as np
 import numpy.typing as npt
 
 from hugin_abflow.coefficient import on_cells
-from hugin_abflow.consistency import trust
-from hugin_abflow.geometry import PairFlow
-from hugin_abflow.opencl import Device
-from hugin_abflow.pyramid import Level
-from hugin_abflow.working import Grid
+from hugin_abflow.consistency import Weighed
+from hugin_abflow.geometry import Pair
+from hugin_abflow.working import Grid, WorkingLayer
+
+_log = logging.getLogger(__name__)
 
 # Trust (consistency.py) from which a flow is sure: there and back again ends about a pixel from the start.
 _SURE = 0.5
@@ -33,15 +34,14 @@ class Parallax:
     consistent: float
 
 
-def parallax(device: Device, pair: PairFlow, levels: Sequence[Level], grid: Grid) -> Parallax:
-    """Of a pair's flow as it was found, before it is mended; levels: both layers on the pair's chart."""
-    both = np.logical_and(*(level.mask.get() > 0 for level in levels))
-    ways = pair.forward, pair.backward
-    trusted = trust(device, *ways, pair.chart.wraps, levels[0].image).get()
+def parallax(found: Weighed, grid: Grid) -> Parallax:
+    """Of a pair's flow, before it is mended; `grid`: the working grid."""
+    trusted = found.forward.get()
+    both = (trusted[..., 3] != 0) & (found.backward.get()[..., 3] != 0)
     sure = both & (trusted[..., 2] >= _SURE)
     if not sure.any():
         return Parallax(0.0, 0.0, 0.0)
-    pixel = (grid.canvas_width or grid.region.width) / pair.chart.around(grid)
+    pixel = (grid.canvas_width or grid.region.width) / found.chart.around(grid)
     lengths = np.hypot(trusted[..., 0], trusted[..., 1])[sure] * pixel
     return Parallax(float(np.median(lengths)), float(lengths.max()), float(sure.sum() / both.sum()))
 
@@ -52,3 +52,31 @@ def share(overlap: npt.NDArray[np.bool_], cells: Grid, regions: npt.NDArray[np.b
         return 0.0
     reached = on_cells(overlap[None], cells, np.logical_or)[0]
     return float((reached & regions).sum() / max(1, reached.sum()))
+
+
+def tell(
+    layers: Sequence[WorkingLayer],
+    overlaps: Sequence[tuple[Pair, npt.NDArray[np.bool_]]],
+    shifts: Sequence[Parallax],
+    cells: Grid,
+    whole: npt.NDArray[np.bool_] | None,
+) -> None:
+    """Say of each overlap how far things shift in it, and how much of it is one layer's.
+
+    The log record has the same as `overlap`, for reports. shifts: empty where there is no flow. whole: where
+    one layer was taken, on the grid `cells`; None: nowhere.
+    """
+    for number, (pair, overlap) in enumerate(overlaps):
+        names = layers[pair.a].layer.name, layers[pair.b].layer.name
+        one_layer = share(overlap, cells, whole) if shifts else 1.0
+        found: dict[str, object] = {"layers": list(names), "one_layer": round(one_layer, 4)}
+        said = f"{one_layer:.0%} from one layer"
+        if shifts:
+            shift = shifts[number]
+            found["parallax_median"], found["parallax_max"] = round(shift.median, 2), round(shift.largest, 2)
+            found["consistent"] = round(shift.consistent, 4)
+            said = (
+                f"parallax {shift.median:.1f} px, up to {shift.largest:.1f} px; "
+                f"{shift.consistent:.0%} consistent; {said}"
+            )
+        _log.info("overlap of %s and %s: %s", *names, said, extra={"overlap": found})

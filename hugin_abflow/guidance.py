@@ -17,7 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from hugin_abflow import flow
-from hugin_abflow.cells import pixels_at
+from hugin_abflow.cells import Flows, pixels_at
 from hugin_abflow.chart import Chart
 from hugin_abflow.flow import Board, FlowParameters, Start
 from hugin_abflow.guides import Guide, Points, doubts
@@ -97,8 +97,8 @@ def lead(
     circumference   of the canvas in px of the chart.
     """
     parameters, count = parameters or GuidanceParameters(), len(guides)
-    ways = list(_ways(images[0], flows, guides))
-    wrong = np.any([np.linalg.norm(way.residuals, axis=1) > parameters.agreement for way in ways], axis=0)
+    ways = list(_ways(images[0].grid, (flows[0].get(), flows[1].get()), guides))
+    wrong = _wrong(ways, parameters.agreement)
     if not wrong.any():
         return flows
     width, _, wraps, _ = images[0].grid
@@ -145,11 +145,21 @@ def lead(
     return flows
 
 
-def held(images: tuple[Level, Level], flows: Sequence[Buffer], guides: ChartGuides) -> tuple[Values, Values]:
+def contradict(chart: Chart, flows: Flows, guides: ChartGuides, times: int) -> bool:
+    """Whether guides of a pair say something else than its flows, a to b and back, as `lead` sees it.
+
+    chart       of both, `times` as fine as that on which guides lead.
+    """
+    return bool(_wrong(_ways(chart.border, flows, guides), times * GuidanceParameters().agreement).any())
+
+
+def held(
+    images: tuple[Level, Level], flows: tuple[Buffer, Buffer], guides: ChartGuides
+) -> tuple[Values, Values]:
     """The guides that both images show and both flows agree with: their places and moves, (n, 4) px, from a
     to b and back.
     """
-    ways = _ways(images[0], flows, guides)
+    ways = _ways(images[0].grid, (flows[0].get(), flows[1].get()), guides)
     agree = np.ones(len(guides), bool)
     for image, way in zip(images, ways, strict=True):
         inside, (row, column) = pixels_at(way.places, image.grid)
@@ -174,15 +184,21 @@ class _Way:
         return _Way(self.places[chosen], self.moves[chosen], self.residuals[chosen])
 
 
-def _ways(image: Level, flows: Sequence[Buffer], guides: ChartGuides) -> tuple[_Way, _Way]:
-    width, _, wraps, _ = image.grid
+def _wrong(ways: Sequence[_Way], agreement: float) -> npt.NDArray[np.bool_]:
+    """Which guides lie farther than that from the flow in one direction."""
+    far = [np.linalg.norm(way.residuals, axis=1) > agreement for way in ways]
+    return np.asarray(np.any(far, axis=0))
+
+
+def _ways(grid: tuple[int, int, int, int], flows: Flows, guides: ChartGuides) -> tuple[_Way, _Way]:
+    width, _, wraps, _ = grid
     moves = guides.at_b - guides.at_a
     if wraps:
         moves[:, 0] -= width * np.rint(moves[:, 0] / width)
     ways = []
     for field, places, way in zip(flows, (guides.at_a, guides.at_b), (moves, -moves), strict=True):
-        inside, (row, column) = pixels_at(places, image.grid)
-        found = field.get()[row * inside, column * inside]
+        inside, (row, column) = pixels_at(places, grid)
+        found = field[row * inside, column * inside]
         ways.append(_Way(places, way, np.where(inside[:, None], way - found, 0.0)))
     return ways[0], ways[1]
 

@@ -29,6 +29,7 @@ from hugin_abflow import (
     memory,
     multiband,
     pairflow,
+    relay,
     saturation,
     seam,
     single,
@@ -36,6 +37,7 @@ from hugin_abflow import (
     working,
 )
 from hugin_abflow.blend import BlendLayer
+from hugin_abflow.cells import Whole
 from hugin_abflow.chart import Chart
 from hugin_abflow.coefficient import Masks
 from hugin_abflow.colour import Correction
@@ -163,18 +165,17 @@ def prepare(
     fast = partial(_of_quality, "fast", full, shared, masks.grid, settings)
     abreast = _check_memory(device, reduced, charts, grid, settings, fast, abreast)
     its_guides = by_pair(guides if settings.guides else ())
-    flows, shifts, singles = (
-        pairflow.solve(
-            device, reduced, overlapping, charts, grid, progress, settings, its_guides, numbers, abreast
-        )
-        if settings.flow
-        else ([], [], [])
-    )
+    flows, shifts, singles = list[PairFlow](), list[figures.Parallax](), list[Whole | None]()
+    if settings.flow:
+        flows, shifts, singles = pairflow.solve(
+            device, reduced, overlapping, charts, grid, progress, settings, its_guides, numbers, abreast,
+            relay.relayed(overlapping, shared, masks.grid),
+        )  # fmt: skip
     with progress("align", 1) as advance:
         once = single.on_canvas(singles, [one.chart for one in flows], seam.seam_grid(grid))
         aligned = _align(device, reduced, overlapping, flows, once, masks, grid, settings)
         if _log.isEnabledFor(logging.INFO):
-            _tell_overlaps(reduced, overlaps, shifts, grid, aligned.whole)
+            figures.tell(reduced, overlaps, shifts, seam.seam_grid(grid), aligned.whole)
         del masks, overlaps, shared  # what comes takes the most memory
         offsets, correction = multiband.none(grid, len(reduced)), aligned.correction
         if settings.exposure and overlapping:
@@ -287,33 +288,6 @@ def _align(
         else:
             last = hoped or gains(settings, None)
         return _Aligned(fields, reaches, last.result(), whole)
-
-
-def _tell_overlaps(
-    layers: Sequence[WorkingLayer],
-    overlaps: Sequence[tuple[Pair, npt.NDArray[np.bool_]]],
-    shifts: Sequence[figures.Parallax],
-    grid: Grid,
-    whole: npt.NDArray[np.bool_] | None,
-) -> None:
-    """Say of each overlap how far things shift in it, and how much of it is one layer's.
-
-    The log record has the same as `overlap`, for reports. shifts: empty where there is no flow.
-    """
-    for number, (pair, overlap) in enumerate(overlaps):
-        names = layers[pair.a].layer.name, layers[pair.b].layer.name
-        share = figures.share(overlap, seam.seam_grid(grid), whole) if shifts else 1.0
-        found: dict[str, object] = {"layers": list(names), "one_layer": round(share, 4)}
-        said = f"{share:.0%} from one layer"
-        if shifts:
-            shift = shifts[number]
-            found["parallax_median"], found["parallax_max"] = round(shift.median, 2), round(shift.largest, 2)
-            found["consistent"] = round(shift.consistent, 4)
-            said = (
-                f"parallax {shift.median:.1f} px, up to {shift.largest:.1f} px; "
-                f"{shift.consistent:.0%} consistent; {said}"
-            )
-        _log.info("overlap of %s and %s: %s", *names, said, extra={"overlap": found})
 
 
 def _read(

@@ -228,8 +228,7 @@ def _widths(grid: Grid) -> Widths:
     """How widely each row of a sphere's grid is smoothed, in columns, to be as smooth along as across it."""
     if not grid.lens[1]:
         return np.zeros(grid.height, np.float32)
-    latitudes = grid.lens[2] - (np.arange(grid.height) + 0.5) * grid.lens[3]
-    slope = np.abs(np.tan(latitudes))  # sqrt(1 / cos^2 - 1): the rest has been done by the reduction
+    slope = np.abs(np.tan(grid.latitudes))  # sqrt(1 / cos^2 - 1): the rest has been done by the reduction
     return np.asarray(np.clip(slope, _LEAST_SPREAD, _MOST_SPREAD * grid.width), np.float32)
 
 

@@ -8,7 +8,7 @@ bars are as wide as on the working canvas.
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing
 from dataclasses import dataclass
@@ -34,6 +34,8 @@ _log = logging.getLogger(__name__)
 
 # Motion that is looked for, as a share of the canvas's width.
 _REACH = 0.1
+# The share of an overlap that others have to know if its flow is not found.
+_KNOWN = 0.3
 # Pairs whose flow is found at a time, at most: small grids and steps on the host leave cores idle, and memory
 # is needed for each.
 ABREAST = 2
@@ -72,6 +74,7 @@ def solve(
     guides: Mapping[tuple[int, int], Sequence[Guide]],
     numbers: Sequence[int],
     abreast: int = 1,
+    relayed: Sequence[bool] = (),
 ) -> tuple[list[PairFlow], list[figures.Parallax], list[Whole | None]]:
     """Flow of every pair of layers, mended; figures of it, if somebody listens; and what is taken from one of
     them, whole, by cells of the flow's chart.
@@ -79,21 +82,34 @@ def solve(
     drawn       the charts of `pairs`, on which flow is found.
     guides      of each two layers, by their numbers; numbers: what guides call each of `layers`.
     abreast     how many pairs are worked on at a time; no flow depends on it.
+    relayed     of which pairs other layers know the flow, so that it need not be found; none if it is empty.
     """
-    ends = finest(drawn, grid, settings)
+    jobs = list(zip(pairs, drawn, finest(drawn, grid, settings), strict=True))
     compared = bool(settings.relay and relay.triangles(pairs))
     solver = _Solver(device, layers, grid, settings, guides, numbers, compared)
-    work = (partial(solver.solve, *each) for each in zip(pairs, drawn, ends, strict=True))
+    left = {index for index, its in enumerate(relayed) if its and compared}
     with progress("flow", len(pairs)) as advance:
-        with closing(side_by_side(device, work, abreast)) as solved:
-            weighed, shifts, singles, held = _gathered(pairs, solved, advance)
+        work = [(solver.leave if i in left else solver.solve, job) for i, job in enumerate(jobs)]
+        found = list(_in_turn(device, work, abreast, advance))
         if compared:
-            for a, b in relay.mend(device, weighed, held):
+            by_others = _relay(device, found)
+            missed = {i for i in left if not solver.suffices(found[i].weighed, jobs[i][1])}
+            if missed:
+                work = [(solver.solve, jobs[i]) for i in sorted(missed)]
+                for i, one in zip(sorted(missed), _in_turn(device, work, abreast), strict=True):
+                    found[i] = one
+                by_others |= _relay(device, found)
+            alone = {(pairs[i].a, pairs[i].b) for i in left - missed}
+            for a, b in sorted(by_others):
                 _log.info(
-                    "flow of %s and %s: by way of other layers, which contradict it or know more",
+                    "flow of %s and %s: by way of other layers, which %s",
                     layers[a].layer.name, layers[b].layer.name,
+                    "show all of it" if (a, b) in alone else "contradict it or know more",
                 )  # fmt: skip
-        mending = (partial(consistency.mend, device, weighed.pop(0)) for _ in range(len(weighed)))
+        heard = _log.isEnabledFor(logging.INFO)
+        shifts = [figures.parallax(one.weighed, grid) for one in found] if heard else []
+        singles = [one.single for one in found]
+        mending = (partial(consistency.mend, device, found.pop(0).weighed) for _ in range(len(found)))
         result = list(side_by_side(device, mending, abreast))
         device.give_back()  # it waits: else the time of one pair at a time would be told as what follows
     return result, shifts, singles
@@ -103,30 +119,36 @@ def solve(
 class _Solved:
     """A pair's flow as it was found.
 
-    shifts  figures of it, if somebody listens.
     held    what guides hold, both ways, on the chart of the flow; none: nothing.
     """
 
     weighed: Weighed
-    single: Whole | None
-    shifts: tuple[figures.Parallax, ...]
-    held: tuple[guidance.Values, ...]
+    single: Whole | None = None
+    held: tuple[guidance.Values, ...] = ()
 
 
-def _gathered(
-    pairs: Sequence[Pair], solved: Iterable[_Solved], advance: Advance
-) -> tuple[list[Weighed], list[figures.Parallax], list[Whole | None], dict[tuple[int, int], guidance.Values]]:
-    """What is found of all pairs, as it comes; the last by layer that flow starts on, and the other one."""
-    weighed, shifts, singles = list[Weighed](), list[figures.Parallax](), list[Whole | None]()
-    held: dict[tuple[int, int], guidance.Values] = {}
-    for pair, one in zip(pairs, solved, strict=True):
-        weighed.append(one.weighed)
-        shifts += one.shifts
-        singles.append(one.single)
-        if one.held:
-            held[pair.a, pair.b], held[pair.b, pair.a] = one.held
-        advance(1)
-    return weighed, shifts, singles, held
+_Job = tuple[Pair, Chart, Chart]
+
+
+def _in_turn(
+    device: Device,
+    work: Iterable[tuple[Callable[[Pair, Chart, Chart], _Solved], _Job]],
+    abreast: int,
+    advance: Advance = lambda units: None,
+) -> Iterator[_Solved]:
+    """What jobs give, so many at a time."""
+    with closing(side_by_side(device, (partial(do, *job) for do, job in work), abreast)) as solved:
+        for one in solved:
+            yield one
+            advance(1)
+
+
+def _relay(device: Device, found: Sequence[_Solved]) -> set[relay.Key]:
+    """Have flow that others contradict, or know better, go by way of them; of which pairs that is."""
+    held: dict[relay.Key, guidance.Values] = {}
+    for pair, its in ((one.weighed, one.held) for one in found if one.held):
+        held[pair.a, pair.b], held[pair.b, pair.a] = its
+    return set(relay.mend(device, [one.weighed for one in found], held))
 
 
 @dataclass(frozen=True)
@@ -151,13 +173,10 @@ class _Solver:
         bearings = its_chart.eye.bearings if its_chart.eye else None
         solved = flow.solve(device, *images, parameters, reach=self._reach(its_chart), bearings=bearings)
         found = (solved.forward, solved.backward)
-        first, second = self.numbers[pair.a], self.numbers[pair.b]
-        its_guides = self.guides.get((min(first, second), max(first, second)), ())
-        placed = guidance.on_chart(its_guides, first, its_chart, grid)
-        held = tuple[guidance.Values, ...]()
-        if its_guides:
+        placed, held = self._guides(pair, its_chart), tuple[guidance.Values, ...]()
+        if placed:
             found = guidance.lead(device, images, found, placed, its_chart.around(grid))
-        if its_guides and self.compared:
+        if placed and self.compared:
             scale = its_finest.width / its_chart.width
             held = tuple(scale * way for way in guidance.held(images, found, placed))
         one = None
@@ -165,15 +184,32 @@ class _Solver:
             views = (View.of(images[0]), View.of(images[1]))
             arrays, vouched = (found[0].get(), found[1].get()), (placed.at_a, placed.at_b)
             one = single.find(its_chart, arrays, views, vouched, solved.refused, settings)
-        its_flow, shifts = PairFlow(pair.a, pair.b, its_chart, *found), tuple[figures.Parallax, ...]()
-        if _log.isEnabledFor(logging.INFO):
-            shifts = (figures.parallax(device, its_flow, images, grid),)
+        its_flow = PairFlow(pair.a, pair.b, its_chart, *found)
         if its_finest is not its_chart:
             images = self._images(pair, its_finest)
             found = flow.refine(device, *images, *found, parameters)
             its_flow = PairFlow(pair.a, pair.b, its_finest, *found)
             one = one and one.finer()
-        return _Solved(consistency.weigh(device, its_flow, images, one), one, shifts, held)
+        return _Solved(consistency.weigh(device, its_flow, images, one), one, held)
+
+    def leave(self, pair: Pair, _: Chart, its_finest: Chart) -> _Solved:
+        """A pair that other layers know."""
+        images = self._images(pair, its_finest)
+        return _Solved(consistency.unknown(self.device, pair, its_finest, images))
+
+    def suffices(self, found: Weighed, its_chart: Chart) -> bool:
+        """Whether what other layers knew of a pair is enough, and right if guides are."""
+        if consistency.known(found) < _KNOWN:
+            return False
+        placed = self._guides(found, found.chart)
+        flows = found.forward.get()[..., :2], found.backward.get()[..., :2]
+        times = its_chart.coarse // found.chart.coarse
+        return not placed or not guidance.contradict(found.chart, flows, placed, times)
+
+    def _guides(self, pair: Pair, its_chart: Chart) -> guidance.ChartGuides:
+        first, second = self.numbers[pair.a], self.numbers[pair.b]
+        its_guides = self.guides.get((min(first, second), max(first, second)), ())
+        return guidance.on_chart(its_guides, first, its_chart, self.grid)
 
     def _reach(self, its_chart: Chart) -> float:
         """Px of a chart up to which motion is searched."""

@@ -14,6 +14,9 @@ that both have in a cell, times the fit of the legs, r_ab r_bc, and how near to 
 far. It is solved by a fixed point, from r = 1. Of doubted pairs, and of those of which others know much more
 than their own flow is sure of, what contradicts the more reliable ways becomes their mean, and so does what
 is not trusted; but not around control points that own flow agrees with, on what moves as they do.
+
+The flow of small overlaps that others show in much larger ones need not be found before: in a ring of
+fisheyes, that of a third of all pairs.
 """
 
 from __future__ import annotations
@@ -29,6 +32,7 @@ from hugin_abflow.chart import Chart
 from hugin_abflow.consistency import Weighed
 from hugin_abflow.geometry import Pair
 from hugin_abflow.opencl import Buffer, Device
+from hugin_abflow.working import Grid
 
 # Chart pixels in the side of a cell, in the middle of which ways are compared.
 _CELL = 8
@@ -58,6 +62,10 @@ _HELD = 64.0
 # Third layers that are asked about a pair, those with the largest overlaps: where many overlap each other,
 # all triangles would be too many.
 _MOST = 4
+
+# How much larger the overlaps of a third layer have to be than one for whose flow they stand, and how much of
+# it they have to show.
+_MUCH, _ALL = 3.0, 0.95
 
 Values = npt.NDArray[np.float64]
 Key = tuple[int, int]
@@ -102,11 +110,46 @@ def triangles(pairs: Iterable[Pair]) -> bool:
     return any(beside[a] & beside[b] for a, its in beside.items() for b in its)
 
 
+def relayed(pairs: Sequence[Pair], overlaps: Sequence[npt.NDArray[np.bool_]], grid: Grid) -> list[bool]:
+    """Of which pairs flow need not be found: all that they share, others show in much larger overlaps with
+    each of both. Ways by these are the more reliable ones then, and in the middle of a third photo two others
+    that end there weigh little.
+
+    overlaps    of `pairs`, on `grid`.
+    """
+    keys = [(pair.a, pair.b) for pair in pairs]
+    shared, area = dict[Key, npt.NDArray[np.bool_]](), dict[Key, float]()
+    for (a, c), overlap in zip(keys, overlaps, strict=True):
+        shared[a, c] = shared[c, a] = overlap
+        area[a, c] = area[c, a] = _area(overlap, grid)
+    beside, found = _beside(keys), set[Key]()
+    for a, c in sorted(keys, key=lambda key: (-area[key], key)):
+        legs = [b for b in beside[a] & beside[c] if found.isdisjoint(((a, b), (b, c)))]
+        smaller = {b: min(area[a, b], area[b, c]) for b in legs}
+        large = [b for b in _largest(smaller) if smaller[b] >= _MUCH * area[a, c]]
+        shown = [shared[a, b] & shared[b, c] for b in large]
+        if shown and _area(np.logical_or.reduce(shown), grid) >= _ALL * area[a, c]:
+            found |= {(a, c), (c, a)}
+    return [key in found for key in keys]
+
+
+def _area(mask: npt.NDArray[np.bool_], grid: Grid) -> float:
+    """In pixels of the grid, on a sphere those of its equator."""
+    return float(np.count_nonzero(mask, 1) @ grid.row_widths)
+
+
+def _largest(areas: Mapping[int, float]) -> list[int]:
+    """The third layers that are asked, of those with these areas."""
+    return sorted(areas, key=lambda layer: (-areas[layer], layer))[:_MOST]
+
+
 def mend(device: Device, found: Sequence[Weighed], held: Mapping[Key, Values]) -> list[Key]:
     """Replace, in place, flow that others contradict, or know better; returns of which pairs, as (a, b).
 
     held        for some pairs, both ways, control points that hold their flow: places and moves, (n, 4) px of
                 their chart.
+
+    A pair of whose flow nothing is trusted says nothing, and goes by way of others wherever these know it.
     """
     ways = dict(_ways(device, found))
     others = dict(_all_others(device, ways))
@@ -197,8 +240,7 @@ def _all_others(device: Device, ways: dict[Key, _Way]) -> Iterator[tuple[Key, li
     beside = _beside(ways)
     for a, c in ways:
         smaller = {b: min(ways[a, b].area, ways[b, c].area) for b in beside[a] & beside[c]}
-        largest = sorted(smaller, key=lambda b: (-smaller[b], b))[:_MOST]
-        yield (a, c), list(_others(device, ways, (a, c), sorted(largest)))
+        yield (a, c), list(_others(device, ways, (a, c), sorted(_largest(smaller))))
 
 
 def _others(device: Device, ways: dict[Key, _Way], key: Key, by: Iterable[int]) -> Iterator[_Other]:
@@ -245,6 +287,8 @@ def _told(key: Key, own: _Way, others: Sequence[_Other], reliable: dict[Key, flo
     differs = sum(_share(key, one.by, reliable) * one.differs for one in others)
     agrees = sum(_share(key, one.by, reliable) * one.agrees for one in others)
     held = _OWN * own.fit * float(own.trust.sum()) + agrees
+    if not own.trust.any():
+        return 0.0
     return held / (held + differs) if differs else 1.0
 
 

@@ -287,9 +287,7 @@ def _regions(residual: Residuals, cells: Grid, once: Cells) -> list[Cells]:
     weak = (residual.mean > _WEAK) | (residual.rms > _STRONG) | once
     weak = _padded(weak.astype(np.uint8), 1, cells.wraps)
     grown = np.asarray(cv2.dilate(weak, np.ones((3, 3), np.uint8)))[1:-1, 1:-1] > 0
-    latitude = cells.lens[2] - (np.arange(cells.height) + 0.5) * cells.lens[3]
-    area = np.cos(latitude)[:, None] if cells.lens[1] else 1.0
-    strong = (residual.mean > _STRONG) * area
+    strong = (residual.mean > _STRONG) * cells.row_widths[:, None]
     return [
         region
         for region in _connected(grown, cells.wraps)

@@ -202,10 +202,8 @@ def wells(cells: Grid, grid: Grid, strain: float, unlike: Values) -> Values:
 
 
 def _narrowing(cells: Grid) -> npt.NDArray[np.float64]:
-    """How wide cells are, by row, beside one at the equator; 1 on a plane, where `lens` is 0."""
-    _, _, latitude, down = cells.lens
-    latitudes = latitude - (np.arange(cells.height) + 0.5) * down
-    widths: npt.NDArray[np.float64] = np.maximum(np.cos(latitudes), _NARROWEST)
+    """How wide cells are, by row, beside one at the equator, but never nothing."""
+    widths: npt.NDArray[np.float64] = np.maximum(cells.row_widths, _NARROWEST)
     return widths
 
 

@@ -73,6 +73,19 @@ class Grid:
         return self.region.height / self.height
 
     @property
+    def latitudes(self) -> npt.NDArray[np.float64]:
+        """Of the middles of rows; 0 on a plane."""
+        _, _, top, down = self.lens
+        rows = np.arange(self.height, dtype=np.float64)
+        return top - (rows + 0.5) * down
+
+    @property
+    def row_widths(self) -> npt.NDArray[np.float64]:
+        """How wide the pixels of each row are, beside those at the equator; 1 on a plane."""
+        widths: npt.NDArray[np.float64] = np.cos(self.latitudes)
+        return widths
+
+    @property
     def circumference(self) -> float:
         """The canvas's width as the flow-magnitude term takes it: radians on the sphere, else grid px."""
         if self.lens[1] and self.wraps:
