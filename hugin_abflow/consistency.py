@@ -22,6 +22,8 @@ from hugin_abflow.geometry import Pair, PairFlow
 from hugin_abflow.opencl import Buffer, Device
 from hugin_abflow.pyramid import Level
 
+# Brightness of what tells nothing, as of kernels/common.cl.
+UNTOLD = 1e3
 # Pixels between start and return that leave a sixteenth of the trust, whatever the chart's resolution:
 # refined flow is that much more exact. What is far off must leave next to nothing: many such pixels would
 # outweigh the few around them.
@@ -80,10 +82,28 @@ def unknown(device: Device, pair: Pair, chart: Chart, images: Sequence[Level]) -
 
 
 def known(found: Weighed) -> float:
-    """The share of an overlap, 0..1, in which its flow is trusted."""
-    forward, backward = (way.get()[..., 2:] for way in (found.forward, found.backward))
-    both = (forward[..., 1] != 0) & (backward[..., 1] != 0)
-    return float(np.minimum(forward, backward)[both, 0].mean()) if both.any() else 1.0
+    """The share of an overlap, 0..1, in which its flow is trusted, both ways; but for its rim, from where
+    flow leads out of it.
+    """
+    ways = found.forward.get(), found.backward.get()
+    both = np.logical_and(*(way[..., 3] != 0 for way in ways))
+    shares = []
+    for way in ways:
+        trusted = both & (way[..., 2] > 0.5)
+        if not trusted.any():
+            return 0.0
+        across, down = np.rint(np.median(way[trusted, :2], axis=0)).astype(int)
+        inside = both & _moved(_moved(both, -down, 0, False), -across, 1, found.chart.wraps)
+        shares.append(float(way[inside, 2].mean()) if inside.any() else 0.0)
+    return min(shares)
+
+
+def _moved(mask: Mask, by: int, axis: int, wraps: bool) -> Mask:
+    """A mask, so many pixels on; what comes in is not in it, unless it comes back."""
+    moved, size = np.roll(mask, by, axis), mask.shape[axis]
+    if not wraps:
+        np.moveaxis(moved, axis, 0)[slice(by) if by > 0 else slice(max(0, size + by), size)] = False
+    return moved
 
 
 def mend(device: Device, found: Weighed) -> PairFlow:

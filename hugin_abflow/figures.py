@@ -10,13 +10,14 @@ import numpy as np
 import numpy.typing as npt
 
 from hugin_abflow.coefficient import on_cells
-from hugin_abflow.consistency import Weighed
+from hugin_abflow.consistency import UNTOLD, Weighed
 from hugin_abflow.geometry import Pair
 from hugin_abflow.working import Grid, WorkingLayer
 
 _log = logging.getLogger(__name__)
 
-# Trust (consistency.py) from which a flow is sure: there and back again ends about a pixel from the start.
+# Trust (consistency.py, relay.py) from which a flow is sure: there and back again ends about a pixel from the
+# start, or others tell it.
 _SURE = 0.5
 
 
@@ -35,9 +36,9 @@ class Parallax:
 
 
 def parallax(found: Weighed, grid: Grid) -> Parallax:
-    """Of a pair's flow, before it is mended; `grid`: the working grid."""
-    trusted = found.forward.get()
-    both = (trusted[..., 3] != 0) & (found.backward.get()[..., 3] != 0)
+    """Of a pair's flow before it is filled, beside what is taken from one photo. grid: the working grid."""
+    trusted, brightness = found.forward.get(), found.backward.get()[..., 3]
+    both = np.logical_and(*((one != 0) & (one < UNTOLD) for one in (trusted[..., 3], brightness)))
     sure = both & (trusted[..., 2] >= _SURE)
     if not sure.any():
         return Parallax(0.0, 0.0, 0.0)

@@ -169,7 +169,7 @@ def prepare(
     if settings.flow:
         flows, shifts, singles = pairflow.solve(
             device, reduced, overlapping, charts, grid, progress, settings, its_guides, numbers, abreast,
-            relay.relayed(overlapping, shared, masks.grid),
+            partial(relay.relayed, overlapping, shared, masks.grid),
         )  # fmt: skip
     with progress("align", 1) as advance:
         once = single.on_canvas(singles, [one.chart for one in flows], seam.seam_grid(grid))

@@ -8,7 +8,7 @@ bars are as wide as on the working canvas.
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing
 from dataclasses import dataclass
@@ -35,7 +35,7 @@ _log = logging.getLogger(__name__)
 # Motion that is looked for, as a share of the canvas's width.
 _REACH = 0.1
 # The share of an overlap that others have to know if its flow is not found.
-_KNOWN = 0.3
+_ENOUGH = 0.7
 # Pairs whose flow is found at a time, at most: small grids and steps on the host leave cores idle, and memory
 # is needed for each.
 ABREAST = 2
@@ -74,7 +74,7 @@ def solve(
     guides: Mapping[tuple[int, int], Sequence[Guide]],
     numbers: Sequence[int],
     abreast: int = 1,
-    relayed: Sequence[bool] = (),
+    relayed: Callable[[], Sequence[bool]] = tuple,
 ) -> tuple[list[PairFlow], list[figures.Parallax], list[Whole | None]]:
     """Flow of every pair of layers, mended; figures of it, if somebody listens; and what is taken from one of
     them, whole, by cells of the flow's chart.
@@ -82,30 +82,17 @@ def solve(
     drawn       the charts of `pairs`, on which flow is found.
     guides      of each two layers, by their numbers; numbers: what guides call each of `layers`.
     abreast     how many pairs are worked on at a time; no flow depends on it.
-    relayed     of which pairs other layers know the flow, so that it need not be found; none if it is empty.
+    relayed     gives of which pairs other layers should know the flow, so that it need not be found.
     """
-    jobs = list(zip(pairs, drawn, finest(drawn, grid, settings), strict=True))
     compared = bool(settings.relay and relay.triangles(pairs))
-    solver = _Solver(device, layers, grid, settings, guides, numbers, compared)
-    left = {index for index, its in enumerate(relayed) if its and compared}
+    solver = _Solver(device, layers, grid, settings, guides, numbers, compared, abreast)
+    jobs = dict(enumerate(zip(pairs, drawn, finest(drawn, grid, settings), strict=True)))
+    others = {i for i, its in enumerate(relayed()) if its} if compared else set[int]()
     with progress("flow", len(pairs)) as advance:
-        work = [(solver.leave if i in left else solver.solve, job) for i, job in enumerate(jobs)]
-        found = list(_in_turn(device, work, abreast, advance))
+        solved = solver.solve_all({i: job for i, job in jobs.items() if i not in others}, advance)
         if compared:
-            by_others = _relay(device, found)
-            missed = {i for i in left if not solver.suffices(found[i].weighed, jobs[i][1])}
-            if missed:
-                work = [(solver.solve, jobs[i]) for i in sorted(missed)]
-                for i, one in zip(sorted(missed), _in_turn(device, work, abreast), strict=True):
-                    found[i] = one
-                by_others |= _relay(device, found)
-            alone = {(pairs[i].a, pairs[i].b) for i in left - missed}
-            for a, b in sorted(by_others):
-                _log.info(
-                    "flow of %s and %s: by way of other layers, which %s",
-                    layers[a].layer.name, layers[b].layer.name,
-                    "show all of it" if (a, b) in alone else "contradict it or know more",
-                )  # fmt: skip
+            _relay(solver, solved, {i: jobs[i] for i in sorted(others)}, advance)
+        found = [solved.pop(i) for i in jobs]
         heard = _log.isEnabledFor(logging.INFO)
         shifts = [figures.parallax(one.weighed, grid) for one in found] if heard else []
         singles = [one.single for one in found]
@@ -115,10 +102,38 @@ def solve(
     return result, shifts, singles
 
 
+def _relay(solver: _Solver, solved: dict[int, _Solved], others: Mapping[int, _Job], advance: Advance) -> None:
+    """Have flow that other layers contradict, or know better, go by way of them; and that of `others`, pairs
+    of which they should know enough. These are added to `solved`; those of which they do not are solved.
+    """
+    changed = solver.compare(solved.values())
+    told = {i: solver.leave(*job) for i, job in others.items()}
+    if told:
+        relay.tell(
+            solver.device, [one.weighed for one in solved.values()], [one.weighed for one in told.values()]
+        )
+    missed = {i: job for i, job in others.items() if not solver.suffices(told[i].weighed, job[1])}
+    for i in missed:
+        del told[i]
+    if missed:
+        solved |= solver.solve_all(missed, advance)
+        changed |= solver.compare(solved.values())
+    solved |= told
+    advance(len(told))
+    alone = {(one.weighed.a, one.weighed.b) for one in told.values()}
+    for a, b in sorted(changed | alone):
+        _log.info(
+            "flow of %s and %s: by way of other layers, which %s",
+            solver.layers[a].layer.name, solver.layers[b].layer.name,
+            "show what they share" if (a, b) in alone else "contradict it or know more",
+        )  # fmt: skip
+
+
 @dataclass(frozen=True)
 class _Solved:
     """A pair's flow as it was found.
 
+    single  what is taken from one of both, whole.
     held    what guides hold, both ways, on the chart of the flow; none: nothing.
     """
 
@@ -127,33 +142,13 @@ class _Solved:
     held: tuple[guidance.Values, ...] = ()
 
 
+# A pair, the chart on which its flow is found, and that on which it ends up.
 _Job = tuple[Pair, Chart, Chart]
-
-
-def _in_turn(
-    device: Device,
-    work: Iterable[tuple[Callable[[Pair, Chart, Chart], _Solved], _Job]],
-    abreast: int,
-    advance: Advance = lambda units: None,
-) -> Iterator[_Solved]:
-    """What jobs give, so many at a time."""
-    with closing(side_by_side(device, (partial(do, *job) for do, job in work), abreast)) as solved:
-        for one in solved:
-            yield one
-            advance(1)
-
-
-def _relay(device: Device, found: Sequence[_Solved]) -> set[relay.Key]:
-    """Have flow that others contradict, or know better, go by way of them; of which pairs that is."""
-    held: dict[relay.Key, guidance.Values] = {}
-    for pair, its in ((one.weighed, one.held) for one in found if one.held):
-        held[pair.a, pair.b], held[pair.b, pair.a] = its
-    return set(relay.mend(device, [one.weighed for one in found], held))
 
 
 @dataclass(frozen=True)
 class _Solver:
-    """Finds the flow of one pair; the fields are arguments of `solve`. compared: whether other pairs' flow is
+    """Finds the flow of pairs; the fields are arguments of `solve`. compared: whether other pairs' flow is
     asked afterwards.
     """
 
@@ -164,6 +159,24 @@ class _Solver:
     guides: Mapping[tuple[int, int], Sequence[Guide]]
     numbers: Sequence[int]
     compared: bool
+    abreast: int
+
+    def solve_all(self, jobs: Mapping[int, _Job], advance: Advance) -> dict[int, _Solved]:
+        """The flows of pairs, so many at a time."""
+        result = dict[int, _Solved]()
+        work = (partial(self.solve, *job) for job in jobs.values())
+        with closing(side_by_side(self.device, work, self.abreast)) as solved:
+            for index, one in zip(jobs, solved, strict=True):
+                result[index] = one
+                advance(1)
+        return result
+
+    def compare(self, found: Iterable[_Solved]) -> set[relay.Key]:
+        """Have flow that others contradict, or know better, go by way of them; of which pairs that is."""
+        found, held = list(found), dict[relay.Key, guidance.Values]()
+        for pair, its in ((one.weighed, one.held) for one in found if one.held):
+            held[pair.a, pair.b], held[pair.b, pair.a] = its
+        return set(relay.mend(self.device, [one.weighed for one in found], held))
 
     def solve(self, pair: Pair, its_chart: Chart, its_finest: Chart) -> _Solved:
         """The flow of a pair, found on one chart and refined on another."""
@@ -193,13 +206,13 @@ class _Solver:
         return _Solved(consistency.weigh(device, its_flow, images, one), one, held)
 
     def leave(self, pair: Pair, _: Chart, its_finest: Chart) -> _Solved:
-        """A pair that other layers know."""
+        """A pair whose flow is not found: others are to tell it."""
         images = self._images(pair, its_finest)
         return _Solved(consistency.unknown(self.device, pair, its_finest, images))
 
     def suffices(self, found: Weighed, its_chart: Chart) -> bool:
-        """Whether what other layers knew of a pair is enough, and right if guides are."""
-        if consistency.known(found) < _KNOWN:
+        """Whether what others told of a pair is enough, and no guide says something else."""
+        if consistency.known(found) < _ENOUGH:
             return False
         placed = self._guides(found, found.chart)
         flows = found.forward.get()[..., :2], found.backward.get()[..., :2]

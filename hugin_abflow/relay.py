@@ -15,8 +15,8 @@ far. It is solved by a fixed point, from r = 1. Of doubted pairs, and of those o
 than their own flow is sure of, what contradicts the more reliable ways becomes their mean, and so does what
 is not trusted; but not around control points that own flow agrees with, on what moves as they do.
 
-The flow of small overlaps that others show in much larger ones need not be found before: in a ring of
-fisheyes, that of a third of all pairs.
+The flow of small overlaps that others show in much larger ones need not be found before, in a ring of
+fisheyes that of a third of all pairs; it is told by others, once these have been compared.
 """
 
 from __future__ import annotations
@@ -111,9 +111,9 @@ def triangles(pairs: Iterable[Pair]) -> bool:
 
 
 def relayed(pairs: Sequence[Pair], overlaps: Sequence[npt.NDArray[np.bool_]], grid: Grid) -> list[bool]:
-    """Of which pairs flow need not be found: all that they share, others show in much larger overlaps with
-    each of both. Ways by these are the more reliable ones then, and in the middle of a third photo two others
-    that end there weigh little.
+    """Of which pairs flow need not be found: all that they share, others show, in much larger overlaps with
+    each of both. What was found in such a small one would be replaced, or seldom matter: two photos that end
+    in the middle of a third one weigh little there.
 
     overlaps    of `pairs`, on `grid`.
     """
@@ -148,8 +148,6 @@ def mend(device: Device, found: Sequence[Weighed], held: Mapping[Key, Values]) -
 
     held        for some pairs, both ways, control points that hold their flow: places and moves, (n, 4) px of
                 their chart.
-
-    A pair of whose flow nothing is trusted says nothing, and goes by way of others wherever these know it.
     """
     ways = dict(_ways(device, found))
     others = dict(_all_others(device, ways))
@@ -169,6 +167,21 @@ def mend(device: Device, found: Sequence[Weighed], held: Mapping[Key, Values]) -
                 _take(device, ways[key], total, counts, held.get(key))
             changed.append((a, c))
     return sorted(changed)
+
+
+def tell(device: Device, found: Sequence[Weighed], unknown: Sequence[Weighed]) -> None:
+    """Have `unknown` pairs go by way of others, in place, where reliable ones of these know it.
+
+    found       all other pairs, mended: what was doubted of them and could not be has no say.
+    """
+    ways = dict(_ways(device, [*found, *unknown]))
+    others = dict(_all_others(device, ways))
+    asked = [key for pair in unknown for key in ((pair.a, pair.b), (pair.b, pair.a))]
+    reliable = dict.fromkeys(asked, 1.0)
+    reliable |= _reliable({key: way for key, way in ways.items() if key not in reliable}, others)
+    for key in asked:
+        total = _sum(device, ways, key, _better(key, others[key], reliable), reliable)
+        _take(device, ways[key], total, 0.0, None)
 
 
 def _take(device: Device, way: _Way, total: Buffer, counts: float, held: Values | None) -> None:
@@ -287,8 +300,6 @@ def _told(key: Key, own: _Way, others: Sequence[_Other], reliable: dict[Key, flo
     differs = sum(_share(key, one.by, reliable) * one.differs for one in others)
     agrees = sum(_share(key, one.by, reliable) * one.agrees for one in others)
     held = _OWN * own.fit * float(own.trust.sum()) + agrees
-    if not own.trust.any():
-        return 0.0
     return held / (held + differs) if differs else 1.0
 
 

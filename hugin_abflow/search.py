@@ -107,36 +107,59 @@ def exhaustive(
     """
     size = grid[:2]
     reach = min(largest, size[0] // 2), min(largest, size[1] // 2)
-    count = (2 * reach[0] + 1) * (2 * reach[1] + 1)
-    pixel_cost, cost = (device.empty((count, size[1], size[0])) for _ in range(2))
-    rows, outside = size[1] * count, parameters.outside
-    device.run("search", "search_pixel_cost", (size[0], rows), a, b, grid, reach, outside, pixel_cost)
-    device.run("search", "search_cost", (-(-size[0] // 8), rows), pixel_cost, grid, count, outside, cost)
-    found = [_coupled(device, cost, flows[way], grid, reach, way, parameters) for way in (0, 1)]
+    costs = volumes(device, a, b, grid, reach, parameters.outside)
+    found = [_coupled(device, *one, grid, reach, parameters) for one in zip(costs, flows, strict=True)]
     agreed = [device.empty(flow.shape) for flow in flows]
     for way, out in enumerate(agreed):
         device.run(
-            "search", "search_agree", size, cost, found[way], found[1 - way], flows[way], grid, reach, way,
-            parameters.tolerance, parameters.distinct, out,
+            "search", "search_agree", size, costs[way], found[way], found[1 - way], flows[way], grid, reach,
+            way, parameters.tolerance, parameters.distinct, costs[way].shape[2], out,
         )  # fmt: skip
     return agreed
 
 
+def volumes(
+    device: Device, a: Buffer, b: Buffer, grid: Grid, reach: tuple[int, int], outside: float
+) -> tuple[Buffer, Buffer]:
+    """What displacements within reach cost, from a to b and from b to a: float32 (height, displacements,
+    columns), of which as many columns count as the grid has.
+
+    a, b: descriptors; outside: the cost of what the other image does not show.
+    """
+    width, height = grid[:2]
+    count, chunks = (2 * reach[0] + 1) * (2 * reach[1] + 1), -(-width // 8)
+    pitch, margin = 8 * (chunks + 1), reach[0] + 1
+    wide = pitch + 2 * margin
+    planes = [device.empty((height, 4, wide)) for _ in range(2)]
+    for image, target in zip((a, b), planes, strict=True):
+        device.run("search", "search_planes", (wide, height), image, grid, margin, wide, target)
+    pixel_cost, cost = (device.empty((height, count, pitch)) for _ in range(2))
+    device.run(
+        "search", "search_pixel_cost", (pitch // 8 * count * height,), *planes, grid, reach, (wide, margin),
+        outside, pitch, pixel_cost,
+    )  # fmt: skip
+    rows = (chunks * count * height,)
+    device.run("search", "search_cost", rows, pixel_cost, grid, count, outside, pitch, cost)
+    turned = pixel_cost  # has done its part
+    device.run("search", "search_turned", rows, cost, grid, reach, outside, pitch, turned)
+    return cost, turned
+
+
 def _coupled(
-    device: Device, cost: Buffer, flow: Buffer, grid: Grid, reach: tuple[int, int], backward: int,
+    device: Device, cost: Buffer, flow: Buffer, grid: Grid, reach: tuple[int, int],
     parameters: SearchParameters,
 ) -> Buffer:  # fmt: skip
     """The displacements of least cost, ever less free to differ from `flow`, then from their own mean."""
-    size, eight_at_a_time = grid[:2], (-(-grid[0] // 8), grid[1])
+    eight_at_a_time = (-(-grid[0] // 8) * grid[1],)
     smooth, best, median = (device.empty(flow.shape) for _ in range(3))
     for turn, coupling in enumerate(parameters.couplings):
         if turn:
             for _ in range(2):
                 best, median = filtered(device, best, grid, median), best
-            device.run("search", "search_mean", size, best, grid, smooth)
+            device.run("search", "search_mean", grid[:2], best, grid, smooth)
         device.run(
-            "search", "search_best", eight_at_a_time, cost, smooth if turn else flow, grid, reach,
-            parameters.outside, coupling, backward, best,
+            "search", "search_best", eight_at_a_time, cost, smooth if turn else flow, grid, reach, coupling,
+            cost.shape[2], best,
         )  # fmt: skip
     return best
 

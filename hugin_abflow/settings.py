@@ -42,7 +42,8 @@ class Settings:
                         how the camera moved.
     foreground          and near things that would be bent, where one layer shows all of them.
     relay               where flow of a pair of layers contradicts that of others, or is not sure where theirs
-                        is, take theirs, by way of a third layer.
+                        is, take theirs, by way of a third layer; and do not find it where they share little
+                        that others show in much larger overlaps.
     transition_strain   by how much changing over from one layer's geometry to the next may stretch it, where
                         the overlap is wide enough; transitions go round what shifts by much. 0..1, 0:
                         nothing is looked for, and they take the whole overlap, as published.

@@ -4,9 +4,11 @@
 
    A descriptor is (h, dh/dx, dh/dy, valid), divided by how strongly its neighbourhood varies: the same in bright
    and dark, sharp and dull places. Flow is in pixels of the level's grid; grid = (width, height, wraps, 0).
-   A displacement has the index (d.y + reach.y) * (2 reach.x + 1) + d.x + reach.x. */
+   A displacement has the index (d.y + reach.y) * (2 reach.x + 1) + d.x + reach.x. The costs of a row lie together, by
+   displacement, in columns of which the first grid.x count: what is tried at a pixel is near in memory. */
 
 #define SEARCH_SLOPE 1.5f /* weight of the derivatives beside h */
+#define SEARCH_UNLIKE 0.5f /* squared difference of descriptors that is half a misfit */
 #define SEARCH_WINDOW 81  /* pixels of the largest window in which flows are compared: its radius is 4 */
 
 /* Features over the root of their mean square in 7 x 7 pixels. */
@@ -37,106 +39,142 @@ __kernel void search_descriptor(__global const float4 *feature, /* (grid.y, grid
 static inline float search_misfit(float4 a, float4 b, float outside) {
     const float3 d = a.xyz - b.xyz;
     const float e = dot(d, d);
-    return a.w * b.w > 0.0f ? e / (e + 0.5f) : outside;
+    return a.w * b.w > 0.0f ? e / (e + SEARCH_UNLIKE) : outside;
 }
 
-/* Misfit of each pixel under each displacement; -1 where the first image is not known. */
-__kernel void search_pixel_cost(__global const float4 *a, /* (grid.y, grid.x) descriptors */
-                                __global const float4 *b, /* (grid.y, grid.x) of the other image */
-                                int4 grid,                /* run size: (grid.x, grid.y x displacements) */
-                                int2 reach,               /* largest displacement, px */
-                                float outside,            /* misfit where one of both is not known */
-                                __global float *cost)     /* (displacements, grid.y, grid.x) */
+/* Descriptors by component, with columns beyond both borders: what is beside the border where the grid wraps, else
+   what is not known. */
+__kernel void search_planes(__global const float4 *descriptor, /* (grid.y, grid.x) */
+                            int4 grid,
+                            int margin,                        /* columns before the grid's first one */
+                            int wide,                          /* columns; run size: (wide, grid.y) */
+                            __global float *planes)            /* (grid.y, 4, wide) */
 {
-    const int x = get_global_id(0), row = get_global_id(1);
-    const int index = row / grid.y, y = row - index * grid.y, span = 2 * reach.x + 1;
-    if (x >= grid.x || index >= span * (2 * reach.y + 1))
+    const int column = get_global_id(0), y = get_global_id(1);
+    if (column >= wide || y >= grid.y)
         return;
-    const float4 own = a[y * grid.x + x];
-    int2 q = (int2)(x, y) + (int2)(index % span, index / span) - reach;
-    const float misfit = grid_border(&q, grid) ? search_misfit(own, b[q.y * grid.x + q.x], outside) : outside;
-    cost[row * grid.x + x] = own.w > 0.0f ? misfit : -1.0f;
+    int2 p = (int2)(column - margin, y);
+    const float4 d = grid_border(&p, grid) ? descriptor[p.y * grid.x + p.x] : (float4)(0.0f);
+    __global float *to = planes + 4 * y * wide + column;
+    to[0] = d.x;
+    to[wide] = d.y;
+    to[2 * wide] = d.z;
+    to[3 * wide] = d.w;
 }
 
-/* Costs at columns x to x + 7 of a row; `outside` beyond the grid. */
-static inline float8 search_row(__global const float *row, int x, int4 grid, float outside) {
-    if (x >= 0 && x + 8 <= grid.x)
-        return vload8(0, row + x);
-    float lanes[8];
-    for (int i = 0; i < 8; ++i) {
-        int2 p = (int2)(x + i, 0);
-        lanes[i] = grid_border(&p, grid) ? row[p.x] : outside;
+/* Misfit of each pixel, and of those beside the grid's borders, under each displacement; -1 where the first image is
+   not known. Eight pixels at a time. */
+__kernel void search_pixel_cost(__global const float *a, /* (grid.y, 4, wide) planes */
+                                __global const float *b, /* (grid.y, 4, wide) of the other image */
+                                int4 grid,
+                                int2 reach,              /* largest displacement, px */
+                                int2 columns,            /* of planes: wide, and margin, more than reach.x */
+                                float outside,           /* misfit where one of both is not known */
+                                int pitch,               /* run size: pitch / 8 x displacements x grid.y */
+                                __global float *cost)    /* (grid.y, displacements, pitch): the first one is at x = -1 */
+{
+    const int span = 2 * reach.x + 1, count = span * (2 * reach.y + 1), chunks = pitch / 8;
+    const int row = get_global_id(0) / chunks, x = 8 * (get_global_id(0) - row * chunks);
+    const int y = row / count, index = row - y * count, there = y + index / span - reach.y;
+    if (y >= grid.y)
+        return;
+    __global const float *own = a + 4 * y * columns.x + columns.y - 1 + x;
+    const float8 known = vload8(0, own + 3 * columns.x);
+    float8 misfit = (float8)(outside);
+    if (there >= 0 && there < grid.y) {
+        __global const float *other = b + 4 * there * columns.x + columns.y - 1 + x + index % span - reach.x;
+        const float8 d0 = vload8(0, own) - vload8(0, other);
+        const float8 d1 = vload8(0, own + columns.x) - vload8(0, other + columns.x);
+        const float8 d2 = vload8(0, own + 2 * columns.x) - vload8(0, other + 2 * columns.x);
+        const float8 e = d0 * d0 + d1 * d1 + d2 * d2, both = known * vload8(0, other + 3 * columns.x);
+        misfit = both > 0.0f ? e / (e + SEARCH_UNLIKE) : misfit;
     }
-    return vload8(0, lanes);
+    vstore8(known > 0.0f ? misfit : (float8)(-1.0f), 0, cost + row * pitch + x);
 }
 
 /* Mean over what is known of 3 x 3 pixels, under each displacement; eight pixels at a time. */
-__kernel void search_cost(__global const float *pixel_cost, /* (displacements, grid.y, grid.x), -1: not known */
-                          int4 grid,                        /* run size: (ceil(grid.x / 8), grid.y x displacements) */
+__kernel void search_cost(__global const float *pixel_cost, /* (grid.y, displacements, pitch) of search_pixel_cost */
+                          int4 grid,                        /* run size: ceil(grid.x / 8) x displacements x grid.y */
                           int displacements,
                           float outside,                    /* cost where none is known */
-                          __global float *cost)             /* (displacements, grid.y, grid.x) */
+                          int pitch,                        /* at least 8 more than grid.x, in whole eights */
+                          __global float *cost)             /* (grid.y, displacements, pitch) */
 {
-    const int x = 8 * get_global_id(0), row = get_global_id(1);
-    const int index = row / grid.y, y = row - index * grid.y, count = LEAST(8, grid.x - x);
-    if (count <= 0 || index >= displacements)
+    const int chunks = (grid.x + 7) / 8, row = get_global_id(0) / chunks, x = 8 * (get_global_id(0) - row * chunks);
+    const int y = row / displacements;
+    if (y >= grid.y)
         return;
     float8 sum = (float8)(0.0f), weight = (float8)(0.0f);
     for (int j = y > 0 ? -1 : 0; j <= (y + 1 < grid.y ? 1 : 0); ++j)
-        for (int i = -1; i <= 1; ++i) {
-            const float8 c = search_row(pixel_cost + (row + j) * grid.x, x + i, grid, -1.0f);
+        for (int i = 0; i < 3; ++i) {
+            const float8 c = vload8(0, pixel_cost + (row + j * displacements) * pitch + x + i);
             sum += c >= 0.0f ? c : (float8)(0.0f);
             weight += c >= 0.0f ? (float8)(1.0f) : (float8)(0.0f);
         }
-    float mean[8];
-    vstore8(weight > 0.0f ? sum / weight : (float8)(outside), 0, mean);
-    for (int i = 0; i < count; ++i)
-        cost[row * grid.x + x + i] = mean[i];
+    vstore8(weight > 0.0f ? sum / weight : (float8)(outside), 0, cost + row * pitch + x);
+}
+
+/* The costs from b to a: what b shows at q, a shows at q + d, so it is that of -d there. Eight pixels at a time. */
+__kernel void search_turned(__global const float *cost, /* (grid.y, displacements, pitch) from a to b */
+                            int4 grid,                  /* run size: ceil(grid.x / 8) x displacements x grid.y */
+                            int2 reach,                 /* px */
+                            float outside,              /* cost of what lies beyond the grid */
+                            int pitch,
+                            __global float *turned)     /* (grid.y, displacements, pitch) */
+{
+    const int span = 2 * reach.x + 1, count = span * (2 * reach.y + 1), chunks = (grid.x + 7) / 8;
+    const int row = get_global_id(0) / chunks, x = 8 * (get_global_id(0) - row * chunks);
+    const int y = row / count, index = row - y * count, there = y + index / span - reach.y;
+    if (y >= grid.y)
+        return;
+    float lanes[8];
+    const int from = x + index % span - reach.x;
+    __global const float *source = cost + (there * count + count - 1 - index) * pitch;
+    for (int i = 0; i < 8; ++i) {
+        int2 p = (int2)(from + i, there);
+        lanes[i] = grid_border(&p, grid) ? source[p.x] : outside;
+    }
+    vstore8(vload8(0, lanes), 0, turned + row * pitch + x);
 }
 
 /* The displacement that costs least, with what it is away from `flow`; eight pixels at a time. */
-__kernel void search_best(__global const float *cost,  /* (displacements, grid.y, grid.x) from a to b */
+__kernel void search_best(__global const float *cost,  /* (grid.y, displacements, pitch) of this direction */
                           __global const float2 *flow, /* (grid.y, grid.x) px */
-                          int4 grid,                   /* run size: (ceil(grid.x / 8), grid.y) */
+                          int4 grid,                   /* run size: ceil(grid.x / 8) x grid.y */
                           int2 reach,                  /* px */
-                          float outside,               /* cost of what lies beyond the grid */
                           float coupling,              /* cost of a squared pixel away from flow */
-                          int backward,                /* 1: flow from b to a */
+                          int pitch,
                           __global float2 *best)       /* (grid.y, grid.x) px */
 {
-    const int x = 8 * get_global_id(0), y = get_global_id(1), count = min(8, grid.x - x);
-    if (count <= 0 || y >= grid.y)
+    const int chunks = (grid.x + 7) / 8, y = get_global_id(0) / chunks, x = 8 * (get_global_id(0) - y * chunks);
+    const int count = LEAST(8, grid.x - x);
+    if (y >= grid.y)
         return;
     float near_x[8], near_y[8];
     for (int i = 0; i < 8; ++i) {
-        const float2 near = flow[y * grid.x + x + min(i, count - 1)];
+        const float2 near = flow[y * grid.x + x + LEAST(i, count - 1)];
         near_x[i] = near.x;
         near_y[i] = near.y;
     }
     const float8 from_x = vload8(0, near_x), from_y = vload8(0, near_y);
-    float8 least = (float8)(INFINITY), found_x = from_x, found_y = from_y;
+    float8 least = (float8)(INFINITY);
+    int8 found = (int8)(0);
+    int index = 0;
+    cost += y * (2 * reach.y + 1) * (2 * reach.x + 1) * pitch + x;
     for (int v = -reach.y; v <= reach.y; ++v) {
         const float8 away_y = (float)v - from_y, down = away_y * away_y;
-        const int row = backward ? y + v : y; /* what b shows at q, a shows at q + d: the cost of -d there */
-        const bool inside = row >= 0 && row < grid.y;
-        for (int u = -reach.x; u <= reach.x; ++u) {
-            const int2 d = backward ? (int2)(-u, -v) : (int2)(u, v);
-            const int index = (d.y + reach.y) * (2 * reach.x + 1) + d.x + reach.x;
-            const float8 own =
-                inside ? search_row(cost + (index * grid.y + row) * grid.x, backward ? x + u : x, grid, outside)
-                       : (float8)(outside);
-            const float8 away_x = (float)u - from_x, total = own + coupling * (away_x * away_x + down);
-            const int8 less = total < least;
-            least = select(least, total, less);
-            found_x = select(found_x, (float8)(u), less);
-            found_y = select(found_y, (float8)(v), less);
+        for (int u = -reach.x; u <= reach.x; ++u, ++index, cost += pitch) {
+            const float8 away_x = (float)u - from_x, total = vload8(0, cost) + coupling * (away_x * away_x + down);
+            const int8 less = total < least; /* `select` would take one after the other on PoCL */
+            least = less ? total : least;
+            found = less ? (int8)(index) : found;
         }
     }
-    float bx[8], by[8];
-    vstore8(found_x, 0, bx);
-    vstore8(found_y, 0, by);
+    int lanes[8];
+    vstore8(found, 0, lanes);
+    const int span = 2 * reach.x + 1;
     for (int i = 0; i < count; ++i)
-        best[y * grid.x + x + i] = (float2)(bx[i], by[i]);
+        best[y * grid.x + x + i] = (float2)(lanes[i] % span - reach.x, lanes[i] / span - reach.y);
 }
 
 /* Mean of 3 x 3 pixels. */
@@ -160,34 +198,24 @@ __kernel void search_mean(__global const float2 *flow, /* (grid.y, grid.x) */
     mean[y * grid.x + x] = sum / weight;
 }
 
-/* Index in `cost` of displacement d from a to b at pixel p, or from b to a if `backward`; -1 beyond the grid. */
-static inline int search_index(int2 p, int2 d, int4 grid, int2 reach, int backward) {
-    if (backward) { /* what b shows at q, a shows at q + d: the cost of -d there */
-        p += d;
-        d = -d;
-        if (!grid_border(&p, grid))
-            return -1;
-    }
-    return (((d.y + reach.y) * (2 * reach.x + 1) + d.x + reach.x) * grid.y + p.y) * grid.x + p.x;
-}
-
 /* What was found, where the other direction found the same and nothing else, more than 2 px away, fits nearly as
    well (on what repeats); elsewhere what was there before. */
-__kernel void search_agree(__global const float *cost,   /* (displacements, grid.y, grid.x) from a to b */
+__kernel void search_agree(__global const float *cost,   /* (grid.y, displacements, pitch) of this direction */
                            __global const float2 *found, /* (grid.y, grid.x) px, whole numbers within reach */
                            __global const float2 *back,  /* (grid.y, grid.x) px, of the other direction, likewise */
                            __global const float2 *flow,  /* (grid.y, grid.x) px */
                            int4 grid,                    /* run size */
                            int2 reach,                   /* px */
-                           int backward,                 /* 1: flow from b to a */
+                           int backward,                 /* 1: what lies beyond the grid is no rival */
                            float tolerance,              /* px */
                            float distinct,               /* how much more any other displacement costs */
+                           int pitch,
                            __global float2 *agreed)      /* (grid.y, grid.x) px */
 {
     const int x = get_global_id(0), y = get_global_id(1);
     if (x >= grid.x || y >= grid.y)
         return;
-    const int at = y * grid.x + x;
+    const int at = y * grid.x + x, span = 2 * reach.x + 1;
     const int2 d = convert_int2(found[at]);
     agreed[at] = flow[at];
     int2 p = (int2)(x, y) + d;
@@ -196,13 +224,14 @@ __kernel void search_agree(__global const float *cost,   /* (displacements, grid
     const float2 away = found[at] + back[p.y * grid.x + p.x];
     if (dot(away, away) > tolerance * tolerance)
         return;
-    const float limit = cost[search_index((int2)(x, y), d, grid, reach, backward)] + distinct;
+    cost += y * span * (2 * reach.y + 1) * pitch + x;
+    const float limit = cost[((d.y + reach.y) * span + d.x + reach.x) * pitch] + distinct;
     for (int v = -reach.y; v <= reach.y; ++v)
-        for (int u = -reach.x; u <= reach.x; ++u) {
-            if (max(abs(u - d.x), abs(v - d.y)) <= 2)
+        for (int u = -reach.x; u <= reach.x; ++u, cost += pitch) {
+            if (*cost >= limit || max(abs(u - d.x), abs(v - d.y)) <= 2)
                 continue;
-            const int index = search_index((int2)(x, y), (int2)(u, v), grid, reach, backward);
-            if (index >= 0 && cost[index] < limit)
+            p = (int2)(x + u, y + v);
+            if (!backward || grid_border(&p, grid))
                 return;
         }
     agreed[at] = found[at];

@@ -66,13 +66,48 @@ def test_descriptor_is_blind_to_contrast(device: Device) -> None:
 def test_costs_equal_their_twins(device: Device, name: str) -> None:
     grid = GRIDS[name]
     a, b = descriptors(5, grid)
+    both = search.volumes(device, device.upload(a), device.upload(b), grid, REACH, 0.5)
+    there, back = (np.moveaxis(cost.get()[..., : grid[0]], 1, 0) for cost in both)
+    expected = twin.costs(a, b, grid, REACH, 0.5)
+    assert_close(there, expected, SUM)
+    assert_close(back, twin.search_turned(expected, grid, REACH, 0.5), SUM)
+
+
+@pytest.mark.parametrize("name", list(GRIDS))
+def test_costs_of_pixels_reach_beyond_borders(device: Device, name: str) -> None:
+    """By a column, as the mean of 3 x 3 pixels does."""
+    grid = GRIDS[name]
+    images, wide, margin = descriptors(5, grid), 62, 6
+    planes = [device.empty((grid[1], 4, wide)) for _ in images]
+    for image, target in zip(images, planes, strict=True):
+        device.run(
+            "search", "search_planes", (wide, grid[1]), device.upload(image), grid, margin, wide, target
+        )
+        assert_close(target.get(), twin.search_planes(image, grid, margin, wide), 0)
     count = (2 * REACH[0] + 1) * (2 * REACH[1] + 1)
-    pixel_cost, cost = (device.empty((count, grid[1], grid[0])) for _ in range(2))
-    rows, sent = grid[1] * count, (device.upload(a), device.upload(b))
-    device.run("search", "search_pixel_cost", (grid[0], rows), *sent, grid, REACH, 0.5, pixel_cost)
-    device.run("search", "search_cost", (-(-grid[0] // 8), rows), pixel_cost, grid, count, 0.5, cost)
-    assert_close(pixel_cost.get(), twin.search_pixel_cost(a, b, grid, REACH, 0.5), SUM)
-    assert_close(cost.get(), twin.costs(a, b, grid, REACH, 0.5), SUM)
+    cost = device.empty((grid[1], count, 48))
+    device.run(
+        "search",
+        "search_pixel_cost",
+        (6 * count * grid[1],),
+        *planes,
+        grid,
+        REACH,
+        (wide, margin),
+        0.5,
+        48,
+        cost,
+    )
+    expected = twin.search_pixel_cost(*images, grid, REACH, 0.5)
+    mode = {"mode": "wrap"} if grid[2] else {"constant_values": -1}
+    expected = np.pad(expected, ((0, 0), (0, 0), (1, 1)), **mode)
+    assert_close(np.moveaxis(cost.get()[..., : grid[0] + 2], 1, 0), expected, SUM)
+
+
+def volume(cost: np.ndarray) -> np.ndarray:
+    """Costs (displacements, height, width) as kernels take them; the columns behind them tell nothing."""
+    rows = np.moveaxis(cost, 0, 1)
+    return np.pad(rows, ((0, 0), (0, 0), (0, 48 - cost.shape[2])), constant_values=np.nan)
 
 
 def test_twin_of_cost_by_hand() -> None:
@@ -97,7 +132,11 @@ def test_best_equals_its_twin(device: Device, name: str, backward: int, coupling
     grid = GRIDS[name]
     cost = twin.costs(*descriptors(9, grid), grid, REACH, 0.5).astype(np.float32)
     near = 2 * noise(13, grid, 2, 3)
-    best = run(device, "search_best", grid, cost, near, grid, REACH, 0.5, coupling, backward)
+    directed = volume(twin.directed(cost, grid, REACH, 0.5, backward))
+    out = device.empty((grid[1], grid[0], 2))
+    sent = device.upload(directed, np.float32), device.upload(near, np.float32)
+    device.run("search", "search_best", (5 * grid[1],), *sent, grid, REACH, coupling, 48, out)
+    best = out.get()
     expected = twin.search_best(cost, near, grid, REACH, 0.5, coupling, backward)
     assert_close(best, expected, 0, DECISIONS)
     true = np.array([2, -1]) * (1 - 2 * backward)
@@ -137,7 +176,8 @@ def test_agree_equals_its_twin(device: Device, name: str, backward: int) -> None
     expected = twin.search_agree(*arguments)
     kept = (expected == ways[backward]).all(-1).mean()
     assert 0.2 < kept < 0.9
-    assert_close(run(device, "search_agree", grid, *arguments), expected, 1e-6, DECISIONS)
+    sent = (volume(twin.directed(cost, grid, REACH, 0.5, backward)), *arguments[1:], 48)
+    assert_close(run(device, "search_agree", grid, *sent), expected, 1e-6, DECISIONS)
 
 
 def test_agree_refuses_what_repeats(device: Device) -> None:
@@ -148,7 +188,7 @@ def test_agree_refuses_what_repeats(device: Device) -> None:
     image = np.stack([*waves, np.ones(x.shape)], -1).astype(np.float32)
     cost = twin.costs(image, image, grid, REACH, 0.5)
     zero, before = np.zeros((24, 40, 2)), np.full((24, 40, 2), 0.25, np.float32)
-    arguments = (cost, zero, zero, before, grid, REACH, 0, 1.5, 0.05)
+    arguments = (volume(cost), zero, zero, before, grid, REACH, 0, 1.5, 0.05, 48)
     assert np.array_equal(run(device, "search_agree", grid, *arguments), before)
 
 

@@ -38,6 +38,13 @@ def misfit(a: Array, b: Array, outside: float) -> Array:
     return np.where(a[..., 3] * b[..., 3] > 0, away / (away + 0.5), outside)
 
 
+def search_planes(descriptor: Array, grid: Sequence[int], margin: int, wide: int) -> Array:
+    """(height, 4, wide): components, from `margin` columns before the grid on."""
+    x, y = np.meshgrid(np.arange(wide) - margin, np.arange(grid[1]))
+    values, inside = on_grid(descriptor, grid, x, y)
+    return np.moveaxis(np.where(inside[..., None], values, 0), -1, 1)
+
+
 def search_pixel_cost(a: Array, b: Array, grid: Sequence[int], reach: Sequence[int], outside: float) -> Array:
     """(displacements, height, width): misfit of every pixel and what b has there; -1 where a is not known."""
     x, y = pixels(grid[0], grid[1])
@@ -59,9 +66,12 @@ def costs(a: Array, b: Array, grid: Sequence[int], reach: Sequence[int], outside
 
 
 def directed(cost: Array, grid: Sequence[int], reach: Sequence[int], outside: float, backward: int) -> Array:
-    """The costs of one direction; from b to a, what lies beyond the grid costs `outside`."""
-    if not backward:
-        return cost.astype(np.float64)
+    """The costs of one direction."""
+    return search_turned(cost, grid, reach, outside) if backward else cost.astype(np.float64)
+
+
+def search_turned(cost: Array, grid: Sequence[int], reach: Sequence[int], outside: float) -> Array:
+    """The costs from b to a; what lies beyond the grid costs `outside`."""
     x, y = pixels(grid[0], grid[1])
     result = []
     for index, (u, v) in enumerate(displacements(reach)):
