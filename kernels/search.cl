@@ -127,14 +127,20 @@ __kernel void search_turned(__global const float *cost, /* (grid.y, displacement
     const int y = row / count, index = row - y * count, there = y + index / span - reach.y;
     if (y >= grid.y)
         return;
-    float lanes[8];
     const int from = x + index % span - reach.x;
     __global const float *source = cost + (there * count + count - 1 - index) * pitch;
-    for (int i = 0; i < 8; ++i) {
-        int2 p = (int2)(from + i, there);
-        lanes[i] = grid_border(&p, grid) ? source[p.x] : outside;
+    float8 costs;
+    if (there >= 0 && there < grid.y && from >= 0 && from + 8 <= grid.x)
+        costs = vload8(0, source + from);
+    else {
+        float lanes[8];
+        for (int i = 0; i < 8; ++i) {
+            int2 p = (int2)(from + i, there);
+            lanes[i] = grid_border(&p, grid) ? source[p.x] : outside;
+        }
+        costs = vload8(0, lanes);
     }
-    vstore8(vload8(0, lanes), 0, turned + row * pitch + x);
+    vstore8(costs, 0, turned + row * pitch + x);
 }
 
 /* The displacement that costs least, with what it is away from `flow`; eight pixels at a time. */
