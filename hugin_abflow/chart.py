@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from hugin_abflow.opencl import Device
-from hugin_abflow.projection import EQUIRECTANGULAR, Eye
+from hugin_abflow.projection import EQUIRECTANGULAR, Eye, directions
 from hugin_abflow.pyramid import Level
 from hugin_abflow.working import Grid, WorkingLayer
 
@@ -141,15 +141,11 @@ def _axes(points: npt.NDArray[np.float64], weights: npt.NDArray[np.float64]) -> 
 
 
 def _sphere(overlap: npt.NDArray[np.bool_], mask_grid: Grid, scale: float) -> Chart:
-    lon0, dlon, lat0, dlat = mask_grid.lens
-    lon = lon0 + (np.arange(mask_grid.width) + 0.5) * dlon
-    lat = lat0 - (np.arange(mask_grid.height) + 0.5) * dlat
+    lon0, dlon = mask_grid.lens[:2]
+    lon = lon0 + (np.arange(mask_grid.width, dtype=np.float64) + 0.5) * dlon
     rows, columns = np.nonzero(overlap)
-    across_axis = np.cos(lat)[rows]
-    points = np.stack(
-        [across_axis * np.sin(lon)[columns], across_axis * np.cos(lon)[columns], np.sin(lat)[rows]], 1
-    )
-    axes = _axes(points, across_axis)
+    points = directions(lon[columns], mask_grid.latitudes[rows])
+    axes = _axes(points, mask_grid.row_widths[rows])
     x, y, z = axes @ points.T
     chart_lon = np.arctan2(x, y)
     lowest, highest = (math.asin(min(max(end, -1.0), 1.0)) for end in (z.min(), z.max()))

@@ -143,7 +143,7 @@ def reach(device: Device, layer: WorkingLayer, field: Buffer, grid: Grid) -> lis
         return rows
     # a vector of length v, added to a unit vector, turns it by asin(v) at most
     angles = np.where(longest < 1, np.arcsin(np.minimum(longest, 1)), math.pi)
-    latitudes = np.abs(grid.lens[2] - (layer.box[1] + np.arange(len(longest)) + 0.5) * grid.lens[3])
+    latitudes = np.abs(grid.latitudes[layer.box[1] :][: len(longest)])
     # but most lead to the side. Displacements of pixels are added to places beside them, too, and their means
     changes = furthest * grid.lens[3] + (1 + 2 * longest) * max(grid.lens[1], grid.lens[3])
     far_from_poles = 2 * longest < np.cos(latitudes)
