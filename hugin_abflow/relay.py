@@ -176,10 +176,8 @@ def tell(device: Device, found: Sequence[Weighed], unknown: Sequence[Weighed]) -
     """
     ways = dict(_ways(device, [*found, *unknown]))
     others = dict(_all_others(device, ways))
-    asked = [key for pair in unknown for key in ((pair.a, pair.b), (pair.b, pair.a))]
-    reliable = dict.fromkeys(asked, 1.0)
-    reliable |= _reliable({key: way for key, way in ways.items() if key not in reliable}, others)
-    for key in asked:
+    reliable = _reliable(ways, others)  # what is unknown contradicts nothing, and is contradicted by nothing
+    for key in (key for pair in unknown for key in ((pair.a, pair.b), (pair.b, pair.a))):
         total = _sum(device, ways, key, _better(key, others[key], reliable), reliable)
         _take(device, ways[key], total, 0.0, None)
 

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from itertools import combinations, permutations
 
 import numpy as np
@@ -227,6 +228,20 @@ def test_it_is_as_if_it_had_been_found(monkeypatch: pytest.MonkeyPatch, found: l
     assert difference.mean() < 0.2 and np.percentile(difference, 99) <= 4
 
 
+@pytest.mark.parametrize("changed", [None, slice(120, 180)])
+def test_progress_counts_each_pair_once(changed: slice | None) -> None:
+    """However its flow comes."""
+    steps = list[int]()
+
+    @contextmanager
+    def progress(phase: str, total: int) -> Iterator[Callable[[int], None]]:
+        yield lambda units: steps.append(units) if phase == "flow" else None
+        assert phase != "flow" or sum(steps) == total == 3
+
+    merge_layers(layers(changed), CANVAS, Settings(**THREADS), progress=progress)
+    assert steps
+
+
 def test_neither_order_nor_threads_change_it() -> None:
     first = merge_layers(layers(), CANVAS, Settings(threads=2))
     for order in permutations(range(3)):
@@ -329,6 +344,11 @@ def test_figures_and_flow_of_what_is_unknown(device: Device) -> None:
     one.forward.set(values)
     told = parallax(one, grid)
     assert (told.median, told.largest) == (5, 5) and told.consistent == pytest.approx(10 / 53)
+    values[20:, :, 3] = consistency.UNTOLD  # taken from one photo, whole
+    one.forward.set(values)
+    assert parallax(one, grid).consistent == pytest.approx(10 / 20)
+    values[20:, :70, 3], values[20:, 70:, 3] = image[20:, :70], 0
+    one.forward.set(values)
     assert consistency.known(one) == 0  # both ways
     one.backward.set(values)
     assert consistency.known(one) == pytest.approx(10 / 49)  # from the last rows it leads beyond them
