@@ -8,7 +8,7 @@ bars are as wide as on the working canvas.
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing
 from dataclasses import dataclass
@@ -73,8 +73,8 @@ def solve(
     settings: Settings,
     guides: Mapping[tuple[int, int], Sequence[Guide]],
     numbers: Sequence[int],
-    abreast: int = 1,
-    relayed: Callable[[], Sequence[bool]] = tuple,
+    abreast: int,
+    relayed: Callable[[], Sequence[bool]],
 ) -> tuple[list[PairFlow], list[figures.Parallax], list[Whole | None]]:
     """Flow of every pair of layers, mended; figures of it, if somebody listens; and what is taken from one of
     them, whole, by cells of the flow's chart.
@@ -87,11 +87,12 @@ def solve(
     compared = bool(settings.relay and relay.triangles(pairs))
     solver = _Solver(device, layers, grid, settings, guides, numbers, compared, abreast)
     jobs = dict(enumerate(zip(pairs, drawn, finest(drawn, grid, settings), strict=True)))
-    others = {i for i, its in enumerate(relayed()) if its} if compared else set[int]()
+    left = relayed() if compared else [False] * len(pairs)
+    others = {i: job for i, job in jobs.items() if left[i]}
     with progress("flow", len(pairs)) as advance:
         solved = solver.solve_all({i: job for i, job in jobs.items() if i not in others}, advance)
         if compared:
-            _relay(solver, solved, {i: jobs[i] for i in sorted(others)}, advance)
+            _relay(solver, solved, others, advance)
         found = [solved.pop(i) for i in jobs]
         heard = _log.isEnabledFor(logging.INFO)
         shifts = [figures.parallax(one.weighed, grid) for one in found] if heard else []
@@ -106,18 +107,19 @@ def _relay(solver: _Solver, solved: dict[int, _Solved], others: Mapping[int, _Jo
     """Have flow that other layers contradict, or know better, go by way of them; and that of `others`, pairs
     of which they should know enough. These are added to `solved`; those of which they do not are solved.
     """
-    changed = solver.compare(solved.values())
+    device = solver.device
+    compared = relay.compare(device, _weighed(solved))
+    changed = _mend(device, solved, compared)
     told = {i: solver.leave(*job) for i, job in others.items()}
     if told:
-        relay.tell(
-            solver.device, [one.weighed for one in solved.values()], [one.weighed for one in told.values()]
-        )
-    missed = {i: job for i, job in others.items() if not solver.suffices(told[i].weighed, job[1])}
-    for i in missed:
-        del told[i]
+        if changed:
+            compared = relay.compare(device, _weighed(solved))
+        relay.tell(device, compared, _weighed(told))
+    told = {i: one for i, one in told.items() if solver.suffices(one.weighed, others[i][1])}
+    missed = {i: job for i, job in others.items() if i not in told}
     if missed:
         solved |= solver.solve_all(missed, advance)
-        changed |= solver.compare(solved.values())
+        changed |= _mend(device, solved, relay.compare(device, _weighed(solved)))
     solved |= told
     advance(len(told))
     alone = {(one.weighed.a, one.weighed.b) for one in told.values()}
@@ -140,6 +142,18 @@ class _Solved:
     weighed: Weighed
     single: Whole | None = None
     held: tuple[guidance.Values, ...] = ()
+
+
+def _weighed(solved: Mapping[int, _Solved]) -> list[Weighed]:
+    return [one.weighed for one in solved.values()]
+
+
+def _mend(device: Device, solved: Mapping[int, _Solved], compared: relay.Compared) -> set[relay.Key]:
+    """Have flow that others contradict, or know better, go by way of them; of which pairs that is."""
+    held: dict[relay.Key, guidance.Values] = {}
+    for pair, its in ((one.weighed, one.held) for one in solved.values() if one.held):
+        held[pair.a, pair.b], held[pair.b, pair.a] = its
+    return set(relay.mend(device, _weighed(solved), compared, held))
 
 
 # A pair, the chart on which its flow is found, and that on which it ends up.
@@ -170,13 +184,6 @@ class _Solver:
                 result[index] = one
                 advance(1)
         return result
-
-    def compare(self, found: Iterable[_Solved]) -> set[relay.Key]:
-        """Have flow that others contradict, or know better, go by way of them; of which pairs that is."""
-        found, held = list(found), dict[relay.Key, guidance.Values]()
-        for pair, its in ((one.weighed, one.held) for one in found if one.held):
-            held[pair.a, pair.b], held[pair.b, pair.a] = its
-        return set(relay.mend(self.device, [one.weighed for one in found], held))
 
     def solve(self, pair: Pair, its_chart: Chart, its_finest: Chart) -> _Solved:
         """The flow of a pair, found on one chart and refined on another."""
@@ -215,9 +222,11 @@ class _Solver:
         if consistency.known(found) < _ENOUGH:
             return False
         placed = self._guides(found, found.chart)
+        if not placed:
+            return True
         flows = found.forward.get()[..., :2], found.backward.get()[..., :2]
         times = its_chart.coarse // found.chart.coarse
-        return not placed or not guidance.contradict(found.chart, flows, placed, times)
+        return not guidance.contradict(found.chart, flows, placed, times)
 
     def _guides(self, pair: Pair, its_chart: Chart) -> guidance.ChartGuides:
         first, second = self.numbers[pair.a], self.numbers[pair.b]

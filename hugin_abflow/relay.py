@@ -62,7 +62,6 @@ _HELD = 64.0
 # Third layers that are asked about a pair, those with the largest overlaps: where many overlap each other,
 # all triangles would be too many.
 _MOST = 4
-
 # How much larger the overlaps of a third layer have to be than one for whose flow they stand, and how much of
 # it they have to show.
 _MUCH, _ALL = 3.0, 0.95
@@ -104,6 +103,15 @@ class _Other:
     differs: float
 
 
+@dataclass(frozen=True)
+class Compared:
+    """Ways of pairs, those by third layers, and how reliable each is, 0..1, both ways the same."""
+
+    ways: dict[Key, _Way]
+    others: dict[Key, list[_Other]]
+    reliable: dict[Key, float]
+
+
 def triangles(pairs: Iterable[Pair]) -> bool:
     """Whether there are three layers each two of which are a pair."""
     beside = _beside((pair.a, pair.b) for pair in pairs)
@@ -143,15 +151,23 @@ def _largest(areas: Mapping[int, float]) -> list[int]:
     return sorted(areas, key=lambda layer: (-areas[layer], layer))[:_MOST]
 
 
-def mend(device: Device, found: Sequence[Weighed], held: Mapping[Key, Values]) -> list[Key]:
+def compare(device: Device, found: Sequence[Weighed]) -> Compared:
+    """What pairs say of each other."""
+    ways = dict(_ways(device, found))
+    others = dict(_all_others(device, ways, ways))
+    return Compared(ways, others, _reliable(ways, others))
+
+
+def mend(
+    device: Device, found: Sequence[Weighed], compared: Compared, held: Mapping[Key, Values]
+) -> list[Key]:
     """Replace, in place, flow that others contradict, or know better; returns of which pairs, as (a, b).
 
+    compared    what `found` say of each other. Where something is returned, it no longer is.
     held        for some pairs, both ways, control points that hold their flow: places and moves, (n, 4) px of
                 their chart.
     """
-    ways = dict(_ways(device, found))
-    others = dict(_all_others(device, ways))
-    reliable = _reliable(ways, others)
+    ways, others, reliable = compared.ways, compared.others, compared.reliable
     changed = []
     # the least reliable first: legs of what is doubted are more so, and still as they were found
     for a, c in sorted(((pair.a, pair.b) for pair in found), key=lambda pair: (reliable[pair], pair)):
@@ -169,16 +185,16 @@ def mend(device: Device, found: Sequence[Weighed], held: Mapping[Key, Values]) -
     return sorted(changed)
 
 
-def tell(device: Device, found: Sequence[Weighed], unknown: Sequence[Weighed]) -> None:
+def tell(device: Device, compared: Compared, unknown: Sequence[Weighed]) -> None:
     """Have `unknown` pairs go by way of others, in place, where reliable ones of these know it.
 
-    found       all other pairs, mended: what was doubted of them and could not be has no say.
+    compared    what all others say of each other, mended: what is doubted of them still has no say.
     """
-    ways = dict(_ways(device, [*found, *unknown]))
-    others = dict(_all_others(device, ways))
-    reliable = _reliable(ways, others)  # what is unknown contradicts nothing, and is contradicted by nothing
-    for key in (key for pair in unknown for key in ((pair.a, pair.b), (pair.b, pair.a))):
-        total = _sum(device, ways, key, _better(key, others[key], reliable), reliable)
+    asked = dict(_ways(device, unknown))
+    ways = compared.ways | asked
+    reliable = compared.reliable | dict.fromkeys(asked, 1.0)
+    for key, others in _all_others(device, ways, asked):
+        total = _sum(device, ways, key, _better(key, others, reliable), reliable)
         _take(device, ways[key], total, 0.0, None)
 
 
@@ -246,10 +262,12 @@ def _way(device: Device, chart: Chart, own: Buffer, other: Buffer) -> _Way:
     return _Way(chart, own, other, cells, values[..., :2], inside, trust, mean)
 
 
-def _all_others(device: Device, ways: dict[Key, _Way]) -> Iterator[tuple[Key, list[_Other]]]:
-    """The ways by third layers, for each way."""
+def _all_others(
+    device: Device, ways: dict[Key, _Way], asked: Iterable[Key]
+) -> Iterator[tuple[Key, list[_Other]]]:
+    """The ways by third layers, for each that is asked."""
     beside = _beside(ways)
-    for a, c in ways:
+    for a, c in asked:
         smaller = {b: min(ways[a, b].area, ways[b, c].area) for b in beside[a] & beside[c]}
         yield (a, c), list(_others(device, ways, (a, c), sorted(_largest(smaller))))
 

@@ -62,8 +62,14 @@ __kernel void search_planes(__global const float4 *descriptor, /* (grid.y, grid.
     to[3 * wide] = d.w;
 }
 
+/* Eight pixels of one row: x of the first one, in whole eights, and the row, of rows of so many eights. */
+static inline int2 search_eight(int eights) {
+    const int item = get_global_id(0), row = item / eights;
+    return (int2)(8 * (item - row * eights), row);
+}
+
 /* Misfit of each pixel, and of those beside the grid's borders, under each displacement; -1 where the first image is
-   not known. Eight pixels at a time. */
+   not known. `search_misfit`, of eight pixels at a time. */
 __kernel void search_pixel_cost(__global const float *a, /* (grid.y, 4, wide) planes */
                                 __global const float *b, /* (grid.y, 4, wide) of the other image */
                                 int4 grid,
@@ -73,8 +79,9 @@ __kernel void search_pixel_cost(__global const float *a, /* (grid.y, 4, wide) pl
                                 int pitch,               /* run size: pitch / 8 x displacements x grid.y */
                                 __global float *cost)    /* (grid.y, displacements, pitch): the first one is at x = -1 */
 {
-    const int span = 2 * reach.x + 1, count = span * (2 * reach.y + 1), chunks = pitch / 8;
-    const int row = get_global_id(0) / chunks, x = 8 * (get_global_id(0) - row * chunks);
+    const int span = 2 * reach.x + 1, count = span * (2 * reach.y + 1);
+    const int2 eight = search_eight(pitch / 8);
+    const int x = eight.x, row = eight.y;
     const int y = row / count, index = row - y * count, there = y + index / span - reach.y;
     if (y >= grid.y)
         return;
@@ -100,8 +107,8 @@ __kernel void search_cost(__global const float *pixel_cost, /* (grid.y, displace
                           int pitch,                        /* at least 8 more than grid.x, in whole eights */
                           __global float *cost)             /* (grid.y, displacements, pitch) */
 {
-    const int chunks = (grid.x + 7) / 8, row = get_global_id(0) / chunks, x = 8 * (get_global_id(0) - row * chunks);
-    const int y = row / displacements;
+    const int2 eight = search_eight((grid.x + 7) / 8);
+    const int x = eight.x, row = eight.y, y = row / displacements;
     if (y >= grid.y)
         return;
     float8 sum = (float8)(0.0f), weight = (float8)(0.0f);
@@ -122,8 +129,9 @@ __kernel void search_turned(__global const float *cost, /* (grid.y, displacement
                             int pitch,
                             __global float *turned)     /* (grid.y, displacements, pitch) */
 {
-    const int span = 2 * reach.x + 1, count = span * (2 * reach.y + 1), chunks = (grid.x + 7) / 8;
-    const int row = get_global_id(0) / chunks, x = 8 * (get_global_id(0) - row * chunks);
+    const int span = 2 * reach.x + 1, count = span * (2 * reach.y + 1);
+    const int2 eight = search_eight((grid.x + 7) / 8);
+    const int x = eight.x, row = eight.y;
     const int y = row / count, index = row - y * count, there = y + index / span - reach.y;
     if (y >= grid.y)
         return;
@@ -152,8 +160,8 @@ __kernel void search_best(__global const float *cost,  /* (grid.y, displacements
                           int pitch,
                           __global float2 *best)       /* (grid.y, grid.x) px */
 {
-    const int chunks = (grid.x + 7) / 8, y = get_global_id(0) / chunks, x = 8 * (get_global_id(0) - y * chunks);
-    const int count = LEAST(8, grid.x - x);
+    const int2 eight = search_eight((grid.x + 7) / 8);
+    const int x = eight.x, y = eight.y, count = LEAST(8, grid.x - x);
     if (y >= grid.y)
         return;
     float near_x[8], near_y[8];

@@ -118,7 +118,7 @@ class Scene:
         return float(np.median(np.concatenate(wrong)))
 
     def mend(self, held: dict[tuple[int, int], np.ndarray] | None = None) -> list[tuple[int, int]]:
-        return relay.mend(self.device, self.found, held or {})
+        return relay.mend(self.device, self.found, relay.compare(self.device, self.found), held or {})
 
     def stays(self) -> bool:
         """Whether mending it changes nothing."""

@@ -290,7 +290,7 @@ def test_flow_is_compared_with_that_of_other_pairs(monkeypatch: pytest.MonkeyPat
     """Before it is filled, and where three layers overlap alone."""
     asked, filled = list[list[tuple[int, int]]](), list[int]()
     monkeypatch.setattr(
-        relay, "mend", lambda device, found, _: asked.append([(one.a, one.b) for one in found]) or []
+        relay, "mend", lambda device, found, *_: asked.append([(one.a, one.b) for one in found]) or []
     )
     fill = consistency.mend
     monkeypatch.setattr(consistency, "mend", lambda *given: filled.append(len(asked)) or fill(*given))
@@ -313,7 +313,7 @@ def test_control_points_hold_flow_on_the_chart_that_it_has(
     monkeypatch.setattr(guidance, "lead", lambda *given: led.append(lead(*given)) or led[-1])
     monkeypatch.setattr(guidance, "held", lambda *given: led.append(given[1]) or held(*given))
     monkeypatch.setattr(relay, "triangles", lambda pairs: True)
-    monkeypatch.setattr(relay, "mend", lambda device, found, held: told.append(held) or [])
+    monkeypatch.setattr(relay, "mend", lambda device, found, compared, held: told.append(held) or [])
     guides = [Guide(1, 0, (150.5, 70.5), (147.5, 70.5)), Guide(0, 1, (149.5, 30.5), (172.5, 30.5))]
     settings = Settings(working_pixels=CANVAS.width * CANVAS.height)
     merge_layers(layers(31), CANVAS, settings, guides=guides)

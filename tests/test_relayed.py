@@ -9,14 +9,13 @@ from itertools import combinations, permutations
 
 import numpy as np
 import pytest
-from grids import plane, sphere
+from grids import plane, sphere, whole_chart
 from hypothesis import given
 from hypothesis import strategies as st
 from pictures import one_device
 from scipy import ndimage
 
 from hugin_abflow import consistency, flow, guidance, quality, relay
-from hugin_abflow.chart import pair_chart
 from hugin_abflow.figures import parallax
 from hugin_abflow.geometry import Pair, PairFlow
 from hugin_abflow.guides import Guide
@@ -330,7 +329,7 @@ def test_what_is_found_after_all_is_compared_with_others(
 def test_figures_and_flow_of_what_is_unknown(device: Device) -> None:
     """Nothing is trusted in it."""
     grid = plane(77, 53)
-    chart = pair_chart(np.ones(grid.shape, bool), grid, grid)
+    chart = whole_chart(grid)
     image = np.random.default_rng(1).normal(size=grid.shape).astype(np.float32)
     level = Level(device.upload(image), device.empty(grid.shape).fill(1), False)
     one = consistency.unknown(device, Pair(0, 1), chart, (level, level))

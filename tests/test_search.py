@@ -87,17 +87,9 @@ def test_costs_of_pixels_reach_beyond_borders(device: Device, name: str) -> None
     count = (2 * REACH[0] + 1) * (2 * REACH[1] + 1)
     cost = device.empty((grid[1], count, 48))
     device.run(
-        "search",
-        "search_pixel_cost",
-        (6 * count * grid[1],),
-        *planes,
-        grid,
-        REACH,
-        (wide, margin),
-        0.5,
-        48,
+        "search", "search_pixel_cost", (6 * count * grid[1],), *planes, grid, REACH, (wide, margin), 0.5, 48,
         cost,
-    )
+    )  # fmt: skip
     expected = twin.search_pixel_cost(*images, grid, REACH, 0.5)
     mode = {"mode": "wrap"} if grid[2] else {"constant_values": -1}
     expected = np.pad(expected, ((0, 0), (0, 0), (1, 1)), **mode)
