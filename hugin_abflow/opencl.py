@@ -210,6 +210,14 @@ class Device:
         return kind_of(self.device)
 
     @property
+    def _exactness(self) -> tuple[str, ...]:
+        """Build options: quotients and roots rounded as processors round them, where the device can do that.
+        OpenCL allows 2.5 ulp, with which a share of a sum of one is not 1.
+        """
+        exact = self.device.single_fp_config & cl.device_fp_config.CORRECTLY_ROUNDED_DIVIDE_SQRT
+        return ("-cl-fp32-correctly-rounded-divide-sqrt",) if exact else ()
+
+    @property
     def current(self) -> Lane:
         """The lane of this thread: the first one, unless it entered another."""
         lane: Lane = getattr(self._entered, "lane", self._first)
@@ -289,7 +297,7 @@ class Device:
             with warnings.catch_warnings(), signals.held():
                 warnings.simplefilter("ignore", cl.CompilerWarning)
                 program = cl.Program(self.context, kernel_source(*modules))
-                program.build(["-cl-std=CL1.2", *options.split()])
+                program.build(["-cl-std=CL1.2", *self._exactness, *options.split()])
         except cl.Error as error:
             raise DeviceError(
                 f"{file} does not build on {self.device.name.strip()}: {error}; "

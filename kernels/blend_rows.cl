@@ -4,8 +4,12 @@
    of the first, then of the next. PoCL's compiler makes vectors of no more than what is written as vectors. */
 
 /* With 4 pixels vectors are longer than some processors'. Clang warns of such arguments, which functions that were
-   compiled for others would not find: ours are compiled together. */
+   compiled for others would not find: ours are compiled together. Compilers for other devices may not know of it. */
+#ifdef __has_warning
+#if __has_warning("-Wpsabi")
 #pragma clang diagnostic ignored "-Wpsabi"
+#endif
+#endif
 
 #if PIXELS == 4
 #define BLEND_SAMPLES 16

@@ -274,7 +274,7 @@ def test_more_layers_add_up(device: Device, overlapping: list[tuple[int, int]]) 
     parts = [whole(device, grid, blend) for blend in blends]
     layers, coefficients = [p[0] for p in parts], [p[1] for p in parts]
     ways = {(0, 1): (1.0, -2.0), (0, 2): (-3.0, 0.5), (1, 2): (-4.0, 2.5)}
-    ways = {pair: ways[pair] for pair in overlapping}
+    ways = {both: ways[both] for both in overlapping}
     for used in [device.empty((*grid.shape, 4)).fill(np.nan) for _ in range(6)]:
         del used  # what was in the memory of fields must not count
 
