@@ -22,10 +22,12 @@ if ! "$python" -m hugin_abflow --list-devices | grep -q '(GPU,.*default)'; then
 fi
 
 printf '\n## Kernels against their twins\n\n'
-"$python" -m pytest -q -p no:cacheprovider \
-    tests/test_opencl.py tests/test_working.py tests/test_coefficient.py tests/test_chart.py tests/test_pyramid.py \
-    tests/test_search.py tests/test_flow.py tests/test_guidance.py tests/test_consistency.py \
-    tests/test_transition.py tests/test_geometry.py tests/test_colour.py tests/test_seam.py tests/test_blend.py
+tests=(tests/test_opencl.py)
+for kernels in kernels/*.cl; do
+    name=tests/test_$(basename "$kernels" .cl).py
+    if [ -f "$name" ]; then tests+=("$name"); fi
+done
+"$python" -m pytest -q -p no:cacheprovider "${tests[@]}"
 
 printf '\n## 9000x4500, end to end\n\n'
 "$python" benchmarks/speed.py --width 9000 --runs 5 --only hugin-abflow

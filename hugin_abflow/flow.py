@@ -48,6 +48,9 @@ class FlowParameters:
 _ROW_GROUP = 64
 # Planes of a board, as of kernels/common.cl.
 _PLANES = 22
+# Pixels of a grid up to which a graphics card relaxes it by one work-group a way, so that it is started once;
+# and columns of such a group, which has as many rows as there can be.
+_SMALL, _SMALL_COLUMNS = 1 << 14, 16
 # Bytes of a board up to which both ways are solved at a time: what does not stay in a CPU's cache is slower.
 _TOGETHER = 1 << 23
 
@@ -91,8 +94,18 @@ class Board:
 
     def relax(self, device: Device, sweeps: int, relaxation: float) -> None:
         """Red-black sweeps."""
+        width, height = self.grid[:2]
+        if device.kind == "GPU" and width * height <= _SMALL:
+            name = "flow_relax_small"
+            most = device.largest_group("flow", name, self.options)
+            group = (_SMALL_COLUMNS, most // _SMALL_COLUMNS)
+            device.run(
+                "flow", name, (*group, self.ways), self.grid, self.pitch, sweeps, relaxation, self.planes,
+                options=self.options, group=group,
+            )  # fmt: skip
+            return
         calls = [(self.grid, self.pitch, colour, relaxation, self.planes) for colour in (0, 1)]
-        size = (self.pitch, self.grid[1], self.ways)
+        size = (self.pitch, height, self.ways)
         device.repeat("flow", "flow_relax", size, calls, sweeps, self.options, _ROW_GROUP)
 
     def solution(self, device: Device, flows: Buffer, first: int = 0) -> Buffer:

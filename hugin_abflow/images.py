@@ -172,12 +172,7 @@ def _is_for_tifffile(spec: Any) -> bool:
 
 
 class _Rows:
-    """Rows of one stored image, decoded when asked for; the `read` of a `Layer`.
-
-    OpenImageIO decodes from the top again after each step back, and everything in between on a step
-    forward that does not begin at a strip. So whole strips are decoded, and the rows below the last
-    answer are kept for the next.
-    """
+    """Rows of one stored image, decoded when asked for; the `read` of a `Layer`, for several threads."""
 
     def __init__(self, path: Path, page: int, spec: Any) -> None:
         self.path, self.page = path, page
@@ -196,10 +191,7 @@ class _Rows:
         self.has_alpha = alpha >= 0
         self.associated = spec.alpha_channel >= 0 and not spec.get_int_attribute(_UNASSOCIATED, 0)
         self.chunk = self._chunk_rows(spec)
-        self._lock = threading.Lock()
-        self._source: Any = None
-        self._kept: Pixels | None = None  # rows that end at self._end
-        self._end = 0
+        self._idle, self._lock = list[_Decoder](), threading.Lock()
 
     def _chunk_rows(self, spec: Any) -> int:
         """Rows that are decoded together; 1 where decoding is strictly sequential."""
@@ -213,64 +205,25 @@ class _Rows:
             raise IndexError(f"rows {top}..{bottom} of an image of {self.height} rows")
         if top == bottom:
             return np.empty((0, self.width, self.channels + 1), self.dtype)
-        with self._lock, trace.span("decode", trace.FILE, file=self.path.name, rows=bottom - top):
-            kept_from = self._end - (0 if self._kept is None else len(self._kept))
-            if self._kept is not None and kept_from <= top and bottom <= self._end:
-                rows, first = self._kept, kept_from
-            else:
-                rows, first = self._extend(top, bottom, kept_from)
-                rows.setflags(write=False)  # the next answer is cut from the same memory
-                self._keep(rows, first)
+        with trace.span("decode", trace.FILE, file=self.path.name, rows=bottom - top):
+            decoder = self._decoder(top)
+            rows = decoder.read(top, bottom)  # one that fails is not used again
+        with self._lock:
+            self._idle.append(decoder)
             if bottom == self.height and self.chunk > 1:
-                # the image is done: let go of file and memory, layers can be many
-                self._kept = self._source = None
-            return rows[top - first : bottom - first]
+                # the image is done: let go of files and memory, layers can be many
+                self._idle.clear()
+        return rows
 
-    def _extend(self, top: int, bottom: int, kept_from: int) -> tuple[Pixels, int]:
-        """Rows that include `top` to `bottom`, and which is the first: kept ones and newly decoded ones."""
-        end = min(self.height, bottom + -bottom % self.chunk)
-        if self._kept is not None and kept_from <= top < self._end:
-            return np.concatenate([self._kept[top - kept_from :], self._decode(self._end, end)]), top
-        start = top - top % self.chunk
-        return self._decode(start, end), start
+    def _decoder(self, top: int) -> _Decoder:
+        """One that nobody uses: at best one that stands where rows from `top` on begin."""
+        with self._lock:
+            for index, idle in enumerate(self._idle):
+                if idle.stands_at(top):
+                    return self._idle.pop(index)
+            return self._idle.pop() if self._idle else _Decoder(self)
 
-    def _keep(self, rows: Pixels, first: int) -> None:
-        """Remember the last rows for the next answer."""
-        self._end = first + len(rows)
-        if rows.nbytes > _MAX_KEPT:
-            rows = rows[-max(self.chunk, _MAX_KEPT // rows[0].nbytes) :].copy()
-            rows.setflags(write=False)
-        self._kept = rows
-
-    def _decode(self, first: int, last: int) -> Pixels:
-        if self.by_tifffile:
-            return self._normalise(tiffreader.read_strips(self.path, self.page, first, last))
-        if self._source is None:
-            self._source = _open(self.path, self.page)
-        whole = self.height - self.height % self.chunk
-        if last <= whole or self.tiled or not whole:
-            return self._normalise(self._stored(first, last))
-        # OpenImageIO decodes from the top to get at the last, shorter strip unless it comes from the
-        # strip above it
-        above = self._stored(min(first, whole - self.chunk), whole)
-        below = self._stored(whole, last)
-        return self._normalise(below if first == whole else np.concatenate([above, below]))
-
-    def _stored(self, first: int, last: int) -> Pixels:
-        """Samples as they are in the file."""
-        top, bottom = self.y + first, self.y + last
-        if self.tiled:
-            right = self.x + self.width
-            raw = self._source.read_tiles(self.x, right, top, bottom, 0, 1, 0, self.samples, "unknown")
-        else:
-            raw = self._source.read_scanlines(top, bottom, 0, 0, self.samples, "unknown")
-        if raw is None:
-            why = self._source.geterror()
-            self._source = None
-            raise _unreadable(self.path, why)
-        return np.asarray(raw)
-
-    def _normalise(self, raw: Pixels) -> Pixels:
+    def normalised(self, raw: Pixels) -> Pixels:
         """Stored samples -> colours and unassociated alpha; NaN and infinity -> alpha 0."""
         full = full_scale(raw.dtype)
         if self.order == list(range(raw.shape[2])) and self.has_alpha:
@@ -283,6 +236,84 @@ class _Rows:
         if rows.dtype.kind == "f":
             rows[~np.isfinite(rows).all(axis=2)] = 0
         return rows
+
+
+class _Decoder:
+    """A place in an image from where rows are decoded, for one thread at a time.
+
+    OpenImageIO decodes from the top again after each step back, and everything in between on a step
+    forward that does not begin at a strip. So whole strips are decoded, and the rows below the last
+    answer are kept for the next.
+    """
+
+    def __init__(self, image: _Rows) -> None:
+        self._image = image
+        self._source: Any = None
+        self._kept: Pixels | None = None  # rows that end at self._end
+        self._end = 0
+
+    @property
+    def _kept_from(self) -> int:
+        return self._end - (0 if self._kept is None else len(self._kept))
+
+    def stands_at(self, top: int) -> bool:
+        """Whether it goes on where it is if it reads from row `top` on."""
+        return self._kept_from <= top <= self._end
+
+    def read(self, top: int, bottom: int) -> Pixels:
+        """See `_Rows.read`."""
+        if self._kept is not None and self._kept_from <= top and bottom <= self._end:
+            rows, first = self._kept, self._kept_from
+        else:
+            rows, first = self._extend(top, bottom)
+            rows.setflags(write=False)  # the next answer is cut from the same memory
+            self._keep(rows, first)
+        return rows[top - first : bottom - first]
+
+    def _extend(self, top: int, bottom: int) -> tuple[Pixels, int]:
+        """Rows that include `top` to `bottom`, and which is the first: kept ones and newly decoded ones."""
+        chunk, kept_from = self._image.chunk, self._kept_from
+        end = min(self._image.height, bottom + -bottom % chunk)
+        if self._kept is not None and kept_from <= top < self._end:
+            return np.concatenate([self._kept[top - kept_from :], self._decode(self._end, end)]), top
+        start = top - top % chunk
+        return self._decode(start, end), start
+
+    def _keep(self, rows: Pixels, first: int) -> None:
+        """Remember the last rows for the next answer."""
+        self._end = first + len(rows)
+        if rows.nbytes > _MAX_KEPT:
+            rows = rows[-max(self._image.chunk, _MAX_KEPT // rows[0].nbytes) :].copy()
+            rows.setflags(write=False)
+        self._kept = rows
+
+    def _decode(self, first: int, last: int) -> Pixels:
+        image = self._image
+        if image.by_tifffile:
+            return image.normalised(tiffreader.read_strips(image.path, image.page, first, last))
+        if self._source is None:
+            self._source = _open(image.path, image.page)
+        whole = image.height - image.height % image.chunk
+        if last <= whole or image.tiled or not whole:
+            return image.normalised(self._stored(first, last))
+        # OpenImageIO decodes from the top to get at the last, shorter strip unless it comes from the
+        # strip above it
+        above = self._stored(min(first, whole - image.chunk), whole)
+        below = self._stored(whole, last)
+        return image.normalised(below if first == whole else np.concatenate([above, below]))
+
+    def _stored(self, first: int, last: int) -> Pixels:
+        """Samples as they are in the file."""
+        image = self._image
+        top, bottom = image.y + first, image.y + last
+        if image.tiled:
+            right = image.x + image.width
+            raw = self._source.read_tiles(image.x, right, top, bottom, 0, 1, 0, image.samples, "unknown")
+        else:
+            raw = self._source.read_scanlines(top, bottom, 0, 0, image.samples, "unknown")
+        if raw is None:
+            raise _unreadable(image.path, self._source.geterror())
+        return np.asarray(raw)
 
 
 def _unpremultiply(rows: Pixels) -> None:

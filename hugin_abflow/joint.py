@@ -56,6 +56,8 @@ _unused_log = logging.getLogger("hugin_abflow.unused")
 
 # Overlaps of fewer working pixels than this have nothing to match.
 _LEAST_OVERLAP = 64
+# Parts that layers are decoded in, for each core.
+_PARTS = 4
 # What only one layer shows first passes for exposure in part: its region grows to its size in a few rounds.
 _SEAM_ROUNDS = 2
 # Bytes that are to come for each working pixel of a layer: a field, an array of coefficients, offsets
@@ -293,8 +295,8 @@ def _align(
 def _read(
     device: Device, layers: Sequence[Layer], grid: Grid, progress: Progress, cores: int
 ) -> list[WorkingLayer]:
-    """The layers on the working grid, several decoded at a time, the largest first: none is last alone. Their
-    order does not depend on the caller's: by place and size, and by what they show where these are the same.
+    """The layers on the working grid, decoded by all cores. Their order does not depend on the caller's: by
+    place and size, and by what they show where these are the same.
     """
     lock = threading.Lock()
 
@@ -306,13 +308,19 @@ def _read(
     decoders = ThreadPoolExecutor(cores, "decoder")
     with progress("read", sum(layer.box.height for layer in layers)) as advance:
         try:
-            jobs = [
-                decoders.submit(
-                    working.reduce_layer, device, layer, grid, told, checked=places[layer.box] > 1
-                )
+            reductions = [
+                working.Reduction(device, layer, grid, checked=places[layer.box] > 1)
                 for layer in sorted(layers, key=lambda one: -one.box.width * one.box.height)
             ]
-            reduced = [job.result() for job in jobs]
+            # several a core, so that all end at a time; of each layer one after the other
+            parts = [one.parts(-(-_PARTS * cores // len(layers))) for one in reductions]
+            turns = sorted((turn, which) for which, its in enumerate(parts) for turn in range(len(its)))
+            jobs = [
+                decoders.submit(reductions[which].read, *parts[which][turn], told) for turn, which in turns
+            ]
+            for job in jobs:
+                job.result()
+            reduced = [one.result() for one in reductions]
         finally:
             decoders.shutdown(cancel_futures=True)
         device.give_back()  # it waits: else the last rows' time would be told as that of what follows

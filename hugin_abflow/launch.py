@@ -9,10 +9,11 @@ import numpy as np
 import pyopencl as cl
 
 
-def work_groups(size: Sequence[int], group: int) -> tuple[tuple[int, ...], tuple[int, ...]]:
-    """A run size in whole work-groups, and the size of these."""
-    columns, *others = map(int, size)
-    return (-(-columns // group) * group, *others), (group, *(1 for _ in others))
+def work_groups(size: Sequence[int], group: int | tuple[int, ...]) -> tuple[tuple[int, ...], tuple[int, ...]]:
+    """A run size in whole work-groups, and the size of these. group: columns, or columns, rows."""
+    group = (group,) if isinstance(group, int) else group
+    local = (*group, *(1 for _ in range(len(size) - len(group))))
+    return tuple(-(-int(wanted) // its) * its for wanted, its in zip(size, local, strict=True)), local
 
 
 def set_arguments(kernel: cl.Kernel, values: Sequence[object]) -> None:

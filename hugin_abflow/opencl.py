@@ -309,6 +309,11 @@ class Device:
             raise DeviceError(f"{file} has no kernels for {self.device.name.strip()}; use another --device")
         return kernels
 
+    def largest_group(self, module: str, name: str, options: str = "") -> int:
+        """How many work items a work-group of a kernel may have."""
+        asked = cl.kernel_work_group_info.WORK_GROUP_SIZE
+        return int(self.kernel(module, name, options).get_work_group_info(asked, self.device))
+
     def run(
         self,
         module: str,
@@ -316,7 +321,7 @@ class Device:
         size: Sequence[int],
         *args: object,
         options: str = "",
-        group: int = _GROUP,
+        group: int | tuple[int, ...] = _GROUP,
     ) -> None:
         """Run a kernel over `size` (columns, rows, or columns, rows, layers) work items.
 

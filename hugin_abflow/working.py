@@ -9,8 +9,10 @@ full-resolution pixel under it is, so that layers cut from one picture agree exa
 from __future__ import annotations
 
 import math
+import threading
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from typing import Any
 from zlib import crc32
 
@@ -24,8 +26,9 @@ from hugin_abflow.progress import Advance
 from hugin_abflow.projection import Eye, directions
 from hugin_abflow.settings import Settings
 
-# Rows of a layer that are decoded and uploaded at a time.
-_ROWS = 64
+# Rows of a layer that are decoded and uploaded at a time: many take memory, few more calls, which many cores
+# have to wait for.
+_ROWS, _ROWS_FOR_CARD = 64, 256
 
 # Bounds of what kernels calculate with int, less some for rounding; only canvases longer than 30,000 px and
 # very narrow get near them.
@@ -206,44 +209,91 @@ def _span(low: int, high: int, start: int, ratio: tuple[int, int]) -> tuple[int,
     return -(-(low - start) * small // full), (high - start) * small // full
 
 
-def reduce_layer(
-    device: Device, layer: Layer, grid: Grid, advance: Advance, *, checked: bool = True
-) -> WorkingLayer:
-    """Decode a layer once, band by band, onto the working grid; `advance` counts its rows.
+class Reduction:
+    """A layer on its way onto the working grid: decoded once, band by band, several parts of it at a time.
 
     checked         whether a checksum is calculated, which costs a fifth of what decoding does; else it is 0.
     """
-    region = grid.region
-    left, right = _span(layer.box.left, layer.box.right, region.left, (region.width, grid.width))
-    top, bottom = _span(layer.box.top, layer.box.bottom, region.top, (region.height, grid.height))
-    width, height = max(1, right - left), max(1, bottom - top)
-    # a layer smaller than a working pixel covers none, but kernels write to the grid under its box
-    box = (min(left, grid.width - width), min(top, grid.height - height), width, height)
-    pixels = device.zeros((height, width, 4))
-    options, white = pixel_options(layer)
-    ratio = (region.width, grid.width, region.height, grid.height)
-    step = max(1, _ROWS * grid.height // region.height)
-    checksum = done = 0
-    place_x, place_y = layer.box.left - region.left, layer.box.top - region.top
-    for first in range(0, bottom - top, step):
-        rows = min(step, bottom - top - first)
-        start = (top + first) * region.height // grid.height - place_y
-        end = -(-(top + first + rows) * region.height // grid.height) - place_y
-        rows_read = device_rows(layer, start, end)
-        checksum = crc32(rows_read.data, checksum) if checked else 0
-        stored = device.upload(rows_read)
-        place = (place_x, start + place_y, layer.box.width, end - start)
-        device.run(
-            "working", "working_reduce", (width, rows), stored, place, ratio, box, first, (width, rows),
-            white, pixels, options=options,
-        )  # fmt: skip
-        advance(end - done)  # bands share rows; each counts once
-        done = end
-    if checked and bottom <= top:
-        # too flat for a row of the grid: the order of such layers must not be the caller's
-        checksum = crc32(device_rows(layer, 0, layer.box.height).data)
-    advance(layer.box.height - done)
-    return WorkingLayer(layer, box, pixels, checksum)
+
+    def __init__(self, device: Device, layer: Layer, grid: Grid, *, checked: bool = True) -> None:
+        region = grid.region
+        left, right = _span(layer.box.left, layer.box.right, region.left, (region.width, grid.width))
+        top, bottom = _span(layer.box.top, layer.box.bottom, region.top, (region.height, grid.height))
+        width, height = max(1, right - left), max(1, bottom - top)
+        # a layer smaller than a working pixel covers none, but kernels write to the grid under its box
+        self._box = (min(left, grid.width - width), min(top, grid.height - height), width, height)
+        self._device, self._layer, self._checked = device, layer, checked
+        self._top, self._rows = top, max(0, bottom - top)
+        self._place = layer.box.left - region.left, layer.box.top - region.top
+        self._ratio = (region.width, grid.width, region.height, grid.height)
+        rows = _ROWS_FOR_CARD if device.kind == "GPU" else _ROWS
+        self._band = max(1, rows * grid.height // region.height)
+        self._pixels = device.zeros((height, width, 4))
+        self._checksum, self._checking = 0, threading.Lock()
+
+    def parts(self, count: int) -> list[tuple[int, int]]:
+        """Rows of the grid, `first` to `end`, that `read` takes: all of them, in so many parts if there are
+        as many bands; in one where the layer can be decoded from its top alone.
+        """
+        bands = -(-self._rows // self._band)
+        count = min(max(1, bands), count) if self._layer.strip > 1 else 1
+        ends = [min(self._rows, bands * index // count * self._band) for index in range(count + 1)]
+        return list(pairwise(ends))
+
+    def read(self, first: int, end: int, advance: Advance) -> None:
+        """Decode one of `parts`; `advance` counts rows of the layer. For several threads, each part once."""
+        _, _, full, small = self._ratio
+        width, pixels = self._box[2], self._pixels
+        options, white = pixel_options(self._layer)
+        for row in range(first, end, self._band):
+            rows = min(self._band, end - row)
+            start, stop = self._begins(row), -(-(self._top + row + rows) * full // small) - self._place[1]
+            rows_read = device_rows(self._layer, start, stop)
+            if self._checked:
+                self._check(rows_read, row)
+            stored = self._device.upload(rows_read)
+            place = (self._place[0], start + self._place[1], self._layer.box.width, stop - start)
+            self._device.run(
+                "working", "working_reduce", (width, rows), stored, place, self._ratio, self._box, row,
+                (width, rows), white, pixels, options=options,
+            )  # fmt: skip
+            advance(self._counted(row + rows) - self._counted(row))  # bands share rows; each counts once
+        if not self._rows:
+            advance(self._layer.box.height)
+
+    def result(self) -> WorkingLayer:
+        """The layer, of which all parts were read."""
+        if self._checked and not self._rows:
+            # too flat for a row of the grid: the order of such layers must not be the caller's
+            self._check(device_rows(self._layer, 0, self._layer.box.height), 0)
+        return WorkingLayer(self._layer, self._box, self._pixels, self._checksum)
+
+    def _begins(self, row: int) -> int:
+        """The layer's row in which a row of its box on the grid begins."""
+        _, _, full, small = self._ratio
+        return (self._top + row) * full // small - self._place[1]
+
+    def _counted(self, row: int) -> int:
+        """How many rows of the layer come before one of its box on the grid: none, or all, at its ends."""
+        if row == self._rows:
+            return self._layer.box.height
+        return self._begins(row) if row else 0
+
+    def _check(self, rows: np.ndarray, row: int) -> None:
+        """Have the checksum tell of a band, in whatever order they come."""
+        its = crc32(rows.data, row)
+        with self._checking:
+            self._checksum = (self._checksum + its) % 2**32
+
+
+def reduce_layer(
+    device: Device, layer: Layer, grid: Grid, advance: Advance, *, checked: bool = True
+) -> WorkingLayer:
+    """A layer on the working grid, all of it decoded here; see `Reduction`."""
+    reduction = Reduction(device, layer, grid, checked=checked)
+    for first, end in reduction.parts(1):
+        reduction.read(first, end, advance)
+    return reduction.result()
 
 
 def same_where_both(device: Device, a: WorkingLayer, b: WorkingLayer) -> bool:

@@ -244,17 +244,11 @@ __kernel void flow_system(int4 grid, int pitch, /* run size: pitch, 2 grid.y, wa
                          north * flow_link(board, pitch, p.at, p.north, contrast)));
 }
 
-/* One half-sweep of red-black successive over-relaxation. */
-__kernel void flow_relax(int4 grid, int pitch, /* run size: pitch, grid.y, ways */
-                         int colour, float relaxation,
-                         __global float *board) /* (ways, 2, grid.y, BOARD_PLANES, pitch); its flow is changed */
-{
-    const int y = get_global_id(1);
-    if (y >= grid.y)
-        return;
-    board += get_global_id(2) * 2 * grid.y * BOARD_PLANES * pitch;
+/* Pixel k of a row and colour, relaxed by red-black successive over-relaxation. */
+static inline void flow_relaxed(int k, int y, int colour, float relaxation, int4 grid, int pitch,
+                                __global float *board) {
     /* across a border that does not wrap the weights are 0 */
-    const flow_places p = flow_around(get_global_id(0), y, colour, grid, pitch);
+    const flow_places p = flow_around(k, y, colour, grid, pitch);
     __global float *u = board + BOARD_U * pitch, *v = board + BOARD_V * pitch;
     __global const float *to_east = board + BOARD_EAST * pitch, *to_south = board + BOARD_SOUTH * pitch;
     const float e = to_east[p.at], w = to_east[p.west], s = to_south[p.at], n = y > 0 ? to_south[p.north] : 0.0f;
@@ -266,6 +260,33 @@ __kernel void flow_relax(int4 grid, int pitch, /* run size: pitch, grid.y, ways 
     fv += relaxation * ((b2 - cross * fu) * board[BOARD_R2 * pitch + p.at] - fv);
     u[p.at] = fu;
     v[p.at] = fv;
+}
+
+/* One half-sweep. */
+__kernel void flow_relax(int4 grid, int pitch, /* run size: pitch, grid.y, ways */
+                         int colour, float relaxation,
+                         __global float *board) /* (ways, 2, grid.y, BOARD_PLANES, pitch); its flow is changed */
+{
+    const int y = get_global_id(1);
+    if (y >= grid.y)
+        return;
+    board += get_global_id(2) * 2 * grid.y * BOARD_PLANES * pitch;
+    flow_relaxed(get_global_id(0), y, colour, relaxation, grid, pitch, board);
+}
+
+/* All half-sweeps of a small board, each way's by one work-group: a graphics card starts more slowly than it does
+   them. */
+__kernel void flow_relax_small(int4 grid, int pitch, /* run size: a work-group (columns, rows), ways */
+                               int sweeps, float relaxation,
+                               __global float *board) /* (ways, 2, grid.y, BOARD_PLANES, pitch); its flow is changed */
+{
+    board += get_global_id(2) * 2 * grid.y * BOARD_PLANES * pitch;
+    for (int half_sweep = 0; half_sweep < 2 * sweeps; ++half_sweep) {
+        for (int y = get_local_id(1); y < grid.y; y += get_local_size(1))
+            for (int k = get_local_id(0); 2 * k < grid.x; k += get_local_size(0)) /* a row ends with zeros */
+                flow_relaxed(k, y, half_sweep & 1, relaxation, grid, pitch, board);
+        barrier(CLK_GLOBAL_MEM_FENCE);
+    }
 }
 
 /* The flow of boards. */

@@ -358,6 +358,41 @@ def test_relax_equals_its_twin(device: Device, name: str, colour: int) -> None:
         assert_close(result, expected, TRIGONOMETRY)
 
 
+@pytest.mark.parametrize("group", [(1, 1), (8, 3), (2, 32)])
+@pytest.mark.parametrize("grid", [(77, 53, 0, 0), (16, 5, 1, 0), (129, 3, 0, 0)])
+def test_one_work_group_sweeps_as_its_twin(
+    device: Device, grid: tuple[int, int, int, int], group: tuple[int, int]
+) -> None:
+    tensor, right, moved, feature = system_of(grid, 51)
+    sides = twin.flow_system(tensor, right, moved, feature, grid, 1.0, 0.3)
+    expected = twin.flow_relax_small(*sides, grid, 3, 1.85, moved)
+    values = {tuple(SOLVED): twin.solving(*sides, grid, moved), tuple(FLOW): moved}
+    way, both = board_of(device, grid, values).planes.get()[0], Board.of(device, 2, grid)
+    both.planes.set(np.stack([0 * way, way]))
+    device.run(
+        "flow", "flow_relax_small", (*group, 2), grid, both.pitch, 3, 1.85, both.planes, options=both.options,
+        group=group,
+    )  # fmt: skip
+    empty, swept = both.planes.get()
+    assert not empty.any()
+    assert not swept[..., (grid[0] + 1) // 2 :].any()
+    assert np.abs(expected - moved).max() > 0.1
+    assert_close(on_board(Board(device.upload(swept[None]), grid), FLOW), expected, TRIGONOMETRY)
+
+
+@pytest.mark.parametrize("kind", ["CPU", "GPU"])
+def test_graphics_cards_relax_small_boards_at_once(
+    device: Device, kind: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    started = list[str]()
+    monkeypatch.setattr(Device, "kind", kind)
+    monkeypatch.setattr(device, "repeat", lambda *args: started.append(args[1]))
+    monkeypatch.setattr(device, "run", lambda *args, **_: started.append(args[1]))
+    for width in (128, 129):
+        Board.of(device, 1, (width, 128, 0, 0)).relax(device, 2, 1.5)
+    assert started == ["flow_relax_small" if kind == "GPU" else "flow_relax", "flow_relax"]
+
+
 @pytest.mark.parametrize("name", list(GRIDS))
 def test_median_is_scipys(device: Device, name: str) -> None:
     """Kernel and twin; rows beyond the border are the pixel itself, which SciPy cannot do."""

@@ -301,6 +301,36 @@ def test_answers_stay_as_they_were_given(tmp_path):
             rows[0, 0, 0] = 1  # shared memory: a caller that writes into it must copy
 
 
+def test_two_threads_decode_one_layer_at_a_time(tmp_path, monkeypatch):
+    """And one, in whatever order, keeps one file open."""
+    from hugin_abflow import images
+
+    pixels = noise(np.uint8, width=61, height=300)
+    write_image(tmp_path / "a.tif", pixels)
+    both, opened = threading.Barrier(2, timeout=60), []
+
+    class Meeting(Counting):
+        def read_scanlines(self, *span):
+            if not both.broken:
+                both.wait()
+            return super().read_scanlines(*span)
+
+    real_open = images._open
+    monkeypatch.setattr(
+        images, "_open", lambda path, page: opened.append(Meeting(real_open(path, page), [])) or opened[-1]
+    )
+    layer = read_layer(tmp_path / "a.tif")
+    opened.clear()  # what told of the layer
+    with ThreadPoolExecutor(2) as threads:
+        first, second = threads.map(layer.read, (0, 160), (100, 260))
+    assert np.array_equal(first, pixels[:100]) and np.array_equal(second, pixels[160:260])
+    assert len(opened) == 2
+    both.abort()
+    for top in (250, 20, 130, 64, 200):
+        assert np.array_equal(layer.read(top, top + 40), pixels[top : top + 40])
+    assert len(opened) == 2
+
+
 def test_many_threads_read_one_layer(tmp_path):
     pixels = noise(np.uint16, height=301)
     write_image(tmp_path / "a.tif", pixels)

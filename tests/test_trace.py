@@ -104,7 +104,7 @@ def test_a_run_tells_phases_kernels_and_files(tmp_path: Path) -> None:
     assert list(phases) == ["read", "flow", "align", "blend"]
     for kind, name, phase in (
         ("kernel", "working_reduce", "read"),
-        ("kernel", "flow_relax", "flow"),
+        ("kernel", "flow_warp", "flow"),
         ("kernel", "blend_band", "blend"),
         ("file", "encode", "blend"),
     ):
@@ -175,5 +175,5 @@ def test_processes_side_by_side_have_one_trace(tmp_path: Path) -> None:
     for process in processes:
         own = [event for event in found if event["pid"] == process]
         (flow,) = (event for event in own if event["name"] == "flow")
-        relaxed = [event for event in own if event["name"] == "flow_relax"]
-        assert relaxed and all(flow["ts"] - 1e3 <= event["ts"] <= end(flow) + 1e3 for event in relaxed)
+        warped = [event for event in own if event["name"] == "flow_warp"]
+        assert warped and all(flow["ts"] - 1e3 <= event["ts"] <= end(flow) + 1e3 for event in warped)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -50,6 +51,11 @@ def test_twin_of_reduce_is_the_mean_of_repeated_pixels() -> None:
     assert not small[~valid].any()
 
 
+def rows_at_a_time(patch: pytest.MonkeyPatch, rows: int) -> None:
+    for name in ("_ROWS", "_ROWS_FOR_CARD"):
+        patch.setattr(working, name, rows)
+
+
 @pytest.mark.parametrize("dtype", DTYPES)
 @pytest.mark.parametrize("channels", [1, 3])
 def test_reduce_equals_its_twin(device: Device, dtype: type, channels: int) -> None:
@@ -58,7 +64,7 @@ def test_reduce_equals_its_twin(device: Device, dtype: type, channels: int) -> N
     layer = Layer.from_array("a", pixels, left=13, top=7)
     grid = grid_over(Box(2, 3, 110, 88), 47, 29)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(working, "_ROWS", 20)
+        rows_at_a_time(patch, 20)
         reduced = working.reduce_layer(device, layer, grid, nothing)
     kernel = reduced.pixels.get()
     left, top, width, height = reduced.box
@@ -79,8 +85,53 @@ def test_reduce_does_not_depend_on_how_rows_are_read(device: Device, rows: int) 
     grid = grid_over(Box(0, 0, 90, 70), 41, 33)
     whole = working.reduce_layer(device, layer, grid, nothing).pixels.get()
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(working, "_ROWS", rows)
+        rows_at_a_time(patch, rows)
         assert np.array_equal(working.reduce_layer(device, layer, grid, nothing).pixels.get(), whole)
+
+
+@pytest.mark.parametrize("count", [2, 5, 99])
+def test_parts_in_any_order_are_the_layer(
+    device: Device, count: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rows_at_a_time(monkeypatch, 7)
+    layer = Layer.from_array("a", random_pixels(2, 77, 53, np.uint16, 3, 0.005), left=5, top=9)
+    layer = replace(layer, strip=4)
+    grid = grid_over(Box(0, 0, 90, 70), 41, 33)
+    whole = working.reduce_layer(device, layer, grid, nothing)
+    reduction, seen = working.Reduction(device, layer, grid), list[int]()
+    parts = reduction.parts(count)
+    assert len(parts) == min(count, 8)  # bands of three rows of the grid
+    assert [first for first, _ in parts[1:]] == [end for _, end in parts[:-1]]
+    for first, end in parts[::-1]:
+        reduction.read(first, end, seen.append)
+    assert sum(seen) == 53
+    result = reduction.result()
+    assert np.array_equal(result.pixels.get(), whole.pixels.get())
+    assert result.checksum == whole.checksum
+
+
+def test_what_is_decoded_from_the_top_alone_is_one_part(device: Device) -> None:
+    layer = Layer.from_array("a", random_pixels(2, 77, 53, np.uint8, 3, 0))
+    assert layer.strip == 1
+    reduction = working.Reduction(device, layer, grid_over(Box(0, 0, 77, 53), 77, 53))
+    assert reduction.parts(8) == [(0, 53)]
+
+
+def test_a_layer_without_a_row_of_the_grid_is_counted_too(device: Device) -> None:
+    seen = list[int]()
+    layer = Layer.from_array("a", random_pixels(2, 77, 3, np.uint8, 3, 0), top=1)
+    result = working.reduce_layer(device, layer, grid_over(Box(0, 0, 90, 70), 9, 7), seen.append)
+    assert seen == [3] and result.checksum
+
+
+def test_checksums_tell_bands_that_are_exchanged(device: Device) -> None:
+    pixels = random_pixels(2, 40, 128, np.uint8, 3, 0)
+    grid = grid_over(Box(0, 0, 40, 128), 40, 128)
+    one, other = (
+        working.reduce_layer(device, Layer.from_array("a", rows), grid, nothing).checksum
+        for rows in (pixels, np.concatenate([pixels[64:], pixels[:64]]))
+    )
+    assert one != other
 
 
 def test_layers_cut_from_one_picture_agree_to_the_bit(device: Device) -> None:
@@ -145,7 +196,7 @@ def test_advance_counts_every_row_of_a_layer_once(device: Device) -> None:
     seen: list[int] = []
     layer = Layer.from_array("a", random_pixels(5, 77, 53, np.uint8, 1, 0), left=1, top=2)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(working, "_ROWS", 16)
+        rows_at_a_time(patch, 16)
         working.reduce_layer(device, layer, grid_over(Box(0, 0, 90, 60), 37, 23), seen.append)
     assert sum(seen) == 53
 

@@ -183,6 +183,15 @@ def flow_relax(
     return result
 
 
+def flow_relax_small(
+    left_side: Array, right_side: Array, grid: Sequence[int], sweeps: int, relaxation: float, flow: Array
+) -> Array:
+    """Whole sweeps: half of one colour, half of the other."""
+    for half_sweep in range(2 * sweeps):
+        flow = flow_relax(left_side, right_side, grid, half_sweep % 2, relaxation, flow)
+    return flow
+
+
 def flow_median(flow: Array, grid: Sequence[int]) -> Array:
     """3 x 3 median of each component; beyond the border a pixel stands for its neighbour."""
     seen = []
