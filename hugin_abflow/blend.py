@@ -26,7 +26,7 @@ from hugin_abflow.working import Grid, device_dtype, device_rows, pixel_options
 _log = logging.getLogger(__name__)
 
 # Bands of about this many output pixels, where the settings leave the choice and memory allows it.
-_BAND_PIXELS = 1 << 20
+_BAND_PIXELS, _BAND_PIXELS_ON_CARD = 1 << 20, 1 << 22
 _LEAST_ROWS = 4
 # What files keep of each layer between two reads, and what is allocated beside that which is reckoned.
 _STRIP_ROWS = 64
@@ -122,7 +122,8 @@ def _band_height(
     device: Device, layers: Sequence[BlendLayer], full: Grid, grid: Grid, crop: Box, settings: Settings
 ) -> int:
     """Rows of a band: as many as are quick and memory holds."""
-    height = max(_LEAST_ROWS, _BAND_PIXELS // crop.width)
+    pixels = _BAND_PIXELS_ON_CARD if device.kind == "GPU" else _BAND_PIXELS
+    height = max(_LEAST_ROWS, pixels // crop.width)
     device.give_back()
     limit = memory.limit(settings.max_memory)
     used = memory.resident() + device.own_memory + _SLACK

@@ -41,6 +41,31 @@ def test_bands_are_as_high_as_memory_allows(device: Device, monkeypatch: pytest.
     assert len(warnings) == 1
 
 
+@pytest.mark.parametrize(("kind", "rows"), [("CPU", 8), ("GPU", 32)])
+def test_bands_are_higher_on_graphics_cards(
+    device: Device, kind: str, rows: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Which start slowly; the same bytes."""
+    full = plane(77, 53)
+    grid = full.resized(31, 23)
+    layers = [blend_layer(device, stored_pixels(31, 77, 53, np.uint8, 3, 0.9), 0, 0, full, grid)]
+    monkeypatch.setattr(Device, "kind", kind)
+    for name, per_row in (("_BAND_PIXELS", 8), ("_BAND_PIXELS_ON_CARD", 32)):
+        monkeypatch.setattr(blend, name, per_row * 77)
+
+    def parts(settings: Settings) -> list[np.ndarray]:
+        cells = grid.resized(7, 5)
+        return list(
+            blend.bands(
+                device, layers, full, grid, cells, cells, 1.0, full.region, settings, lambda units: None
+            )
+        )
+
+    result = parts(Settings())
+    assert len(result[0]) == rows
+    assert np.array_equal(np.concatenate(result), np.concatenate(parts(Settings(band_rows=5))))
+
+
 def test_layers_that_no_band_needs_together_share_memory() -> None:
     """A column of many small layers takes no more than those that meet; none lies over another in use."""
     pixels = np.zeros((20, 30, 4), np.uint8)
