@@ -334,7 +334,7 @@ def _rows_needed(layer: BlendLayer, full: Grid, part: Box, scale: float) -> Span
     beyond = math.ceil(max(layer.reach[first:last]) * scale) + 3  # 3: bicubic taps, rounding
     start, end = max(0, part.top - beyond - offset), min(box.height, part.bottom + beyond - offset)
     # whole strips, unless they are large: parts would have to be cut and joined again
-    strip, row = layer.layer.strip, box.width * (layer.layer.channels + 1) * layer.layer.dtype.itemsize
+    strip, row = layer.layer.strip, layer.layer.row_bytes
     return start, min(box.height, end + (-end % strip if strip * row <= _WHOLE_STRIP else 0))
 
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import importlib
 import logging
 import threading
-from collections import Counter
 from collections.abc import Callable, Generator, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager, suppress
@@ -29,6 +28,7 @@ from hugin_abflow import (
     memory,
     multiband,
     pairflow,
+    reading,
     relay,
     saturation,
     seam,
@@ -56,8 +56,6 @@ _unused_log = logging.getLogger("hugin_abflow.unused")
 
 # Overlaps of fewer working pixels than this have nothing to match.
 _LEAST_OVERLAP = 64
-# Parts that layers are decoded in, for each core.
-_PARTS = 4
 # What only one layer shows first passes for exposure in part: its region grows to its size in a few rounds.
 _SEAM_ROUNDS = 2
 # Bytes that are to come for each working pixel of a layer: a field, an array of coefficients, offsets
@@ -152,7 +150,7 @@ def prepare(
     """
     full = working.full_grid(canvas, layers)
     grid = working.working_grid(full, settings)
-    everything = _read(device, layers, grid, progress, settings.cores)
+    everything = reading.read(device, layers, grid, progress, settings)
     masks = coefficient.masks(device, everything, grid)
     used = [i for i in range(len(everything)) if not _redundant(i, everything, masks)]
     reduced = [everything[i] for i in used]
@@ -290,46 +288,6 @@ def _align(
         else:
             last = hoped or gains(settings, None)
         return _Aligned(fields, reaches, last.result(), whole)
-
-
-def _read(
-    device: Device, layers: Sequence[Layer], grid: Grid, progress: Progress, cores: int
-) -> list[WorkingLayer]:
-    """The layers on the working grid, decoded by all cores. Their order does not depend on the caller's: by
-    place and size, and by what they show where these are the same.
-    """
-    lock = threading.Lock()
-
-    def told(rows: int) -> None:
-        with lock:
-            advance(rows)
-
-    places = Counter(layer.box for layer in layers)
-    decoders = ThreadPoolExecutor(cores, "decoder")
-    with progress("read", sum(layer.box.height for layer in layers)) as advance:
-        try:
-            reductions = [
-                working.Reduction(device, layer, grid, checked=places[layer.box] > 1)
-                for layer in sorted(layers, key=lambda one: -one.box.width * one.box.height)
-            ]
-            # several a core, so that all end at a time; of each layer one after the other
-            parts = [one.parts(-(-_PARTS * cores // len(layers))) for one in reductions]
-            turns = sorted((turn, which) for which, its in enumerate(parts) for turn in range(len(its)))
-            jobs = [
-                decoders.submit(reductions[which].read, *parts[which][turn], told) for turn, which in turns
-            ]
-            for job in jobs:
-                job.result()
-            reduced = [one.result() for one in reductions]
-        finally:
-            decoders.shutdown(cancel_futures=True)
-        device.give_back()  # it waits: else the last rows' time would be told as that of what follows
-    return sorted(reduced, key=_place)
-
-
-def _place(layer: WorkingLayer) -> tuple[int, ...]:
-    box = layer.layer.box
-    return box.top, box.left, box.bottom, box.right, layer.checksum
 
 
 def _redundant(index: int, layers: Sequence[WorkingLayer], masks: Masks) -> bool:

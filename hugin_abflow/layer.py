@@ -119,6 +119,11 @@ class Layer:
     strip: int = 1
     compressed: bool = False
 
+    @property
+    def row_bytes(self) -> int:
+        """Of one row that `read` gives."""
+        return self.box.width * (self.channels + 1) * self.dtype.itemsize
+
     @classmethod
     def from_array(
         cls, name: str, pixels: npt.NDArray[Any], left: int = 0, top: int = 0, icc: bytes | None = None

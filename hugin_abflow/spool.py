@@ -45,7 +45,7 @@ def spooled(layers: Sequence[Layer]) -> Iterator[list[Layer]]:
             room = min(memory.unused(), shutil.disk_usage(folder).free) // _SHARE
             file = stack.enter_context(tempfile.TemporaryFile(dir=folder))
             for index, layer in enumerate(layers):
-                size = _row_bytes(layer) * layer.box.height
+                size = layer.row_bytes * layer.box.height
                 if layer.compressed and end + size <= room and hasattr(os, "preadv"):  # Windows has none
                     rows = _Rows(layer, file, end)
                     stack.callback(rows.end)
@@ -54,10 +54,6 @@ def spooled(layers: Sequence[Layer]) -> Iterator[list[Layer]]:
         if end:
             _log.info("spool: up to %s of decoded layers in a temporary file in %s", memory.size(end), folder)
         yield result
-
-
-def _row_bytes(layer: Layer) -> int:
-    return layer.box.width * (layer.channels + 1) * layer.dtype.itemsize
 
 
 class _Block(NamedTuple):
@@ -76,7 +72,7 @@ class _Rows:
     def __init__(self, layer: Layer, file: IO[bytes], start: int) -> None:
         self._layer, self._start = layer, start
         self._file: IO[bytes] | None = file
-        self._row = _row_bytes(layer)
+        self._row = layer.row_bytes
         self._pixel = self._row // layer.box.width
         self._blocks: list[_Block] = []
         self._block_of = np.full(layer.box.height, -1)  # each row's; -1: it is not stored

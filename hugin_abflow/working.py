@@ -26,9 +26,9 @@ from hugin_abflow.progress import Advance
 from hugin_abflow.projection import Eye, directions
 from hugin_abflow.settings import Settings
 
-# Rows of a layer that are decoded and uploaded at a time: many take memory, few more calls, which many cores
-# have to wait for.
-_ROWS, _ROWS_FOR_CARD = 64, 256
+# Rows of a layer that are decoded and uploaded at a time, and their bytes: many take memory, few more calls,
+# for which many cores have to wait.
+_ROWS, _ROWS_FOR_CARD, _BYTES = 64, 256, 8 << 20
 
 # Bounds of what kernels calculate with int, less some for rounding; only canvases longer than 30,000 px and
 # very narrow get near them.
@@ -203,6 +203,12 @@ def device_rows(layer: Layer, top: int, bottom: int) -> np.ndarray:
     return layer.read(top, bottom).astype(device_dtype(layer), copy=False)
 
 
+def rows_at_a_time(device: Device, layer: Layer) -> int:
+    """How many rows of a layer are decoded at a time, but for whole strips."""
+    most = _ROWS_FOR_CARD if device.kind == "GPU" else _ROWS
+    return max(1, min(most, _BYTES // layer.row_bytes))
+
+
 def _span(low: int, high: int, start: int, ratio: tuple[int, int]) -> tuple[int, int]:
     """Grid pixels (first, end) that lie wholly within full-resolution pixels [low, high)."""
     full, small = ratio
@@ -226,8 +232,7 @@ class Reduction:
         self._top, self._rows = top, max(0, bottom - top)
         self._place = layer.box.left - region.left, layer.box.top - region.top
         self._ratio = (region.width, grid.width, region.height, grid.height)
-        rows = _ROWS_FOR_CARD if device.kind == "GPU" else _ROWS
-        self._band = max(1, rows * grid.height // region.height)
+        self._band = max(1, rows_at_a_time(device, layer) * grid.height // region.height)
         self._pixels = device.zeros((height, width, 4))
         self._checksum, self._checking = 0, threading.Lock()
 
@@ -250,7 +255,7 @@ class Reduction:
             start, stop = self._begins(row), -(-(self._top + row + rows) * full // small) - self._place[1]
             rows_read = device_rows(self._layer, start, stop)
             if self._checked:
-                self._check(rows_read, row)
+                self._check(rows_read, start, row, row + rows)
             stored = self._device.upload(rows_read)
             place = (self._place[0], start + self._place[1], self._layer.box.width, stop - start)
             self._device.run(
@@ -265,7 +270,7 @@ class Reduction:
         """The layer, of which all parts were read."""
         if self._checked and not self._rows:
             # too flat for a row of the grid: the order of such layers must not be the caller's
-            self._check(device_rows(self._layer, 0, self._layer.box.height), 0)
+            self._checksum = crc32(device_rows(self._layer, 0, self._layer.box.height).data)
         return WorkingLayer(self._layer, self._box, self._pixels, self._checksum)
 
     def _begins(self, row: int) -> int:
@@ -279,9 +284,14 @@ class Reduction:
             return self._layer.box.height
         return self._begins(row) if row else 0
 
-    def _check(self, rows: np.ndarray, row: int) -> None:
-        """Have the checksum tell of a band, in whatever order they come."""
-        its = crc32(rows.data, row)
+    def _check(self, stored: np.ndarray, start: int, row: int, end: int) -> None:
+        """Have the checksum tell of what lies under rows `row` to `end`, and no more: bands share rows, come
+        in any order, and may be larger elsewhere.
+
+        stored: rows of the layer from its row `start` on.
+        """
+        first, last = max(start, self._counted(row)), min(start + len(stored), self._counted(end))
+        its = sum(crc32(stored[y - start].data, y) for y in range(first, last))
         with self._checking:
             self._checksum = (self._checksum + its) % 2**32
 
