@@ -98,7 +98,8 @@ class Board:
         if device.kind == "GPU" and width * height <= _SMALL:
             name = "flow_relax_small"
             most = device.largest_group("flow", name, self.options)
-            group = (_SMALL_COLUMNS, most // _SMALL_COLUMNS)
+            columns = min(_SMALL_COLUMNS, most)
+            group = (columns, most // columns)
             device.run(
                 "flow", name, (*group, self.ways), self.grid, self.pitch, sweeps, relaxation, self.planes,
                 options=self.options, group=group,

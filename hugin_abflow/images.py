@@ -7,6 +7,8 @@ multiplies colours by alpha unless told on both sides not to.
 from __future__ import annotations
 
 import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -191,7 +193,8 @@ class _Rows:
         self.has_alpha = alpha >= 0
         self.associated = spec.alpha_channel >= 0 and not spec.get_int_attribute(_UNASSOCIATED, 0)
         self.chunk = self._chunk_rows(spec)
-        self._idle, self._lock = list[_Decoder](), threading.Lock()
+        self._idle, self._busy, self._done = list[_Decoder](), 0, False
+        self._lock = threading.Lock()
 
     def _chunk_rows(self, spec: Any) -> int:
         """Rows that are decoded together; 1 where decoding is strictly sequential."""
@@ -205,23 +208,36 @@ class _Rows:
             raise IndexError(f"rows {top}..{bottom} of an image of {self.height} rows")
         if top == bottom:
             return np.empty((0, self.width, self.channels + 1), self.dtype)
-        with trace.span("decode", trace.FILE, file=self.path.name, rows=bottom - top):
-            decoder = self._decoder(top)
-            rows = decoder.read(top, bottom)  # one that fails is not used again
-        with self._lock:
-            self._idle.append(decoder)
-            if bottom == self.height and self.chunk > 1:
-                # the image is done: let go of files and memory, layers can be many
-                self._idle.clear()
+        with (
+            self._decoder(top) as decoder,
+            trace.span("decode", trace.FILE, file=self.path.name, rows=bottom - top),
+        ):
+            rows = decoder.read(top, bottom)
+            self._done = self._done or (bottom == self.height and self.chunk > 1)
         return rows
 
-    def _decoder(self, top: int) -> _Decoder:
-        """One that nobody uses: at best one that stands where rows from `top` on begin."""
+    @contextmanager
+    def _decoder(self, top: int) -> Iterator[_Decoder]:
+        """One that nobody uses: at best one that stands where rows from `top` on begin. If it fails it is not
+        used again; once the image was read to its end, and nobody reads it, none are: layers can be many, and
+        their files and rows take room.
+        """
         with self._lock:
-            for index, idle in enumerate(self._idle):
-                if idle.stands_at(top):
-                    return self._idle.pop(index)
-            return self._idle.pop() if self._idle else _Decoder(self)
+            self._busy += 1
+            at = next((index for index, idle in enumerate(self._idle) if idle.stands_at(top)), -1)
+            decoder = self._idle.pop(at) if self._idle else _Decoder(self)
+        failed = True
+        try:
+            yield decoder
+            failed = False
+        finally:
+            with self._lock:
+                self._busy -= 1
+                if not failed:
+                    self._idle.append(decoder)
+                if self._done and not self._busy:
+                    self._idle.clear()
+                    self._done = False
 
     def normalised(self, raw: Pixels) -> Pixels:
         """Stored samples -> colours and unassociated alpha; NaN and infinity -> alpha 0."""

@@ -1,4 +1,4 @@
-"""All layers on the working grid, decoded by all cores."""
+"""All layers on the working grid. Where cores are more than layers, these are decoded in parts."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from hugin_abflow.progress import Progress
 from hugin_abflow.settings import Settings
 from hugin_abflow.working import Grid, Reduction, WorkingLayer
 
-# Parts that layers are decoded in, for each core: so that all are done at a time.
+# Parts, for each core, where cores are more than layers: so that all are done at a time.
 _PARTS = 4
 # The share of the memory that rows being read may take, and how often each is there: decoded, kept for the
 # next ones, joined with these, on the device.
@@ -44,8 +44,9 @@ def read(
                 Reduction(device, layer, grid, checked=places[layer.box] > 1)
                 for layer in sorted(layers, key=lambda one: -one.box.width * one.box.height)
             ]
-            parts = [one.parts(-(-_PARTS * threads // len(layers))) for one in started]
-            # of each layer one after the other: several threads at one wait for each other
+            count = -(-_PARTS * threads // len(layers)) if threads > len(layers) else 1
+            parts = [one.parts(count) for one in started]
+            # the first of all layers, then the second: one thread at a time keeps rows of a layer (spool.py)
             turns = sorted((turn, which) for which, its in enumerate(parts) for turn in range(len(its)))
             jobs = [decoders.submit(started[which].read, *parts[which][turn], told) for turn, which in turns]
             for job in jobs:
@@ -59,7 +60,7 @@ def read(
 
 def _threads(device: Device, layers: Sequence[Layer], settings: Settings) -> int:
     """How many decode at a time: as many as there are cores, and memory holds."""
-    most = max(one.row_bytes * max(working.rows_at_a_time(device, one), one.strip) for one in layers)
+    most = max(one.row_bytes * (working.rows_at_a_time(device, one) + one.strip) for one in layers)
     fitting = int(_SHARE * memory.limit(settings.max_memory)) // (_COPIES * most)
     return max(1, min(settings.cores, fitting))
 

@@ -30,6 +30,9 @@ from hugin_abflow.settings import Settings
 # for which many cores have to wait.
 _ROWS, _ROWS_FOR_CARD, _BYTES = 64, 256, 8 << 20
 
+# Strips of a layer that a part has at least.
+_PART_STRIPS = 8
+
 # Bounds of what kernels calculate with int, less some for rounding; only canvases longer than 30,000 px and
 # very narrow get near them.
 _LARGEST_PRODUCT = 0.99 * 2**31
@@ -237,11 +240,13 @@ class Reduction:
         self._checksum, self._checking = 0, threading.Lock()
 
     def parts(self, count: int) -> list[tuple[int, int]]:
-        """Rows of the grid, `first` to `end`, that `read` takes: all of them, in so many parts if there are
-        as many bands; in one where the layer can be decoded from its top alone.
+        """Rows of the grid, `first` to `end`, that `read` takes: all of them, in so many parts at most. Two
+        may share a strip, which is decoded for each of them, so each part has several; a layer that is
+        decoded from its top alone is one.
         """
-        bands = -(-self._rows // self._band)
-        count = min(max(1, bands), count) if self._layer.strip > 1 else 1
+        bands, strip = -(-self._rows // self._band), self._layer.strip
+        most = self._layer.box.height // (_PART_STRIPS * strip) if strip > 1 else 1
+        count = max(1, min(bands, count, most))
         ends = [min(self._rows, bands * index // count * self._band) for index in range(count + 1)]
         return list(pairwise(ends))
 

@@ -331,6 +331,37 @@ def test_two_threads_decode_one_layer_at_a_time(tmp_path, monkeypatch):
     assert len(opened) == 2
 
 
+@pytest.mark.parametrize("last", [True, False])
+def test_a_layer_that_threads_read_to_its_end_holds_no_file(tmp_path, last):
+    """Whoever is the last one to read of it."""
+    write_image(tmp_path / "a.tif", noise(np.uint8, width=61, height=300))
+    before, layer = open_files(), read_layer(tmp_path / "a.tif")
+    rows = layer.read.__self__
+    with rows._decoder(0) as first, rows._decoder(200) as second:
+        first.read(0, 100)
+        second.read(200, 300)
+        assert open_files() == before + 2
+        rows._done = True  # one of them had the last rows
+    del first, second
+    assert open_files() == before
+    layer.read(200, 299 + last)
+    assert open_files() == before + (not last)
+
+
+def test_where_decoding_stands_it_goes_on(tmp_path):
+    """Two threads that take turns keep their places."""
+    write_image(tmp_path / "a.tif", noise(np.uint8, width=61, height=300))
+    rows = read_layer(tmp_path / "a.tif").read.__self__
+    with rows._decoder(0) as first, rows._decoder(200) as second:
+        first.read(0, 40)
+        second.read(200, 240)
+    for _ in range(3):
+        with rows._decoder(240) as found:
+            assert found is second
+        with rows._decoder(40) as found:
+            assert found is first
+
+
 def test_many_threads_read_one_layer(tmp_path):
     pixels = noise(np.uint16, height=301)
     write_image(tmp_path / "a.tif", pixels)

@@ -69,7 +69,7 @@ def test_checksums_do_not_depend_on_how_many_rows_are_read_at_a_time(
 def test_no_more_threads_than_memory_holds_rows_for(device: Device, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(working, "_ROWS", 16)
     layers, row = [stripped(1), stripped(2)], 77 * 4
-    for strip, rows in ((8, 16), (32, 32)):
+    for strip, rows in ((8, 24), (32, 48)):
         several = [replace(one, strip=strip) for one in layers]
         for threads in (1, 3, 8):
             limit = threads * 4 * rows * row * 4
@@ -90,6 +90,21 @@ def test_two_threads_read_one_layer(device: Device) -> None:
 
     (found,) = read(device, [replace(layer, read=rows)], threads=2)
     assert found.pixels.get()[..., 3].all()
+
+
+def test_where_layers_are_as_many_as_cores_each_is_one_part(
+    device: Device, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of many layers few are open at a time."""
+    asked = list[int]()
+    parts = working.Reduction.parts
+    monkeypatch.setattr(
+        reading.Reduction, "parts", lambda self, count: asked.append(count) or parts(self, count)
+    )
+    layers = [stripped(1), stripped(2), stripped(3)]
+    for threads in (1, 2, 3, 4):
+        read(device, layers, threads=threads)
+    assert asked == [1] * 9 + [6] * 3
 
 
 def test_every_row_is_counted_once(device: Device) -> None:

@@ -94,6 +94,7 @@ def test_parts_in_any_order_are_the_layer(
     device: Device, count: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     rows_at_a_time(monkeypatch, 7)
+    monkeypatch.setattr(working, "_PART_STRIPS", 1)
     layer = Layer.from_array("a", random_pixels(2, 77, 53, np.uint16, 3, 0.005), left=5, top=9)
     layer = replace(layer, strip=4)
     grid = grid_over(Box(0, 0, 90, 70), 41, 33)
@@ -110,11 +111,29 @@ def test_parts_in_any_order_are_the_layer(
     assert result.checksum == whole.checksum
 
 
-def test_what_is_decoded_from_the_top_alone_is_one_part(device: Device) -> None:
+@pytest.mark.parametrize(("strip", "parts"), [(1, 1), (2, 4), (4, 2), (5, 1), (64, 1)])
+def test_each_part_has_several_strips(
+    device: Device, strip: int, parts: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Which two parts may share; what is decoded from its top alone (1) is one."""
+    rows_at_a_time(monkeypatch, 8)
+    layer = replace(Layer.from_array("a", random_pixels(2, 77, 64, np.uint8, 3, 0)), strip=strip)
+    reduction = working.Reduction(device, layer, grid_over(Box(0, 0, 77, 64), 77, 64))
+    found = reduction.parts(8)
+    assert len(found) == parts and (found[0][0], found[-1][1]) == (0, 64)
+
+
+@pytest.mark.parametrize(("kind", "rows"), [("CPU", 64), ("GPU", 256)])
+def test_graphics_cards_get_more_rows_at_a_time(
+    device: Device, kind: str, rows: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """But of wide layers no more than 8 MiB."""
+    monkeypatch.setattr(Device, "kind", kind)
     layer = Layer.from_array("a", random_pixels(2, 77, 53, np.uint8, 3, 0))
-    assert layer.strip == 1
-    reduction = working.Reduction(device, layer, grid_over(Box(0, 0, 77, 53), 77, 53))
-    assert reduction.parts(8) == [(0, 53)]
+    assert working.rows_at_a_time(device, layer) == rows
+    for width, fitting in ((1 << 17, 16), (1 << 23, 1)):
+        wide = replace(layer, box=Box(0, 0, width, 53))
+        assert working.rows_at_a_time(device, wide) == fitting
 
 
 def test_a_layer_without_a_row_of_the_grid_is_counted_too(device: Device) -> None:
