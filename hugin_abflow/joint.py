@@ -284,7 +284,8 @@ def _align(
             last, whole = gains(replace(settings, exposure=False), None), None
         elif whole is not None:
             last = gains(settings, whole)
-            seam.cut(device, layers, fields, residual, whole, masks, grid, once)
+            lost = seam.lost(device, layers, fields, pairs, strict, clipped, grid)
+            seam.cut(device, layers, fields, residual, whole, masks, grid, once, lost)
         else:
             last = hoped or gains(settings, None)
         return _Aligned(fields, reaches, last.result(), whole)

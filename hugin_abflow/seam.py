@@ -5,13 +5,14 @@ layers that differ although exposure is corrected. In each connected region of s
 to one layer: the one that the softmax favours, with cuts between layers, and at the layers' own
 borders, where they show least. This is a labelling of least energy,
 
-    sum_cells r (1 - s_k)  +  sum_neighbours c (t + t') / 2 [k != k']  +  sum_borders c t
+    sum_cells (r (1 - s_k) + h e_k)  +  sum_neighbours c (t + t') / 2 [k != k']  +  sum_borders c t
 
-with r the residual of low frequencies, t that of all, s_k the share of the softmax and c the price of a cut
-(labelling.py). A cut through somebody who is as bright as what is behind shows in t alone. Regions keep to
-themselves: elsewhere the softmax stays as it is, and the transition lies where the layers agree. What is
-clipped in one photo only is no such difference: it is brighter in the other by an unknown amount, and changes
-over best where it does so slowly.
+with r the residual of low frequencies, t that of all, s_k the share of the softmax, c the price of a cut
+(labelling.py), and h that of what layer k shows clipped and another one not, though as bright, e_k. A cut
+through somebody who is as bright as what is behind shows in t alone. Regions keep to themselves: elsewhere
+the softmax stays as it is, and the transition lies where the layers agree. What is clipped in one photo only
+is no such difference: it is brighter in the other by an unknown amount, and changes over best where it does
+so slowly.
 
 Where there is no flow, layers are not aligned, and each overlap is such a region, whole: on finer cells, with
 the mean square of the difference in place of r and t, since fine texture is as much in the way, and with
@@ -57,11 +58,15 @@ _FINE_CUT = 120.0
 _SHORTER = 0.005
 # No layer is taken where it is not.
 _FORBIDDEN = 1e4
+# Price of a cell that is clipped, and is not in another layer, as of a residual that nothing favours; and by
+# how much, of full scale, that may be darker: what is white here and darker there is something else.
+_CLIPPED, _DARKER = 0.5, 0.05
 # How much more a region may cost if that shows things once and whole, from a layer that has most of it.
 _ONCE, _MOSTLY = 2.0, 0.5
 
 
 Cells = npt.NDArray[np.bool_]  # (height, width) on the seam grid
+Prices = npt.NDArray[np.float64]  # (layers, height, width) on the seam grid
 
 
 @dataclass(frozen=True)
@@ -107,6 +112,34 @@ def residuals(
     return Residuals(mean, np.sqrt(square), told)
 
 
+def lost(
+    device: Device,
+    layers: Sequence[WorkingLayer],
+    fields: Sequence[Buffer],
+    pairs: Sequence[Pair],
+    correction: Correction,
+    clipped: npt.NDArray[np.float32],
+    grid: Grid,
+) -> Prices | None:
+    """What it costs to take what one layer shows clipped, and another one as bright, but not clipped; None:
+    nothing anywhere.
+
+    clipped     by how much more each layer is clipped than another (`highlights.excess`).
+    """
+    if not clipped.any():
+        return None
+    cells = seam_grid(grid)
+    told = np.zeros((len(layers), *cells.shape), bool)
+    all_tells = [(math.inf,) * 4] * len(layers)
+    differences = _differences(device, layers, fields, pairs, correction, grid, cells, all_tells)
+    for pair, found in zip(pairs, differences, strict=True):
+        brighter, both = found[..., :3].mean(-1), found[..., 4] > 0
+        told[pair.a] |= both & (brighter < _DARKER)
+        told[pair.b] |= both & (-brighter < _DARKER)
+    prices: Prices = _CLIPPED * told * _on(cells, clipped)
+    return prices
+
+
 def regions(residual: Residuals, grid: Grid, aligned: bool = True, once: Cells | None = None) -> Cells:
     """Where layers differ too much to be blended, of the same shape; unless they are aligned, texture differs
     everywhere and tells nothing. once: cells that belong to a region whatever the layers show there.
@@ -125,12 +158,14 @@ def cut(
     masks: Masks,
     grid: Grid,
     once: Cells | None = None,
+    lost: Prices | None = None,
 ) -> None:
     """Give each cell of the regions `whole` to one layer: the others lose their colour weight there
     (fields[...].w, in place). A region that has cells of `once` is cut in two only if that is much better.
+    lost: what each layer costs in a cell besides.
     """
     cells = seam_grid(grid)
-    owner = _owners(layers, fields, residual, whole, masks, grid, cells, _CUT, once)
+    owner = _owners(layers, fields, residual, whole, masks, grid, cells, _CUT, once, lost)
     yields = [_soften((whole & (owner != k)).astype(np.float32), cells.wraps) for k in range(len(layers))]
     _yield(device, layers, fields, yields, grid, cells)
 
@@ -166,6 +201,7 @@ def _owners(
     cells: Grid,
     cut_price: float,
     once: Cells | None = None,
+    lost: Prices | None = None,
 ) -> npt.NDArray[np.intp]:
     """The layer of each cell, (height, width): in the regions `whole` the one it is taken from, elsewhere the
     one that the softmax favours, -1 where none is.
@@ -180,7 +216,9 @@ def _owners(
     for region in _connected(whole, cells.wraps):
         rows, columns = np.nonzero(region)
         one = once is not None and bool(once[region].any())
-        owner[rows, columns] = label(rows, columns, residual, shares, cover, cells.wraps, cut_price, one)
+        owner[rows, columns] = label(
+            rows, columns, residual, shares, cover, cells.wraps, cut_price, one, lost
+        )
     return owner
 
 
@@ -310,11 +348,13 @@ def label(
     wraps: bool,
     cut_price: float = _CUT,
     once: bool = False,
+    lost: Prices | None = None,
 ) -> npt.NDArray[np.intp]:
     """Which layer each cell (rows, columns) of a region is taken from: the least energy found.
 
     shares, cover: shares of the softmax and coverage (layers, height, width).
     cut_price: of a cut, in cells.
+    lost: what each layer costs in a cell besides (layers, height, width).
     once: one layer is taken, as far as it goes, if that is not much worse. Somebody may stand there twice,
     and a cut between his two places, or where these overlap, is as cheap as one beside him.
     """
@@ -324,6 +364,8 @@ def label(
     weight, rough = residual.mean[rows, columns], residual.rms[rows, columns]
     present = cover[candidates][:, rows, columns]
     price = np.where(present, weight * (1 - shares[candidates][:, rows, columns]), _FORBIDDEN)
+    if lost is not None:
+        price += lost[candidates][:, rows, columns]
     number = np.full(residual.mean.shape, -1)
     number[rows, columns] = np.arange(rows.size)
     links = []
@@ -355,6 +397,16 @@ def _neighbours(
     if not wraps:
         inside &= (columns >= 0) & (columns < shape[1])
     return inside, (np.clip(rows, 0, shape[0] - 1), columns % shape[1])
+
+
+def _on(cells: Grid, values: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
+    """What arrays (..., height, width) over the same region have at the centres of cells."""
+    row, column = (
+        ((np.arange(to) + 0.5) * of / to).astype(int)
+        for to, of in zip(cells.shape, values.shape[-2:], strict=True)
+    )
+    found: npt.NDArray[np.float32] = values[..., row[:, None], column]
+    return found
 
 
 def _at_centres(

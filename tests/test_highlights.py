@@ -12,7 +12,9 @@ from reference.highlights import highlights_share, highlights_yield
 from scipy import ndimage
 from tolerances import SUM, assert_close
 
-from hugin_abflow import coefficient, highlights
+from hugin_abflow import coefficient, highlights, seam
+from hugin_abflow.colour import Correction
+from hugin_abflow.geometry import Pair
 from hugin_abflow.layer import Canvas, Layer
 from hugin_abflow.opencl import Device
 from hugin_abflow.settings import Settings
@@ -127,3 +129,37 @@ def test_what_is_blown_out_comes_from_the_darker_photo() -> None:
     assert (result[:, 240:, :3] == 255).all()
     means = result[..., 1].mean(0)
     assert np.abs(np.diff(ndimage.uniform_filter1d(means, 5))).max() < 12
+
+
+@pytest.mark.parametrize("light", [0.8, 1.3])
+def test_what_flow_cannot_explain_is_not_taken_from_the_photo_that_clips_it(
+    device: Device, light: float
+) -> None:
+    """The clipped layer has all the softmax's weight, and yields to a grey that is as bright once exposure is
+    corrected; if that is darker it is something else, and stays where it was."""
+    layers, masks = white_and_grey(device)
+    grid = GRIDS["plane"]
+    cells = seam.seam_grid(grid)
+    fields = []
+    for layer, weight in zip(layers, (1e-3, 1.0), strict=True):
+        field = np.zeros((*layer.pixels.shape[:2], 4), np.float32)
+        field[..., 3] = weight
+        fields.append(device.upload(field))
+    gains = []
+    for gain in (2 * light, 1.0):
+        values = np.zeros((*highlights.highlights_grid(grid).shape, 4), np.float32)
+        values[..., :3] = np.log(gain)
+        gains.append(device.upload(values))
+    correction = Correction(highlights.highlights_grid(grid), 0.0, tuple(gains))
+    clipped = highlights.excess(device, layers, masks, grid, Settings())
+    prices = seam.lost(device, layers, fields, [Pair(0, 1)], correction, clipped, grid)
+    assert not prices[0].any()  # grey is never clipped
+    assert (prices[1, 4:, 3:5] == (seam._CLIPPED if light > 1 else 0)).all()
+    assert not prices[1, :, 7:].any()  # alone
+    assert seam.lost(device, layers, fields, [Pair(0, 1)], correction, 0 * clipped, grid) is None
+    whole = np.zeros(cells.shape, bool)
+    whole[3:, 2:6] = True  # columns 15 to 46, below the white corner
+    residual = seam.Residuals(np.full(cells.shape, 0.3), np.zeros(cells.shape))
+    seam.cut(device, layers, fields, residual, whole, masks, grid, lost=prices)
+    grey, white = (field.get()[38:48, 29:33, 3] for field in fields)  # both cover all of the grid
+    assert (grey > 10 * white).all() if light > 1 else (grey < 1e-3 * white).all()

@@ -186,6 +186,29 @@ def test_a_border_counts_as_a_cut() -> None:
         assert (seam.label(rows, columns, residual, shares, cover, False) == taken).all()
 
 
+def test_what_is_clipped_costs_what_its_price_says() -> None:
+    """Where cuts are free, each cell is of the layer that costs least."""
+    random = np.random.default_rng(4)
+    rows, columns = (n.ravel() for n in np.indices((9, 13)))
+    shares = random.dirichlet((1, 1, 1), (9, 13)).transpose(2, 0, 1)
+    lost = random.random((3, 9, 13)) * (random.random((3, 9, 13)) < 0.3)
+    residual, cover = seam.Residuals(np.full((9, 13), 0.3), np.zeros((9, 13))), np.ones((3, 9, 13), bool)
+    found = seam.label(rows, columns, residual, shares, cover, False, lost=lost)
+    assert np.array_equal(found, (0.3 * (1 - shares) + lost).argmin(0).ravel())
+    assert (found != shares.argmax(0).ravel()).mean() > 0.1
+
+
+@pytest.mark.parametrize("size", [(7, 5), (24, 18), (1, 1)])
+def test_cells_read_what_lies_at_their_centres(size: tuple[int, int]) -> None:
+    cells = plane(96, 72).resized(24, 18)
+    values = np.arange(2 * size[0] * size[1], dtype=np.float32).reshape(2, size[1], size[0])
+    found = seam._on(cells, values)
+    for y, x in ((0, 0), (3, 23), (17, 11)):
+        row, column = int((y + 0.5) / 18 * size[1]), int((x + 0.5) / 24 * size[0])
+        assert found[:, y, x].tolist() == values[:, row, column].tolist()
+    assert found.shape == (2, 18, 24)
+
+
 def test_a_border_is_priced_by_all_frequencies() -> None:
     """The same, where a border that differs in low frequencies alone is just worth it."""
     rows, columns = (v.ravel() for v in np.mgrid[0:6, 0:19])
