@@ -348,6 +348,18 @@ def test_a_layer_that_threads_read_to_its_end_holds_no_file(tmp_path, last):
     assert open_files() == before + (not last)
 
 
+def test_a_decoder_that_failed_is_not_used_again(tmp_path):
+    """Where it stands nobody knows."""
+    write_image(tmp_path / "a.tif", noise(np.uint8))
+    rows = read_layer(tmp_path / "a.tif").read.__self__
+    with pytest.raises(ValueError), rows._decoder(0) as failed:
+        raise ValueError
+    with rows._decoder(0) as found:
+        assert found is not failed
+    with rows._decoder(0) as again:
+        assert again is found
+
+
 def test_where_decoding_stands_it_goes_on(tmp_path):
     """Two threads that take turns keep their places."""
     write_image(tmp_path / "a.tif", noise(np.uint8, width=61, height=300))

@@ -9,12 +9,13 @@ import subprocess
 import sys
 from itertools import product
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pyopencl as cl
 import pytest
 
-from hugin_abflow import opencl, spare, working
+from hugin_abflow import flow, opencl, spare, working
 from hugin_abflow.errors import DeviceError
 from hugin_abflow.opencl import Device, kernel_source
 
@@ -92,6 +93,32 @@ def test_files_without_options_are_built_together(monkeypatch: pytest.MonkeyPatc
     assert sorted(device.build("flow", "-DWRAPS=1")) == sorted(kernels_of("flow"))
     sizes = [(len(modules), options) for modules, options in built]
     assert sizes == [(len(MODULES) - 2, ""), (1, "-DWRAPS=1")]
+
+
+@pytest.mark.parametrize("exact", [True, False])
+def test_quotients_are_rounded_as_processors_do_where_devices_can(
+    monkeypatch: pytest.MonkeyPatch, exact: bool
+) -> None:
+    """Compilers refuse the option where they can not."""
+    asked, build = [], cl.Program.build
+    can = cl.device_fp_config.CORRECTLY_ROUNDED_DIVIDE_SQRT if exact else cl.device_fp_config.FMA
+    device = Device()
+    monkeypatch.setattr(opencl, "kernel_source", lambda *modules: "__kernel void nothing() {}")
+    monkeypatch.setattr(device, "device", SimpleNamespace(single_fp_config=can, name="none"))
+    monkeypatch.setattr(cl.Program, "build", lambda self, options: asked.append(options) or build(self))
+    device.build("pyramid")
+    (options,) = asked
+    assert ("-cl-fp32-correctly-rounded-divide-sqrt" in options) == exact
+
+
+def test_the_largest_group_of_a_kernel_can_be_started(device: Device) -> None:
+    most = device.largest_group("flow", "flow_relax_small")
+    assert 0 < most <= device.device.max_work_group_size
+    board = flow.Board.of(device, 1, (5, 3, 0, 0))
+    device.run(
+        "flow", "flow_relax_small", (most, 1, 1), board.grid, board.pitch, 1, 1.5, board.planes, group=most
+    )
+    assert not board.planes.get().any()
 
 
 def test_where_one_file_does_not_build_the_others_do(monkeypatch: pytest.MonkeyPatch) -> None:
