@@ -285,7 +285,7 @@ def _align(
         elif whole is not None:
             last = gains(settings, whole)
             lost = seam.lost(device, layers, fields, pairs, strict, clipped, grid)
-            seam.cut(device, layers, fields, residual, whole, masks, grid, once, lost)
+            seam.cut(device, layers, fields, residual, whole, masks, grid, once=once, lost=lost)
         else:
             last = hoped or gains(settings, None)
         return _Aligned(fields, reaches, last.result(), whole)

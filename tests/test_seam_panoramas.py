@@ -274,9 +274,9 @@ def test_weights_outside_the_regions_stay(device: Device, monkeypatch: pytest.Mo
     """The cut takes weight away only where its cells, blurred by one, reach; a trace is left."""
     seen = {}
 
-    def remember(device, layers, fields, *rest, original=seam.cut):
+    def remember(device, layers, fields, *rest, original=seam.cut, **named):
         seen["before"], seen["regions"] = [f.get() for f in fields], rest[1]
-        original(device, layers, fields, *rest)
+        original(device, layers, fields, *rest, **named)
         seen["after"] = [f.get() for f in fields]
 
     monkeypatch.setattr(seam, "cut", remember)
