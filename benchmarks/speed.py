@@ -60,7 +60,7 @@ def make_layers(folder: Path, width: int) -> None:
 
 def measure(command: list[str]) -> Run:
     """Run a command to its end and ask the system what it took, its children included."""
-    paths = [str(ROOT), *filter(None, [os.environ.get("PYTHONPATH")])]
+    paths = filter(None, [str(ROOT), os.environ.get("PYTHONPATH")])
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(paths)}
     # compiled once, as pip does with what it installs, whatever this shell does
     environment |= {"PYTHONDONTWRITEBYTECODE": "", "PYTHONPYCACHEPREFIX": str(ROOT / "build" / "bytecode")}

@@ -136,7 +136,8 @@ def lost(
         brighter, both = found[..., :3].mean(-1), found[..., 4] > 0
         told[pair.a] |= both & (brighter < _DARKER)
         told[pair.b] |= both & (-brighter < _DARKER)
-    prices: Prices = _CLIPPED * told * _on(cells, clipped)
+    row, column = _centres(cells, clipped.shape)
+    prices: Prices = _CLIPPED * told * clipped[:, row[:, None], column]
     return prices
 
 
@@ -399,14 +400,13 @@ def _neighbours(
     return inside, (np.clip(rows, 0, shape[0] - 1), columns % shape[1])
 
 
-def _on(cells: Grid, values: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
-    """What arrays (..., height, width) over the same region have at the centres of cells."""
+def _centres(cells: Grid, shape: Sequence[int]) -> tuple[npt.NDArray[np.intp], npt.NDArray[np.intp]]:
+    """Rows and columns, of an array (..., height, width) over the same region, at the centres of cells."""
     row, column = (
-        ((np.arange(to) + 0.5) * of / to).astype(int)
-        for to, of in zip(cells.shape, values.shape[-2:], strict=True)
+        ((np.arange(to) + 0.5) * of / to).astype(np.intp)
+        for to, of in zip(cells.shape, shape[-2:], strict=True)
     )
-    found: npt.NDArray[np.float32] = values[..., row[:, None], column]
-    return found
+    return row, column
 
 
 def _at_centres(
@@ -414,8 +414,8 @@ def _at_centres(
 ) -> npt.NDArray[np.float64]:
     """Weights at the cells' centres; 0 outside the layer's box."""
     left, top, width, height = box
-    rows = ((np.arange(cells.height) + 0.5) * grid.height / cells.height).astype(int) - top
-    columns = ((np.arange(cells.width) + 0.5) * grid.width / cells.width).astype(int) - left
+    rows, columns = _centres(cells, grid.shape)
+    rows, columns = rows - top, columns - left
     row_inside, column_inside = (rows >= 0) & (rows < height), (columns >= 0) & (columns < width)
     result = np.zeros(cells.shape)
     result[np.ix_(row_inside, column_inside)] = weights[np.ix_(rows[row_inside], columns[column_inside])]
