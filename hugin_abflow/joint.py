@@ -247,14 +247,14 @@ def _align(
     """
     settled = transition.wanted(flows, settings)
     coefficients = coefficient.coefficients(device, layers, masks, grid, even=settled)
-    clipped = highlights.excess(device, layers, masks, grid, settings)
+    clipped = highlights.measure(device, layers, masks, grid, settings)
     if settled:
-        transition.settle(device, layers, coefficients, flows, masks, grid, settings, clipped.max(0))
+        transition.settle(device, layers, coefficients, flows, masks, grid, settings, clipped.excess.max(0))
     intermediate.settle(device, layers, coefficients, flows, grid, settings)
     fields = geometry.fields(device, layers, coefficients, flows, grid, settings)
     del coefficients
     device.give_back()
-    highlights.give_way(device, layers, fields, clipped, grid)
+    yielded = highlights.give_way(device, layers, fields, clipped, masks, grid)
     measured = colour.measure(device, layers, fields, pairs, grid, masks.host)
     device.give_back()  # two solutions at a time take the most memory
     with ThreadPoolExecutor(2, "gains") as solving:  # each on one core: the device goes on meanwhile
@@ -284,8 +284,10 @@ def _align(
             last, whole = gains(replace(settings, exposure=False), None), None
         elif whole is not None:
             last = gains(settings, whole)
-            lost = seam.lost(device, layers, fields, pairs, strict, clipped, grid)
-            seam.cut(device, layers, fields, residual, whole, masks, grid, once=once, lost=lost)
+            lost = seam.lost(device, layers, fields, pairs, strict, clipped.excess, grid)
+            seam.cut(
+                device, layers, fields, residual, whole, masks, grid, once=once, lost=lost, yielded=yielded
+            )
         else:
             last = hoped or gains(settings, None)
         return _Aligned(fields, reaches, last.result(), whole)

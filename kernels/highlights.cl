@@ -28,18 +28,18 @@ __kernel void highlights_share(__global const float4 *layer, /* (box.w, box.z) r
     share[cy * cells.x + cx] = n > 0.0f ? sum / n : 0.0f;
 }
 
-/* Divide a layer's colour weight by exp(strength) where all is clipped, by less where less is. */
-__kernel void highlights_yield(__global float4 *field,       /* (box.w, box.z) of the working grid; w is scaled */
-                               int4 box, int4 border,        /* place on the working grid, run size; that grid */
-                               __global const float *clipped, /* (cells.y, cells.x), 0..1 */
-                               int4 cells,                   /* highlights grid, over the same region */
-                               float strength)
+/* Divide a layer's colour weight by what the cells tell the logarithm of. */
+__kernel void highlights_yield(__global float4 *field,           /* (box.w, box.z) of the working grid; w is scaled */
+                               int4 box, int4 border,            /* place on the working grid, run size; that grid */
+                               __global const float *logarithms, /* (cells.y, cells.x), 0 or more */
+                               int4 cells)                       /* highlights grid, over the same region */
 {
     const int x = get_global_id(0), y = get_global_id(1);
     if (x >= box.z || y >= box.w)
         return;
     const float2 ratio = (float2)((float)cells.x / border.x, (float)cells.y / border.y);
-    const float share = bilinear_scalar(clipped, (float2)(x + box.x + 0.5f, y + box.y + 0.5f) * ratio, cells);
-    if (share > 0.0f) /* hardly anywhere: elsewhere nothing is read or written */
-        field[y * box.z + x].w *= exponential(-strength * share);
+    const float2 place = (float2)(x + box.x + 0.5f, y + box.y + 0.5f) * ratio;
+    const float logarithm = bilinear_scalar(logarithms, place, cells);
+    if (logarithm > 0.0f) /* hardly anywhere: elsewhere nothing is read or written */
+        field[y * box.z + x].w *= exponential(-logarithm);
 }

@@ -50,13 +50,13 @@ def test_yield_equals_its_twin(device: Device, name: str) -> None:
     grid = GRIDS[name]
     cells = grid.resized(10, 7).border
     box = (5, 0, grid.width - 5, grid.height - 2)
-    clipped = (patches(2, 10, 7, 0.5, 2) * np.random.default_rng(3).random((7, 10))).astype(np.float32)
+    logarithms = (7 * patches(2, 10, 7, 0.5, 2) * np.random.default_rng(3).random((7, 10))).astype(np.float32)
     field = np.random.default_rng(4).normal(size=(box[3], box[2], 4)).astype(np.float32)
     out = device.upload(field)
     device.run(
-        "highlights", "highlights_yield", box[2:], out, box, grid.border, device.upload(clipped), cells, 7.0
+        "highlights", "highlights_yield", box[2:], out, box, grid.border, device.upload(logarithms), cells
     )
-    expected = highlights_yield(field, box, grid.border, clipped, cells, 7.0)
+    expected = highlights_yield(field, box, grid.border, logarithms, cells)
     assert_close(out.get(), expected, 100 * SUM)
     assert np.array_equal(out.get()[..., :3], field[..., :3])
     assert (expected[..., 3] != field[..., 3]).any()
@@ -80,7 +80,7 @@ def white_and_grey(device: Device) -> tuple[list, coefficient.Masks]:
 def test_only_what_another_layer_shows_better_gives_way(device: Device) -> None:
     layers, masks = white_and_grey(device)
     grid = GRIDS["plane"]
-    found = highlights.excess(device, layers, masks, grid, Settings())
+    found = highlights.measure(device, layers, masks, grid, Settings()).excess
     assert found.shape == (2, 3, 5)  # cells of 15.4 x 17.7 px
     assert not found[0].any()
     assert (found[1, 1:, 2] == 1).all()  # both, one of them white
@@ -88,12 +88,43 @@ def test_only_what_another_layer_shows_better_gives_way(device: Device) -> None:
     assert not found[1, :, 4].any()  # alone
 
 
+def test_what_is_clipped_yields_most_where_it_need_not_be_shown(
+    device: Device, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Beside what only the white layer shows it yields less, the nearer the less; with another grey one that
+    reaches further, and is seen over it, nowhere. What it yields by is what its weight is divided by."""
+    monkeypatch.setattr(highlights, "_FAR", 40.0)
+    grid = GRIDS["plane"]
+    grey, white, further = (np.zeros((53, 77, 4), np.float32) for _ in range(3))
+    grey[:, :48], white[:, 16:], further[:, 32:] = (0.5, 0.5, 0.5, 1), 1, (0.4, 0.4, 0.4, 1)
+    for shown in ([grey, white], [grey, white, further]):
+        layers = [on_device(device, one) for one in shown]
+        masks = coefficient.masks(device, layers, grid)
+        clipped = highlights.measure(device, layers, masks, grid, Settings())
+        fields = [device.upload(np.ones((*one.pixels.shape[:2], 4), np.float32)) for one in layers]
+        found = highlights.give_way(device, layers, fields, clipped, masks, grid)
+        assert not found[[0, *range(2, len(layers))]].any()
+        strength = found[1, :, 1:] / np.maximum(clipped.excess[1, :, 1:], 1e-9)
+        if len(layers) == 3:
+            assert (strength == highlights._FULL_STRENGTH).all()
+        else:  # white is alone from the fourth column of cells on, 15.4 px wide: its centre is that far away
+            share = 15.4 / 40
+            smooth = share * share * (3 - 2 * share)
+            between = highlights._STRENGTH * (1 - smooth) + highlights._FULL_STRENGTH * smooth
+            assert strength[:, 1] == pytest.approx(between)
+            assert (strength[:, 0] > between).all()
+            assert (strength[:, 2] == highlights._STRENGTH).all()
+            assert not strength[:, 3].any()
+        middle = fields[1].get()[26, 38, 3]  # a cell's centre
+        assert np.log(middle) == pytest.approx(-found[1, 1, 2], rel=1e-3)
+
+
 def test_not_of_floats_and_not_when_off(device: Device) -> None:
     layers, masks = white_and_grey(device)
     grid = GRIDS["plane"]
-    assert not highlights.excess(device, layers, masks, grid, Settings(highlights=False)).any()
+    assert not highlights.measure(device, layers, masks, grid, Settings(highlights=False)).shares.any()
     floats = [replace(one, layer=replace(one.layer, dtype=np.dtype(np.float32))) for one in layers]
-    assert not highlights.excess(device, floats, masks, grid, Settings()).any()
+    assert not highlights.measure(device, floats, masks, grid, Settings()).shares.any()
 
 
 # The panorama
@@ -131,6 +162,21 @@ def test_what_is_blown_out_comes_from_the_darker_photo() -> None:
     assert np.abs(np.diff(ndimage.uniform_filter1d(means, 5))).max() < 12
 
 
+@pytest.mark.usefixtures(one_device.__name__)
+def test_white_is_not_seen_where_two_darker_photos_meet() -> None:
+    """Whose shared overlap is narrow: the white photo, of the middle, weighs most there. Weights span more
+    than by themselves, as they do where things shift."""
+    noise = ndimage.gaussian_filter(np.random.default_rng(6).normal(size=(HEIGHT, WIDTH)), 3)
+    scene = np.clip(0.65 + 0.1 * noise / noise.std(), 0.55, 0.8)
+    layers = [shot(scene, 1.0, 0, 160), shot(scene, 2.0, 60, 240), shot(scene, 1.0, 145, WIDTH)]
+    result = merged(layers, Canvas.plane(WIDTH, HEIGHT), softmax_sharpness=20.0)[..., 1].astype(float)
+    for left in range(0, WIDTH - 20, 10):
+        here = scene[:, left : left + 20], result[:, left : left + 20]
+        deviations = [one - one.mean(0) for one in here]
+        assert np.corrcoef(*(one.ravel() for one in deviations))[0, 1] > 0.99
+        assert deviations[1].std() > 0.97 * 255 * deviations[0].std()
+
+
 @pytest.mark.parametrize("light", [0.8, 1.3])
 def test_what_flow_cannot_explain_is_not_taken_from_the_photo_that_clips_it(
     device: Device, light: float
@@ -151,7 +197,7 @@ def test_what_flow_cannot_explain_is_not_taken_from_the_photo_that_clips_it(
         values[..., :3] = np.log(gain)
         gains.append(device.upload(values))
     correction = Correction(highlights.highlights_grid(grid), 0.0, tuple(gains))
-    clipped = highlights.excess(device, layers, masks, grid, Settings())
+    clipped = highlights.measure(device, layers, masks, grid, Settings()).excess
     prices = seam.lost(device, layers, fields, [Pair(0, 1)], correction, clipped, grid)
     assert not prices[0].any()  # grey is never clipped
     assert (prices[1, 4:, 3:5] == (seam._CLIPPED if light > 1 else 0)).all()
@@ -163,3 +209,24 @@ def test_what_flow_cannot_explain_is_not_taken_from_the_photo_that_clips_it(
     seam.cut(device, layers, fields, residual, whole, masks, grid, lost=prices)
     grey, white = (field.get()[38:48, 29:33, 3] for field in fields)  # both cover all of the grid
     assert (grey > 10 * white).all() if light > 1 else (grey < 1e-3 * white).all()
+
+
+def test_a_cut_counts_weights_as_they_were_before_layers_gave_way(device: Device) -> None:
+    """What clipped layers lose by there is in `lost`; else they would be left twice."""
+    layers, masks = white_and_grey(device)
+    grid = GRIDS["plane"]
+    cells = seam.seam_grid(grid)
+    whole = np.zeros(cells.shape, bool)
+    whole[3:, 2:6] = True
+    residual = seam.Residuals(np.full(cells.shape, 0.3), np.zeros(cells.shape))
+    yielded = np.zeros((2, *highlights.highlights_grid(grid).shape), np.float32)
+    yielded[1] = 5
+    for given in (None, yielded):
+        fields = [device.upload(np.ones((*one.pixels.shape[:2], 4), np.float32)) for one in layers]
+        for field, weight in zip(fields, (0.1, np.exp(-5)), strict=True):
+            values = field.get()
+            values[..., 3] = weight
+            field.set(values)
+        seam.cut(device, layers, fields, residual, whole, masks, grid, yielded=given)
+        grey, white = (field.get()[38:48, 29:33, 3] for field in fields)
+        assert (grey > white).all() if given is None else (grey < white).all()

@@ -37,15 +37,14 @@ def highlights_yield(
     field: Array,
     box: Sequence[int],
     border: Sequence[int],
-    clipped: Array,
+    logarithms: Array,
     cells: Sequence[int],
-    strength: float,
 ) -> Array:
-    """The weight times exp(-strength * share), between the cells' centres."""
+    """The weight times exp(-logarithm), between the cells' centres."""
     x, y = pixels(box[2], box[3], box[0], box[1])
     total, share = bilinear(
-        clipped, cells, (x + 0.5) * cells[0] / border[0], (y + 0.5) * cells[1] / border[1]
+        logarithms, cells, (x + 0.5) * cells[0] / border[0], (y + 0.5) * cells[1] / border[1]
     )
     result = field.astype(np.float64)
-    result[..., 3] *= np.exp(-strength * total / share)
+    result[..., 3] *= np.exp(-total / share)
     return result
