@@ -4,12 +4,13 @@ Where a photo runs into white (saturation.py), a darker one beside it still has 
 nothing of that. So a layer's colour weight falls with how much more of its surroundings it shows clipped than
 the layer that shows least so,
 
-    s_k <- s_k exp(-strength * e_k),    e_k = c_k - min_j c_j
+    s_k <- s_k exp(-strength_k * e_k),    e_k = c_k - min_j c_j
 
 with c_k the clipped share. As white and what is not differ by an unknown amount, the transition is as wide as
 the overlap allows there (transition.py), and the darker layer is seen nearly up to its border, if there is
-nothing but white beyond. Where darker layers reach beyond each other white need not be shown at all, and the
-strength is as much greater as that takes.
+nothing but white beyond. Where layers that clip less than k, by all that both show, reach beyond each other,
+white need not be shown at all, and the strength is twice as large; towards what layer k has to show white it
+falls.
 """
 
 from __future__ import annotations
@@ -33,10 +34,13 @@ _NEARLY, _SURELY = 0.9, 0.98
 # The softmax's own weights span e^10: with as much, layers are mixed next to the border of the darker one.
 # A little more, as dark spots are not clipped, and what white leaves of these looks like no photo.
 _STRENGTH = 12.0
-# The same far from white that has to be shown: of a clipped layer nothing is seen.
+# Where white need not be shown: the softmax's weights span more than that where things shift.
 _FULL_STRENGTH = 24.0
-# The clipped share of a cell that is white, and how far from such cells, in working pixels, that is.
+# What is clipped as far as this, and no layer shows that clips less, has to be shown, though white; what is
+# clipped less than that yields by no more than _STRENGTH. From so many working pixels on strength is full.
 _WHITE, _FAR = 0.5, 128.0
+# A layer clips less than another if this part of what both show clipped, together, is the other one's alone.
+_LESS = 0.25
 
 Cells = npt.NDArray[np.float32]  # (layers, height, width) on the highlights grid
 
@@ -45,7 +49,7 @@ Cells = npt.NDArray[np.float32]  # (layers, height, width) on the highlights gri
 class Clipped:
     """How much of each layer is clipped, 0..1.
 
-    shares  c_k, 0 where the layer is not.
+    shares  c_k of the pixels that the layer covers, 0 where it is not.
     excess  e_k, 0 where the layer is not, where it is alone, and where all are clipped alike.
     """
 
@@ -86,38 +90,69 @@ def give_way(
     masks: Masks,
     grid: Grid,
 ) -> Cells:
-    """Divide the colour weights of fields (geometry.py), in place, by what the result is the logarithm of."""
-    cells = highlights_grid(grid)
-    logarithms = np.zeros_like(clipped.excess)
-    if not clipped.excess.any():
-        return logarithms
-    inside, whole = (on_cells(masks.host, cells, rule) for rule in (np.logical_or, np.logical_and))
-    for k, (layer, field, excess) in enumerate(zip(layers, fields, clipped.excess, strict=True)):
-        if excess.any():
-            bound = inside[k] & (clipped.shares[k] > _WHITE) & ~_shown_darker(k, clipped, inside, whole)
-            logarithms[k] = excess * _strength(device, bound, np.logical_or.reduce(inside, 0), grid)
-            device.run(
-                "highlights", "highlights_yield", layer.box[2:], field, layer.box, grid.border,
-                device.upload(logarithms[k]), cells.border,
-            )  # fmt: skip
-    return logarithms
+    """Lower the colour weights of fields (geometry.py), in place.
 
-
-def _shown_darker(index: int, clipped: Clipped, inside: Mask, whole: Mask) -> Mask:
-    """The cells that layers show whole which clip less than one, where both are, (height, width)."""
-    more = np.sum((clipped.shares[index] - clipped.shares) * (inside & inside[index]), (1, 2))
-    return np.asarray(whole[more > 0].any(0))
-
-
-def _strength(device: Device, bound: Mask, cover: Mask, grid: Grid) -> npt.NDArray[np.float32]:
-    """How strongly a layer gives way, (height, width) on the highlights grid: less near `bound`, where it is
-    to be shown, though white. cover: where any layer is.
+    Returns by how much more than if white had to be shown everywhere: the weights are divided by the
+    exponential of this, 0 or more, bilinear between the cells.
     """
     cells = highlights_grid(grid)
+    further = np.zeros_like(clipped.excess)
+    if not clipped.excess.any():
+        return further
+    bounds = _bounds(clipped, masks, cells)
+    for k, (layer, field, excess) in enumerate(zip(layers, fields, clipped.excess, strict=True)):
+        if excess.any():
+            further[k] = excess * _further(device, bounds[k], grid)
+            device.run(
+                "highlights", "highlights_yield", layer.box[2:], field, layer.box, grid.border,
+                device.upload(_STRENGTH * excess + further[k]), cells.border,
+            )  # fmt: skip
+    return further
+
+
+def regain(
+    device: Device,
+    layers: Sequence[WorkingLayer],
+    fields: Sequence[Buffer],
+    further: Cells,
+    there: Mask,
+    grid: Grid,
+) -> None:
+    """Have weights be as if white had to be shown, in some cells.
+
+    further     what `give_way` returned.
+    there       (height, width) on any grid over the region.
+    """
+    part, part_cells = device.upload(there, np.float32), (*there.shape[::-1], *grid.border[2:])
+    for layer, field, one in zip(layers, fields, further, strict=True):
+        if one.any():
+            device.run(
+                "highlights", "highlights_regain", layer.box[2:], field, layer.box, grid.border,
+                device.upload(one), highlights_grid(grid).border, part, part_cells,
+            )  # fmt: skip
+
+
+def _bounds(clipped: Clipped, masks: Masks, cells: Grid) -> npt.NDArray[np.bool_]:
+    """What each layer has to show, though white, (layers, height, width): no layer shows it that clips less
+    than it, by all that both show.
+    """
+    count = len(clipped.shares)
+    shares = clipped.shares.reshape(count, -1).astype(np.float64)
+    whole = on_cells(masks.host, cells, np.logical_and).reshape(count, -1)
+    where_both = (shares * whole) @ whole.T  # [j, k]: what j shows clipped, of what k shows as well
+    less = where_both.T - where_both > _LESS * (where_both.T + where_both)  # [j, k]: j clips less than k
+    replaced = less.T.astype(np.float32) @ whole.astype(np.float32) > 0
+    return np.asarray((clipped.shares > _WHITE) & ~replaced.reshape(clipped.shares.shape))
+
+
+def _further(device: Device, bound: Mask, grid: Grid) -> npt.NDArray[np.float32]:
+    """How much stronger than _STRENGTH, (height, width) on the highlights grid: from 0 at `bound` on."""
+    cells = highlights_grid(grid)
+    most = np.float32(_FULL_STRENGTH - _STRENGTH)
     if not bound.any():
-        return np.full(cells.shape, _FULL_STRENGTH, np.float32)
-    free = Masks(cells, (device.upload(~bound, np.uint8),), ~bound[None])
-    off = distance(device, free, 0, device.upload(cover, np.uint8), grid).get()
+        return np.full(cells.shape, most)
+    free, everywhere = ~bound, np.ones(cells.shape, np.uint8)
+    masks = Masks(cells, (device.upload(free, np.uint8),), free[None])
+    off = distance(device, masks, 0, device.upload(everywhere), grid).get()
     off = np.minimum(off / np.float32(_FAR), 1)
-    smooth = off * off * (3 - 2 * off)
-    return np.asarray(_STRENGTH + (_FULL_STRENGTH - _STRENGTH) * smooth, np.float32)
+    return np.asarray(most * off * off * (3 - 2 * off), np.float32)

@@ -254,7 +254,7 @@ def _align(
     fields = geometry.fields(device, layers, coefficients, flows, grid, settings)
     del coefficients
     device.give_back()
-    yielded = highlights.give_way(device, layers, fields, clipped, masks, grid)
+    further = highlights.give_way(device, layers, fields, clipped, masks, grid)
     measured = colour.measure(device, layers, fields, pairs, grid, masks.host)
     device.give_back()  # two solutions at a time take the most memory
     with ThreadPoolExecutor(2, "gains") as solving:  # each on one core: the device goes on meanwhile
@@ -285,9 +285,8 @@ def _align(
         elif whole is not None:
             last = gains(settings, whole)
             lost = seam.lost(device, layers, fields, pairs, strict, clipped.excess, grid)
-            seam.cut(
-                device, layers, fields, residual, whole, masks, grid, once=once, lost=lost, yielded=yielded
-            )
+            highlights.regain(device, layers, fields, further, whole, grid)
+            seam.cut(device, layers, fields, residual, whole, masks, grid, once=once, lost=lost)
         else:
             last = hoped or gains(settings, None)
         return _Aligned(fields, reaches, last.result(), whole)

@@ -160,19 +160,13 @@ def cut(
     grid: Grid,
     once: Cells | None = None,
     lost: Prices | None = None,
-    yielded: npt.NDArray[np.float32] | None = None,
 ) -> None:
     """Give each cell of the regions `whole` to one layer: the others lose their colour weight there
     (fields[...].w, in place). A region that has cells of `once` is cut in two only if that is much better.
-    lost: what each layer costs in a cell besides. yielded: by what logarithms the weights were divided for
-    that (`highlights.give_way`): it is not counted twice.
+    lost: what each layer costs in a cell besides.
     """
     cells = seam_grid(grid)
-    weights = _weights(layers, fields, grid, cells)
-    if yielded is not None:
-        row, column = _centres(cells, yielded.shape)
-        weights *= np.exp(yielded[:, row[:, None], column])
-    owner = _owners(weights, residual, whole, masks, cells, _CUT, once, lost)
+    owner = _owners(layers, fields, residual, whole, masks, grid, cells, _CUT, once, lost)
     yields = [_soften((whole & (owner != k)).astype(np.float32), cells.wraps) for k in range(len(layers))]
     _yield(device, layers, fields, yields, grid, cells)
 
@@ -193,34 +187,32 @@ def divide(
     for found in _differences(device, layers, fields, pairs, correction, grid, cells, all_tells):
         square = np.maximum(square, np.where(found[..., 4] > 0, _SHORTER + found[..., 3], 0))
     whole = square > 0
-    weights = _weights(layers, fields, grid, cells)
-    owner = _owners(weights, Residuals(square, square), whole, masks, cells, _FINE_CUT)
+    owner = _owners(layers, fields, Residuals(square, square), whole, masks, grid, cells, _FINE_CUT)
     yields = [(whole & (owner != k)).astype(np.float32) for k in range(len(layers))]
     _yield(device, layers, fields, yields, grid, cells)
 
 
-def _weights(layers: Sequence[WorkingLayer], fields: Sequence[Buffer], grid: Grid, cells: Grid) -> Prices:
-    """The layers' colour weights at the cells' centres."""
-    weights = [_at_centres(f.get()[..., 3], k.box, grid, cells) for f, k in zip(fields, layers, strict=True)]
-    return np.stack(weights)
-
-
 def _owners(
-    weights: Prices,
+    layers: Sequence[WorkingLayer],
+    fields: Sequence[Buffer],
     residual: Residuals,
     whole: npt.NDArray[np.bool_],
     masks: Masks,
+    grid: Grid,
     cells: Grid,
     cut_price: float,
     once: Cells | None = None,
     lost: Prices | None = None,
 ) -> npt.NDArray[np.intp]:
     """The layer of each cell, (height, width): in the regions `whole` the one it is taken from, elsewhere the
-    one that has the largest of `weights`, (layers, height, width), -1 where none is.
+    one that the softmax favours, -1 where none is.
     """
     cover = on_cells(masks.host, cells, np.logical_and)
     residual = _completed(residual, cover, cells.wraps)
-    shares = weights / np.maximum(weights.sum(0), 1e-12)
+    shares = np.stack(
+        [_at_centres(f.get()[..., 3], k.box, grid, cells) for f, k in zip(fields, layers, strict=True)]
+    )
+    shares /= np.maximum(shares.sum(0), 1e-12)
     owner = np.where(cover.any(0), (shares * cover).argmax(0), -1)
     for region in _connected(whole, cells.wraps):
         rows, columns = np.nonzero(region)

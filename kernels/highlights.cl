@@ -43,3 +43,21 @@ __kernel void highlights_yield(__global float4 *field,           /* (box.w, box.
     if (logarithm > 0.0f) /* hardly anywhere: elsewhere nothing is read or written */
         field[y * box.z + x].w *= exponential(-logarithm);
 }
+
+/* The reverse of highlights_yield, as far as the cells of another grid over the same region tell. */
+__kernel void highlights_regain(__global float4 *field,           /* (box.w, box.z) of the working grid; w is scaled */
+                                int4 box, int4 border,            /* place on the working grid, run size; that grid */
+                                __global const float *logarithms, /* (cells.y, cells.x), 0 or more */
+                                int4 cells,                       /* highlights grid */
+                                __global const float *part,       /* (part_cells.y, part_cells.x), 0..1 */
+                                int4 part_cells)
+{
+    const int x = get_global_id(0), y = get_global_id(1);
+    if (x >= box.z || y >= box.w)
+        return;
+    const float2 place = (float2)(x + box.x + 0.5f, y + box.y + 0.5f) / (float2)(border.x, border.y);
+    const float2 on_part = place * (float2)(part_cells.x, part_cells.y), on_cells = place * (float2)(cells.x, cells.y);
+    const float share = bilinear_scalar(part, on_part, part_cells);
+    if (share > 0.0f)
+        field[y * box.z + x].w *= exponential(share * bilinear_scalar(logarithms, on_cells, cells));
+}

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from grids import GRIDS, on_device, patches, random_layer
 from pictures import merged, one_device
-from reference.highlights import highlights_share, highlights_yield
+from reference.highlights import highlights_regain, highlights_share, highlights_yield
 from scipy import ndimage
 from tolerances import SUM, assert_close
 
@@ -62,6 +62,29 @@ def test_yield_equals_its_twin(device: Device, name: str) -> None:
     assert (expected[..., 3] != field[..., 3]).any()
 
 
+@pytest.mark.parametrize("name", list(GRIDS))
+def test_regain_equals_its_twin(device: Device, name: str) -> None:
+    """And is the reverse of yielding, where all is to be regained."""
+    grid = GRIDS[name]
+    cells, part_cells = grid.resized(10, 7).border, grid.resized(19, 15).border
+    box = (5, 0, grid.width - 5, grid.height - 2)
+    logarithms = (20 * np.random.default_rng(3).random((7, 10))).astype(np.float32)
+    field = np.random.default_rng(4).normal(size=(box[3], box[2], 4)).astype(np.float32)
+    some = patches(5, 19, 15, 0.5, 3).astype(np.float32)
+    for part in (some, np.ones_like(some)):
+        out, on_cells = device.upload(field), device.upload(logarithms)
+        device.run("highlights", "highlights_yield", box[2:], out, box, grid.border, on_cells, cells)
+        yielded = out.get()
+        device.run(
+            "highlights", "highlights_regain", box[2:], out, box, grid.border, on_cells, cells,
+            device.upload(part), part_cells,
+        )  # fmt: skip
+        expected = highlights_regain(yielded, box, grid.border, logarithms, cells, part, part_cells)
+        assert np.allclose(out.get(), expected, 1e-4, 0)
+    assert (yielded[..., 3] != field[..., 3]).all()
+    assert np.allclose(out.get(), field, 1e-4, 0)
+
+
 # Which cells
 
 
@@ -88,35 +111,78 @@ def test_only_what_another_layer_shows_better_gives_way(device: Device) -> None:
     assert not found[1, :, 4].any()  # alone
 
 
-def test_what_is_clipped_yields_most_where_it_need_not_be_shown(
+def strips(device: Device, *shown: tuple[int, int, float]) -> tuple[list, coefficient.Masks]:
+    """Layers of one brightness each, of the plane's columns from one on up to another."""
+    layers = []
+    for left, right, value in shown:
+        pixels = np.zeros((53, 77, 4), np.float32)
+        pixels[:, left:right] = (value, value, value, 1)
+        layers.append(on_device(device, pixels))
+    return layers, coefficient.masks(device, layers, GRIDS["plane"])
+
+
+def yielding(device: Device, *shown: tuple[int, int, float]) -> tuple[np.ndarray, np.ndarray]:
+    """By how much more the layers give way, per cell, and the logarithms of weights that were 1."""
+    layers, masks = strips(device, *shown)
+    grid = GRIDS["plane"]
+    clipped = highlights.measure(device, layers, masks, grid, Settings())
+    fields = [device.upload(np.ones((53, 77, 4), np.float32)) for _ in layers]
+    further = highlights.give_way(device, layers, fields, clipped, masks, grid)
+    return further, np.log([field.get()[..., 3] for field in fields])
+
+
+MORE = highlights._FULL_STRENGTH - highlights._STRENGTH
+
+
+def test_what_is_clipped_yields_less_near_what_has_to_be_shown_white(
     device: Device, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Beside what only the white layer shows it yields less, the nearer the less; with another grey one that
-    reaches further, and is seen over it, nowhere. What it yields by is what its weight is divided by."""
-    monkeypatch.setattr(highlights, "_FAR", 40.0)
+    """White is alone from column 48 on, in the fourth of the cells of 15.4 px."""
+    for far, share in ((40.0, 15.4 / 40), (10.0, 1.0)):
+        monkeypatch.setattr(highlights, "_FAR", far)
+        further, weights = yielding(device, (0, 48, 0.5), (16, 77, 1.0))
+        assert not further[0].any()
+        assert further[1, :, 2] == pytest.approx(MORE * share * share * (3 - 2 * share))
+        assert (further[1, :, 1] > further[1, :, 2] - (share == 1)).all()
+        assert not further[1, :, 3:].any()
+        # at the centre of a cell
+        assert weights[1, 26, 38] == pytest.approx(-highlights._STRENGTH - further[1, 1, 2], rel=1e-3)
+
+
+@pytest.mark.parametrize("third", [(32, 77, 0.4), (40, 77, 0.94)])
+def test_what_is_clipped_yields_most_where_others_show_all(
+    device: Device, third: tuple[int, int, float]
+) -> None:
+    """Also where a layer is clipped itself, but less: half, and nothing of that counts there."""
+    further, _ = yielding(device, (0, 48, 0.5), (16, 77, 1.0), third)
+    assert (further[1, :, 1:3] == MORE).all()
+    assert further[1, :, 4] == pytest.approx(MORE if third[2] < 0.9 else MORE / 2, abs=1e-3)
+    assert not further[0].any()
+
+
+@pytest.mark.parametrize("third", [(32, 77, 1.0), (32, 77, 0.975), (70, 77, 0.4)])
+def test_layers_that_clip_as_much_or_do_not_reach_far_enough_replace_no_white(
+    device: Device, third: tuple[int, int, float]
+) -> None:
+    """Or nearly as much: it must not depend on noise."""
+    further, _ = yielding(device, (0, 48, 0.5), (16, 77, 1.0), third)
+    assert (further[1] < 0.5 * MORE).all()
+    assert not further[1, :, 3].any()
+
+
+def test_what_is_alone_but_not_white_holds_no_yield_back(device: Device) -> None:
+    """A quarter of it is clipped."""
+    layers, masks = strips(device, (0, 48, 0.5), (16, 77, 0.92))
+    white = np.zeros((53, 77, 4), np.float32)
+    white[:, 16:] = (0.92, 0.92, 0.92, 1)
+    white[:, 16:40, :3] = 1
+    layers[1] = on_device(device, white)
     grid = GRIDS["plane"]
-    grey, white, further = (np.zeros((53, 77, 4), np.float32) for _ in range(3))
-    grey[:, :48], white[:, 16:], further[:, 32:] = (0.5, 0.5, 0.5, 1), 1, (0.4, 0.4, 0.4, 1)
-    for shown in ([grey, white], [grey, white, further]):
-        layers = [on_device(device, one) for one in shown]
-        masks = coefficient.masks(device, layers, grid)
-        clipped = highlights.measure(device, layers, masks, grid, Settings())
-        fields = [device.upload(np.ones((*one.pixels.shape[:2], 4), np.float32)) for one in layers]
-        found = highlights.give_way(device, layers, fields, clipped, masks, grid)
-        assert not found[[0, *range(2, len(layers))]].any()
-        strength = found[1, :, 1:] / np.maximum(clipped.excess[1, :, 1:], 1e-9)
-        if len(layers) == 3:
-            assert (strength == highlights._FULL_STRENGTH).all()
-        else:  # white is alone from the fourth column of cells on, 15.4 px wide: its centre is that far away
-            share = 15.4 / 40
-            smooth = share * share * (3 - 2 * share)
-            between = highlights._STRENGTH * (1 - smooth) + highlights._FULL_STRENGTH * smooth
-            assert strength[:, 1] == pytest.approx(between)
-            assert (strength[:, 0] > between).all()
-            assert (strength[:, 2] == highlights._STRENGTH).all()
-            assert not strength[:, 3].any()
-        middle = fields[1].get()[26, 38, 3]  # a cell's centre
-        assert np.log(middle) == pytest.approx(-found[1, 1, 2], rel=1e-3)
+    clipped = highlights.measure(device, layers, masks, grid, Settings())
+    fields = [device.upload(np.ones((53, 77, 4), np.float32)) for _ in layers]
+    further = highlights.give_way(device, layers, fields, clipped, masks, grid)
+    assert further[1] == pytest.approx(MORE * clipped.excess[1])
+    assert ((clipped.excess[1] > 0.1) & (clipped.excess[1] < 0.9)).any()
 
 
 def test_not_of_floats_and_not_when_off(device: Device) -> None:
@@ -211,22 +277,24 @@ def test_what_flow_cannot_explain_is_not_taken_from_the_photo_that_clips_it(
     assert (grey > 10 * white).all() if light > 1 else (grey < 1e-3 * white).all()
 
 
-def test_a_cut_counts_weights_as_they_were_before_layers_gave_way(device: Device) -> None:
-    """What clipped layers lose by there is in `lost`; else they would be left twice."""
-    layers, masks = white_and_grey(device)
+def test_what_is_cut_out_of_a_layer_that_gave_way_is_that_layers(device: Device) -> None:
+    """A region that goes to the clipped layer, since what the other one shows is darker: no ghost of that."""
+    layers, masks = strips(device, (0, 48, 0.5), (16, 77, 1.0), (32, 77, 0.4))
     grid = GRIDS["plane"]
     cells = seam.seam_grid(grid)
     whole = np.zeros(cells.shape, bool)
     whole[3:, 2:6] = True
     residual = seam.Residuals(np.full(cells.shape, 0.3), np.zeros(cells.shape))
-    yielded = np.zeros((2, *highlights.highlights_grid(grid).shape), np.float32)
-    yielded[1] = 5
-    for given in (None, yielded):
-        fields = [device.upload(np.ones((*one.pixels.shape[:2], 4), np.float32)) for one in layers]
-        for field, weight in zip(fields, (0.1, np.exp(-5)), strict=True):
-            values = field.get()
-            values[..., 3] = weight
-            field.set(values)
-        seam.cut(device, layers, fields, residual, whole, masks, grid, yielded=given)
-        grey, white = (field.get()[38:48, 29:33, 3] for field in fields)
-        assert (grey > white).all() if given is None else (grey < white).all()
+    fields = []
+    for layer, weight in zip(layers, (1.0, 1.0, 0.0), strict=True):
+        field = np.zeros((*layer.pixels.shape[:2], 4), np.float32)
+        field[..., 3] = weight
+        fields.append(device.upload(field))
+    clipped = highlights.measure(device, layers, masks, grid, Settings())
+    further = highlights.give_way(device, layers, fields, clipped, masks, grid)
+    prices = np.zeros((3, *cells.shape))
+    prices[[0, 2]] = 5
+    highlights.regain(device, layers, fields, further, whole, grid)
+    seam.cut(device, layers, fields, residual, whole, masks, grid, lost=prices)
+    grey, white, _ = (field.get()[38:48, 34, 3] for field in fields)
+    assert (white > 100 * grey).all()

@@ -48,3 +48,23 @@ def highlights_yield(
     result = field.astype(np.float64)
     result[..., 3] *= np.exp(-total / share)
     return result
+
+
+def highlights_regain(
+    field: Array,
+    box: Sequence[int],
+    border: Sequence[int],
+    logarithms: Array,
+    cells: Sequence[int],
+    part: Array,
+    part_cells: Sequence[int],
+) -> Array:
+    """The weight times exp(part * logarithm), each between the centres of its own cells."""
+    x, y = pixels(box[2], box[3], box[0], box[1])
+    values = []
+    for of, on in ((logarithms, cells), (part, part_cells)):
+        total, share = bilinear(of, on, (x + 0.5) * on[0] / border[0], (y + 0.5) * on[1] / border[1])
+        values.append(total / share)
+    result = field.astype(np.float64)
+    result[..., 3] *= np.exp(values[0] * values[1])
+    return result
