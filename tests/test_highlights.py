@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -16,7 +17,7 @@ from hugin_abflow import coefficient, highlights, seam
 from hugin_abflow.colour import Correction
 from hugin_abflow.geometry import Pair
 from hugin_abflow.layer import Canvas, Layer
-from hugin_abflow.opencl import Device
+from hugin_abflow.opencl import Buffer, Device
 from hugin_abflow.settings import Settings
 
 __all__ = ["one_device"]
@@ -121,14 +122,25 @@ def strips(device: Device, *shown: tuple[int, int, float]) -> tuple[list, coeffi
     return layers, coefficient.masks(device, layers, GRIDS["plane"])
 
 
-def yielding(device: Device, *shown: tuple[int, int, float]) -> tuple[np.ndarray, np.ndarray]:
-    """By how much more the layers give way, per cell, and the logarithms of weights that were 1."""
-    layers, masks = strips(device, *shown)
+def weighted(device: Device, layers: list, weights: Sequence[float]) -> list[Buffer]:
+    """Fields of layers that stay where they are, with one weight each."""
+    fields = []
+    for layer, weight in zip(layers, weights, strict=True):
+        field = np.zeros((*layer.pixels.shape[:2], 4), np.float32)
+        field[..., 3] = weight
+        fields.append(device.upload(field))
+    return fields
+
+
+def yielding(device: Device, layers: list, masks: coefficient.Masks) -> tuple[np.ndarray, ...]:
+    """By how much more layers give way, and how much more they clip, per cell; and the logarithms of weights
+    that were 1.
+    """
     grid = GRIDS["plane"]
     clipped = highlights.measure(device, layers, masks, grid, Settings())
-    fields = [device.upload(np.ones((53, 77, 4), np.float32)) for _ in layers]
+    fields = weighted(device, layers, [1.0] * len(layers))
     further = highlights.give_way(device, layers, fields, clipped, masks, grid)
-    return further, np.log([field.get()[..., 3] for field in fields])
+    return further, clipped.excess, np.log([field.get()[..., 3] for field in fields])
 
 
 MORE = highlights._FULL_STRENGTH - highlights._STRENGTH
@@ -140,7 +152,7 @@ def test_what_is_clipped_yields_less_near_what_has_to_be_shown_white(
     """White is alone from column 48 on, in the fourth of the cells of 15.4 px."""
     for far, share in ((40.0, 15.4 / 40), (10.0, 1.0)):
         monkeypatch.setattr(highlights, "_FAR", far)
-        further, weights = yielding(device, (0, 48, 0.5), (16, 77, 1.0))
+        further, _, weights = yielding(device, *strips(device, (0, 48, 0.5), (16, 77, 1.0)))
         assert not further[0].any()
         assert further[1, :, 2] == pytest.approx(MORE * share * share * (3 - 2 * share))
         assert (further[1, :, 1] > further[1, :, 2] - (share == 1)).all()
@@ -154,7 +166,7 @@ def test_what_is_clipped_yields_most_where_others_show_all(
     device: Device, third: tuple[int, int, float]
 ) -> None:
     """Also where a layer is clipped itself, but less: half, and nothing of that counts there."""
-    further, _ = yielding(device, (0, 48, 0.5), (16, 77, 1.0), third)
+    further, _, _ = yielding(device, *strips(device, (0, 48, 0.5), (16, 77, 1.0), third))
     assert (further[1, :, 1:3] == MORE).all()
     assert further[1, :, 4] == pytest.approx(MORE if third[2] < 0.9 else MORE / 2, abs=1e-3)
     assert not further[0].any()
@@ -165,7 +177,7 @@ def test_layers_that_clip_as_much_or_do_not_reach_far_enough_replace_no_white(
     device: Device, third: tuple[int, int, float]
 ) -> None:
     """Or nearly as much: it must not depend on noise."""
-    further, _ = yielding(device, (0, 48, 0.5), (16, 77, 1.0), third)
+    further, _, _ = yielding(device, *strips(device, (0, 48, 0.5), (16, 77, 1.0), third))
     assert (further[1] < 0.5 * MORE).all()
     assert not further[1, :, 3].any()
 
@@ -177,12 +189,9 @@ def test_what_is_alone_but_not_white_holds_no_yield_back(device: Device) -> None
     white[:, 16:] = (0.92, 0.92, 0.92, 1)
     white[:, 16:40, :3] = 1
     layers[1] = on_device(device, white)
-    grid = GRIDS["plane"]
-    clipped = highlights.measure(device, layers, masks, grid, Settings())
-    fields = [device.upload(np.ones((53, 77, 4), np.float32)) for _ in layers]
-    further = highlights.give_way(device, layers, fields, clipped, masks, grid)
-    assert further[1] == pytest.approx(MORE * clipped.excess[1])
-    assert ((clipped.excess[1] > 0.1) & (clipped.excess[1] < 0.9)).any()
+    further, excess, _ = yielding(device, layers, masks)
+    assert further[1] == pytest.approx(MORE * excess[1])
+    assert ((excess[1] > 0.1) & (excess[1] < 0.9)).any()
 
 
 def test_not_of_floats_and_not_when_off(device: Device) -> None:
@@ -252,11 +261,7 @@ def test_what_flow_cannot_explain_is_not_taken_from_the_photo_that_clips_it(
     layers, masks = white_and_grey(device)
     grid = GRIDS["plane"]
     cells = seam.seam_grid(grid)
-    fields = []
-    for layer, weight in zip(layers, (1e-3, 1.0), strict=True):
-        field = np.zeros((*layer.pixels.shape[:2], 4), np.float32)
-        field[..., 3] = weight
-        fields.append(device.upload(field))
+    fields = weighted(device, layers, (1e-3, 1.0))
     gains = []
     for gain in (2 * light, 1.0):
         values = np.zeros((*highlights.highlights_grid(grid).shape, 4), np.float32)
@@ -285,11 +290,7 @@ def test_what_is_cut_out_of_a_layer_that_gave_way_is_that_layers(device: Device)
     whole = np.zeros(cells.shape, bool)
     whole[3:, 2:6] = True
     residual = seam.Residuals(np.full(cells.shape, 0.3), np.zeros(cells.shape))
-    fields = []
-    for layer, weight in zip(layers, (1.0, 1.0, 0.0), strict=True):
-        field = np.zeros((*layer.pixels.shape[:2], 4), np.float32)
-        field[..., 3] = weight
-        fields.append(device.upload(field))
+    fields = weighted(device, layers, (1.0, 1.0, 0.0))
     clipped = highlights.measure(device, layers, masks, grid, Settings())
     further = highlights.give_way(device, layers, fields, clipped, masks, grid)
     prices = np.zeros((3, *cells.shape))

@@ -33,6 +33,13 @@ def highlights_share(
     return result
 
 
+def _on_pixels(values: Array, cells: Sequence[int], box: Sequence[int], border: Sequence[int]) -> Array:
+    """What cells tell of a box's pixels, between the cells' centres."""
+    x, y = pixels(box[2], box[3], box[0], box[1])
+    total, share = bilinear(values, cells, (x + 0.5) * cells[0] / border[0], (y + 0.5) * cells[1] / border[1])
+    return total / share
+
+
 def highlights_yield(
     field: Array,
     box: Sequence[int],
@@ -40,13 +47,9 @@ def highlights_yield(
     logarithms: Array,
     cells: Sequence[int],
 ) -> Array:
-    """The weight times exp(-logarithm), between the cells' centres."""
-    x, y = pixels(box[2], box[3], box[0], box[1])
-    total, share = bilinear(
-        logarithms, cells, (x + 0.5) * cells[0] / border[0], (y + 0.5) * cells[1] / border[1]
-    )
+    """The weight times exp(-logarithm)."""
     result = field.astype(np.float64)
-    result[..., 3] *= np.exp(-total / share)
+    result[..., 3] *= np.exp(-_on_pixels(logarithms, cells, box, border))
     return result
 
 
@@ -59,12 +62,8 @@ def highlights_regain(
     part: Array,
     part_cells: Sequence[int],
 ) -> Array:
-    """The weight times exp(part * logarithm), each between the centres of its own cells."""
-    x, y = pixels(box[2], box[3], box[0], box[1])
-    values = []
-    for of, on in ((logarithms, cells), (part, part_cells)):
-        total, share = bilinear(of, on, (x + 0.5) * on[0] / border[0], (y + 0.5) * on[1] / border[1])
-        values.append(total / share)
+    """The weight times exp(part * logarithm)."""
+    logarithm, share = (_on_pixels(v, on, box, border) for v, on in ((logarithms, cells), (part, part_cells)))
     result = field.astype(np.float64)
-    result[..., 3] *= np.exp(values[0] * values[1])
+    result[..., 3] *= np.exp(share * logarithm)
     return result
