@@ -103,45 +103,69 @@ static inline int intermediate_nearest(float2 u, int4 grid) {
     return grid_index((int2)(grid.z ? p.x : LIMITED(p.x, 0, grid.x - 1), LIMITED(p.y, 0, grid.y - 1)), grid);
 }
 
-/* Where a thing that is narrower than its way passes, no flow that starts there is the thing's. So each flow that leads
-   back tells the four pixels around the place through which it passes; of those that differ from what is there already
-   a pixel listens to the one that differs most. It is called for the flow of a and for that of b, to find by how much;
-   and then once more, to find the flows. */
-__kernel void intermediate_pass(__global const float2 *flow, /* (grid.y, grid.x) of one layer to the other, px */
-                                __global const float2 *back, /* (grid.y, grid.x) the other layer's */
-                                int4 grid,                   /* chart; run size */
-                                __global const float *share, /* (grid.y, grid.x) of b */
-                                __global const float2 *through, /* (grid.y, grid.x) what is there, from a to b */
-                                int other,                   /* 0: the flow is that of a; 1: of b */
-                                int named,                   /* 0: the difference is found; 1: whose it is */
-                                __global uint *furthest,     /* (grid.y, grid.x) bits of the squared difference */
-                                __global uint *source)       /* (grid.y, grid.x) 0: none; 1 + pixel, of b: + all */
+/* Where a flow that leads back passes: the pixel from which on the four around that place lie, its row and, in the
+   lowest bits, its column, each and 1, for there may be one beside the grid; -1 for others. */
+__kernel void intermediate_follow(__global const float2 *flow, /* (grid.y, grid.x) F_ab, px */
+                                  __global const float2 *back, /* (grid.y, grid.x) F_ba, px */
+                                  int4 grid,                   /* chart; run size: grid.x, grid.y, 2 */
+                                  __global const float *share, /* (grid.y, grid.x) of b */
+                                  int bits,                    /* so many that grid.x has no more */
+                                  __global int *places)        /* (2, grid.y, grid.x) of F_ab and of F_ba */
 {
-    const int x = get_global_id(0), y = get_global_id(1);
+    const int x = get_global_id(0), y = get_global_id(1), other = get_global_id(2);
     if (x >= grid.x || y >= grid.y)
         return;
-    const int at = y * grid.x + x;
-    const float2 f = flow[at], start = (float2)(x + 0.5f, y + 0.5f);
-    if (!(square2(f) > INTERMEDIATE_ALIKE && square2(f + bilinear_flow(back, start + f, grid)) < INTERMEDIATE_TRUSTED))
+    const int pixel = y * grid.x + x, at = other * grid.x * grid.y + pixel;
+    const float2 f = other ? back[pixel] : flow[pixel], start = (float2)(x + 0.5f, y + 0.5f);
+    places[at] = -1;
+    if (!(square2(f) > INTERMEDIATE_ALIKE &&
+          square2(f + bilinear_flow(other ? flow : back, start + f, grid)) < INTERMEDIATE_TRUSTED))
         return; /* nor for what is not a number */
     float2 u = start;
     for (int step = 0; step < INTERMEDIATE_STEPS; ++step) {
         const float s = share[intermediate_nearest(u, grid)];
         u = start + (other ? 1.0f - s : s) * f;
     }
-    const int2 corner = floor_int2(u - 0.5f);
+    int2 corner = floor_int2(u - 0.5f);
+    if (grid.z)
+        corner.x -= floor_int((float)corner.x / grid.x) * grid.x;
+    if (corner.x >= -1 && corner.x < grid.x && corner.y >= -1 && corner.y < grid.y)
+        places[at] = (corner.y + 1) << bits | (corner.x + 1);
+}
+
+/* Where a thing that is narrower than its way passes, no flow that starts there is the thing's. So each flow that leads
+   back tells the four pixels around the place through which it passes; of those that differ from what is there already
+   a pixel listens to the one that differs most. It is called to find by how much, and then once more, to find the
+   flows. */
+__kernel void intermediate_pass(__global const float2 *flow, /* (grid.y, grid.x) F_ab, px */
+                                __global const float2 *back, /* (grid.y, grid.x) F_ba, px */
+                                int4 grid,                   /* chart; run size: grid.x, grid.y, 2 */
+                                __global const int *places, int bits, /* of intermediate_follow */
+                                __global const float2 *through, /* (grid.y, grid.x) what is there, from a to b */
+                                int named,                   /* 0: the difference is found; 1: whose it is */
+                                __global uint *furthest,     /* (grid.y, grid.x) bits of the squared difference */
+                                __global uint *source)       /* (grid.y, grid.x) 0: none; 1 + pixel, of b: + all */
+{
+    const int x = get_global_id(0), y = get_global_id(1), other = get_global_id(2);
+    if (x >= grid.x || y >= grid.y)
+        return;
+    const int pixel = y * grid.x + x, at = other * grid.x * grid.y + pixel, place = places[at];
+    if (place < 0)
+        return;
+    const float2 f = other ? -back[pixel] : flow[pixel];
+    const int2 corner = (int2)(place & ((1 << bits) - 1), place >> bits) - 1;
     for (int tap = 0; tap < 4; ++tap) {
         const int there = grid_index(corner + (int2)(tap & 1, tap >> 1), grid);
         if (there < 0)
             continue;
-        const float apart = square2((other ? -f : f) - through[there]);
+        const float apart = square2(f - through[there]);
         if (!(apart > INTERMEDIATE_APART))
             continue;
         /* of numbers above 0, those that are larger have larger bits */
         if (!named)
             atomic_max(furthest + there, as_uint(apart));
         else if (apart >= INTERMEDIATE_SAME * as_float(furthest[there]))
-            atomic_max(source + there, (uint)(1 + at + other * grid.x * grid.y));
+            atomic_max(source + there, (uint)(1 + at));
     }
 }
 

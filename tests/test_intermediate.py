@@ -93,13 +93,20 @@ def test_kernels_equal_their_twins(device: Device, wraps: bool, seed: int) -> No
     direct = eighths(direct)
     through.set(direct)
     furthest, source = (device.zeros((HEIGHT, WIDTH), np.uint32) for _ in range(2))
+    places, bits = device.empty((2, HEIGHT, WIDTH), np.int32), WIDTH.bit_length()
+    device.run("intermediate", "intermediate_follow", (*size, 2), *ways, grid, shares, bits, places)
+    corners = twin.intermediate_follow((flow, back), grid, share)
+    told = np.where(corners[..., 1] < -1, -1, (corners[..., 1] + 1 << bits) + corners[..., 0] + 1)
+    assert 0.1 < (told < 0).mean() < 0.9
+    assert (places.get() != told).mean() <= DECISIONS
+
+    places.set(told.astype(np.int32))
     for named in (0, 1):
-        for other, way in enumerate((ways, ways[::-1])):
-            device.run(
-                "intermediate", "intermediate_pass", size, *way, grid, shares, through, other, named,
-                furthest, source,
-            )  # fmt: skip
-    apart, sources = twin.intermediate_pass((flow, back), grid, share, direct)
+        device.run(
+            "intermediate", "intermediate_pass", (*size, 2), *ways, grid, places, bits, through, named,
+            furthest, source,
+        )  # fmt: skip
+    apart, sources = twin.intermediate_pass((flow, back), grid, corners, direct)
     assert 0.1 < (sources > 0).mean() < 0.9 and (sources > WIDTH * HEIGHT).any()
     assert_close(furthest.get().view(np.float32), apart, SUM, decisions=DECISIONS)
     assert (source.get() != sources).mean() <= DECISIONS

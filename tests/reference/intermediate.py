@@ -11,7 +11,6 @@ from reference.common import (
     Numbers,
     canvas_position,
     chart_point,
-    four_taps,
     grid_border,
     on_grid,
     pixels,
@@ -71,29 +70,45 @@ def intermediate_direct(flow: Array, back: Array, grid: Sequence[int], share: Ar
     return part * first + (1 - part) * second
 
 
-def intermediate_pass(
-    flows: tuple[Array, Array], grid: Sequence[int], share: Array, through: Array
-) -> tuple[Array, Array]:
-    """Both passes over both flows: the largest squared differences, and whose they are."""
+def intermediate_follow(flows: tuple[Array, Array], grid: Sequence[int], share: Array) -> Array:
+    """(2, height, width, 2): column and row from which on the four pixels lie that flow passes; a row of -2
+    where it does not lead back, or passes beside the grid.
+    """
     width, height, wraps, _ = grid
     x, y = (n + 0.5 for n in pixels(width, height))
-    furthest, source = np.zeros(width * height), np.zeros(width * height, np.int64)
+    corners = []
     for other in (0, 1):
         f = flows[other].astype(np.float64)
         back = flow_at(flows[1 - other], x + f[..., 0], y + f[..., 1], grid)
-        told = (square(f) > ALIKE) & (square(f + back) < TRUSTED)
         u, v = x, y
         for _ in range(STEPS):
             column, row = np.floor(u).astype(int), np.clip(np.floor(v).astype(int), 0, height - 1)
             s = share[row, column % width if wraps else np.clip(column, 0, width - 1)]
             s = (1 - s if other else s)[..., None]
             u, v = np.moveaxis(np.stack([x, y], -1) + s * f, -1, 0)
+        column, row = np.floor(u - 0.5).astype(int), np.floor(v - 0.5).astype(int)
+        column = column % width if wraps else column
+        beside = (column < -1) | (column >= width) | (row < -1) | (row >= height)
+        told = (square(f) > ALIKE) & (square(f + back) < TRUSTED) & ~beside
+        corners.append(np.where(told[..., None], np.stack([column, row], -1), -2))
+    return np.stack(corners)
+
+
+def intermediate_pass(
+    flows: tuple[Array, Array], grid: Sequence[int], corners: Array, through: Array
+) -> tuple[Array, Array]:
+    """Both passes over both flows: the largest squared differences, and whose they are."""
+    width, height = grid[:2]
+    furthest, source = np.zeros(width * height), np.zeros(width * height, np.int64)
+    for other in (0, 1):
+        f = flows[other].astype(np.float64)
         names = 1 + np.arange(width * height).reshape(height, width) + other * width * height
-        for column, row, _ in four_taps(u, v):
+        for tap in range(4):
+            column, row = corners[other, ..., 0] + tap % 2, corners[other, ..., 1] + tap // 2
             column, row, inside = grid_border(column, row, grid)
             at = np.where(inside, row * width + column, 0)
             apart = square((-f if other else f) - through.reshape(-1, 2)[at])
-            counts = told & inside & (apart > APART)
+            counts = (corners[other, ..., 1] > -2) & inside & (apart > APART)
             for place, how, name in zip(at[counts], apart[counts], names[counts], strict=True):
                 if (how, name) > (furthest[place], source[place]):
                     furthest[place], source[place] = how, name
