@@ -126,14 +126,26 @@ __kernel void geometry_reach(__global const float4 *field, /* (box.w, box.z) */
     const int y = get_global_id(0);
     if (y >= box.w || get_global_id(1) > 0)
         return;
+    const float4 py = (float4)(y + box.y + 0.5f);
     float longest = 0.0f, furthest = 0.0f;
-    for (int x = 0; x < box.z; ++x) {
-        const float3 d = field[y * box.z + x].xyz;
-        if (d.x == 0.0f && d.y == 0.0f && d.z == 0.0f)
+    for (int x = 0; x < box.z; x += GEOMETRY_CHUNK) {
+        float3 d[GEOMETRY_CHUNK];
+        for (int k = 0; k < GEOMETRY_CHUNK; ++k)
+            d[k] = x + k < box.z ? field[y * box.z + x + k].xyz : (float3)(0.0f);
+        const points4 way = {(float4)(d[0].x, d[1].x, d[2].x, d[3].x), (float4)(d[0].y, d[1].y, d[2].y, d[3].y),
+                             (float4)(d[0].z, d[1].z, d[2].z, d[3].z)};
+        const float4 length = way.x * way.x + way.y * way.y + way.z * way.z;
+        const float most = GREATEST(GREATEST(length.x, length.y), GREATEST(length.z, length.w));
+        if (most == 0.0f)
             continue; /* as most of a layer */
-        const float2 q = (float2)(x + box.x, y + box.y) + 0.5f;
-        longest = GREATEST(longest, square3(d));
-        furthest = GREATEST(furthest, MAGNITUDE(layer_position(q, d, lens).y - q.y));
+        float4 to = py + way.y;
+        if (lens.y != 0.0f) {
+            const points4 q = canvas_sphere4(convert_float4(x + box.x + (int4)(0, 1, 2, 3)) + 0.5f, py, lens);
+            canvas_sphere_position4((points4){q.x + way.x, q.y + way.y, q.z + way.z}, lens, &to);
+        }
+        const float4 rows = length > 0.0f ? MAGNITUDE(to - py) : (float4)(0.0f);
+        longest = GREATEST(longest, most);
+        furthest = GREATEST(furthest, GREATEST(GREATEST(rows.x, rows.y), GREATEST(rows.z, rows.w)));
     }
     reach[y] = (float2)(ROOT(longest), furthest);
 }

@@ -239,18 +239,22 @@ __kernel void multiband_offset(__global const float4 *level, /* (box.w, box.z) *
     const int x = get_global_id(0), y = get_global_id(1);
     if (x >= box.z || y >= box.w)
         return;
-    const int valid = level[y * box.z + x].w > 0.0f;
-    float4 sum = (float4)(0.0f);
-    for (int reach = valid ? 0 : 1; reach <= (valid ? 0 : 2) && sum.w == 0.0f; ++reach)
-        for (int j = -reach; j <= reach; ++j)
-            for (int i = -reach; i <= reach; ++i) {
-                int2 p = (int2)(x + box.x + i, y + box.y + j);
-                const int at = grid_border(&p, grid) ? box_index(p, box) : -1;
-                if (at < 0 || level[at].w == 0.0f)
-                    continue;
-                const float4 there = blend[p.y * grid.x + p.x];
-                sum += there.w > 0.0f ? (float4)(there.xyz - level[at].xyz, 1.0f) : (float4)(0.0f);
-            }
+    const int here = y * box.z + x, reach = level[here].w > 0.0f ? 0 : 2;
+    const bool inner = x >= reach && y >= reach && x + reach < box.z && y + reach < box.w;
+    float4 near = (float4)(0.0f), sum = near;
+    for (int j = -reach; j <= reach; ++j)
+        for (int i = -reach; i <= reach; ++i) {
+            int2 p = (int2)(x + box.x + i, y + box.y + j);
+            const int at = inner ? here + j * box.z + i : grid_border(&p, grid) ? box_index(p, box) : -1;
+            if (at < 0 || level[at].w == 0.0f)
+                continue;
+            const float4 there = blend[p.y * grid.x + p.x];
+            const float4 rise = there.w > 0.0f ? (float4)(there.xyz - level[at].xyz, 1.0f) : (float4)(0.0f);
+            sum += rise;
+            if (i * i <= 1 && j * j <= 1)
+                near += rise;
+        }
+    sum = near.w > 0.0f ? near : sum;
     const float3 d = sum.w > 0.0f ? sum.xyz / sum.w : (float3)(0.0f);
     const float3 size = MAGNITUDE(d), left = size - negligible;
     offset[y * box.z + x] = (float4)(left > 0.0f ? d * (left / size) : (float3)(0.0f), 0.0f);
