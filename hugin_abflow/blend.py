@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from hugin_abflow import memory
+from hugin_abflow import hidden, memory
 from hugin_abflow.layer import Box, Layer
 from hugin_abflow.opencl import Buffer, Device, DeviceMemoryError
 from hugin_abflow.progress import Advance
@@ -40,9 +40,6 @@ _QUARTER_FINE_LEVEL = 0.25 / 65535
 
 # Pixels of a row for which it is found out first which layers they show.
 _BLOCK = 64
-
-# Build options of what goes over coarse arrays, of floats whatever the layers are.
-_OF_COARSE = f"-DPIXEL=float -DSAMPLES=4 -DWHITE=1.0f -DINTEGER=0 -DPIXELS=2 -DBLOCK={_BLOCK}"
 
 # A row of the table of layers: `blend_layer` of kernels/blend.cl.
 _LAYER = np.dtype(
@@ -166,14 +163,11 @@ def _pass_memory(layers: Sequence[BlendLayer], plan: Sequence[_Band], scale: flo
     return shelves.total * pixel + fresh * pixel + 4 * out + slices
 
 
-def option_sets(device: Device, first: Layer) -> tuple[str, str]:
-    """Build options of what makes the panorama's pixels, which are as the first layer's, and of what goes
-    over coarse arrays before.
-    """
+def build_options(device: Device, first: Layer) -> str:
+    """Of what makes the panorama's pixels, which are as the first layer's."""
     pixel, white = pixel_options(first)
     integer, together = int(first.dtype.kind == "u"), _pixels_together(device)
-    pixel += f" -DWHITE={white:.1f}f -DINTEGER={integer} -DPIXELS={together} -DBLOCK={_BLOCK}"
-    return pixel, _OF_COARSE
+    return f"{pixel} -DWHITE={white:.1f}f -DINTEGER={integer} -DPIXELS={together} -DBLOCK={_BLOCK}"
 
 
 def _pixels_together(device: Device) -> int:
@@ -195,7 +189,7 @@ def _bands(
 ) -> Iterator[npt.NDArray[Any]]:
     """Bands of `height` rows."""
     region, first = full.region, layers[0].layer
-    together, options = _pixels_together(device), option_sets(device, first)[0]
+    together, options = _pixels_together(device), build_options(device, first)
     share = _QUARTER_LEVEL.get(first.dtype, _QUARTER_FINE_LEVEL)
     whole = (0, 0, gain_grid.width, gain_grid.height)
     fields = [(layer.box, layer.field) for layer in layers]
@@ -216,7 +210,8 @@ def _bands(
             groups = -(-part.width // together), part.height
             store.next()
             places = [slices.take(part) for slices in (ways, gained, added)]
-            _hide(device, ways.values, places[0], part, grid, share)
+            top, bottom = _coarse_rows((0, 0, grid.width, grid.height), part, grid.row_height)
+            hidden.mark(device, ways.values, places[0], (0, top, grid.width, bottom - top), share)
             table = np.zeros(len(layers), _LAYER)
             for row, layer, ring, (start, end) in zip(
                 table, layers, store.shelves.rings, band.rows, strict=True
@@ -279,18 +274,6 @@ class _Slices:
                 place[:5] = left, first, width, last - first, values
                 values += width * (last - first)
         return places
-
-
-def _hide(
-    device: Device, ways: Buffer, places: npt.NDArray[np.int32], part: Box, grid: Grid, share: float
-) -> None:
-    """Make weights of `ways` negative that are less than a share of what all layers have in their place."""
-    first, last = _coarse_rows((0, 0, grid.width, grid.height), part, grid.row_height)
-    run = 0, first, grid.width, last - first
-    device.run(
-        "blend", "blend_hide", run[2:], ways, device.upload(places), len(places), run, share,
-        options=_OF_COARSE,
-    )  # fmt: skip
 
 
 def _mark(

@@ -200,7 +200,7 @@ def _making_ready(device: Device, first: Layer, settings: Settings) -> Iterator[
     steps: list[Callable[[], object]] = [partial(device.build, "coefficient")]  # and all without options
     steps += [partial(device.build, "flow", flow.board_options(wraps=False))] if settings.flow else []
     steps += [partial(importlib.import_module, name) for name in libraries]
-    steps += [partial(device.build, "blend", options) for options in blend.option_sets(device, first)]
+    steps.append(partial(device.build, "blend", blend.build_options(device, first)))
     device.build("working", working.pixel_options(first)[0])  # else reading would wait for all the others
     done = threading.Event()
 

@@ -8,29 +8,6 @@ static inline blend_int blend_any(blend_samples v) {
     return set.REDS | set.GREENS | set.BLUES;
 }
 
-/* Weights of fields that are less than a share of their sum, which nobody sees, become negative. */
-__kernel void blend_hide(__global float4 *ways,      /* fields, one after the other: (box.w, box.z) each */
-                         __global const int8 *boxes, /* (count) box on the working grid; s4: begin in ways */
-                         int count,
-                         int4 part,   /* of the working grid: run size */
-                         float share) /* below which they are hidden */
-{
-    const int2 p = (int2)(get_global_id(0), get_global_id(1)) + part.xy;
-    if (p.x >= part.x + part.z || p.y >= part.y + part.w)
-        return;
-    float least = 0.0f;
-    for (int k = 0; k < count; ++k) {
-        const int at = box_index(p, boxes[k].lo);
-        least += at < 0 ? 0.0f : share * ways[boxes[k].s4 + at].w;
-    }
-    for (int k = 0; k < count; ++k) {
-        const int at = box_index(p, boxes[k].lo);
-        __global float4 *way = ways + boxes[k].s4 + at;
-        if (at >= 0)
-            way->w -= way->w > least ? least * least / way->w : least; /* hardly less where much is left */
-    }
-}
-
 /* Columns in an array of those from span.x on, span.y of them; beyond it, its rim. */
 static inline blend_between blend_within(blend_between at, int2 span, int4 border) {
     blend_int left = at.left - span.x, right = at.right - span.x; /* Mesa 22 would change the caller's at */
@@ -243,7 +220,7 @@ __kernel void blend_mark(
 __kernel void blend_band(
     __global const pixel_stored *stored, /* a ring of rows for each layer: (ring, width) */
     __global const blend_layer *layers, int count, /* those that the band may touch */
-    __global const float4 *ways,         /* per layer, (way.w, way.z): displacement, weight, from blend_hide */
+    __global const float4 *ways,         /* per layer, (way.w, way.z): displacement, weight, from hidden_mark */
     __global const float4 *gains,        /* per corrected layer, (gain.w, gain.z), whole rows of their grid */
     __global const float4 *offsets,      /* per layer with offsets, (offset.w, offset.z) */
     __global const float2 *columns,      /* (band.z) sine and cosine of longitude; plane: not used */

@@ -10,8 +10,9 @@ from bands import blend_layer, field_of, merged, stored_pixels
 from grids import patches, plane, sphere
 from reference import blend as twin
 from reference import common
+from reference.hidden import hidden_mark
 from scipy import ndimage
-from tolerances import DECISIONS, POSITION, SUM, assert_close
+from tolerances import DECISIONS, POSITION, assert_close
 
 from hugin_abflow import blend, working
 from hugin_abflow.layer import Box, Layer
@@ -90,34 +91,6 @@ def test_twin_of_position_turns_by_an_angle() -> None:
     )
 
 
-@pytest.mark.parametrize("share", [0.0, 0.1])
-def test_what_is_hidden_equals_its_twin(device: Device, share: float) -> None:
-    """Fields of parts of the grid; small weights turn negative, within the rows that are asked for."""
-    grid = sphere().resized(48, 25)
-    boxes = [(2, 0, 31, 24), (0, 3, 48, 9), (40, 20, 5, 4)]
-    fields = [field_of(7 + i, grid, box, 1.5) for i, box in enumerate(boxes)]
-    found, expected = hidden(device, fields, boxes, (0, 5, 48, 16), share), []
-    for field, whole, box in zip(fields, twin.blend_hide(fields, boxes, share), boxes, strict=True):
-        rows = box[1] + np.arange(box[3])[:, None, None]
-        expected.append(np.where((rows >= 5) & (rows < 21), whole, field))
-    for field, wanted in zip(found, expected, strict=True):
-        assert_close(field, wanted, SUM)
-    assert any((field[..., 3] < 0).any() for field in expected) == (share > 0)
-
-
-def hidden(device: Device, fields: list, boxes: list, part: tuple, share: float) -> list[np.ndarray]:
-    """What the kernel makes of fields in a part of their grid."""
-    begins = np.cumsum([0, *(field.size // 4 for field in fields)])
-    table = np.array([(*box, begin, 0, 0, 0) for box, begin in zip(boxes, begins, strict=False)], np.int32)
-    ways = device.upload(np.concatenate([field.reshape(-1, 4) for field in fields]))
-    device.run(
-        "blend", "blend_hide", part[2:], ways, device.upload(table), len(boxes), part, share,
-        options=f"-DPIXEL=float -DSAMPLES=4 -DWHITE=1.0f -DINTEGER=0 -DPIXELS=2 -DBLOCK={BLOCK}",
-    )  # fmt: skip
-    parts = np.split(ways.get(), begins[1:-1])
-    return [one.reshape(field.shape) for one, field in zip(parts, fields, strict=True)]
-
-
 @pytest.mark.parametrize(("dtype", "channels"), STORED)
 @pytest.mark.parametrize("name", list(GRIDS))
 @pytest.mark.parametrize(("nearest", "together", "width"), [(0, 2, 71), (0, 4, 71), (0, 4, 69), (1, 4, 70)])
@@ -145,7 +118,7 @@ def test_a_band_of_three_layers_equals_its_twin(
         offset[:, :4] = 0
     stored = [stored_pixels(5 + i, p[2], p[3], dtype, channels, 0.95) for i, p in enumerate(places)]
     options, white = options_of(Layer.from_array("a", stored[0]), together)
-    ways = hidden(device, fields, boxes, (0, 0, 48, 25), share)
+    ways = [field.astype(np.float32) for field in hidden_mark(fields, boxes, share)]
 
     table = np.zeros((3, 24), np.int32)
     table[:, :4], table[:, 4:8], table[:, 8:12] = places, boxes, (0, 0, 7, 5)

@@ -91,20 +91,6 @@ def correct(colour: Array, gain: Array, offset: Array, white: float, shoulder: f
     return np.where(offset == 0, c, np.where(c >= 0, np.maximum(raised, 0), raised))
 
 
-def blend_hide(fields: Sequence[Array], boxes: Sequence[Sequence[int]], share: float) -> list[Array]:
-    """Fields on parts of a grid; weights below a share of their sum turn negative."""
-    width, height = (max(box[i] + box[i + 2] for box in boxes) for i in (0, 1))
-    places = [np.s_[top : top + rows, left : left + columns] for left, top, columns, rows in boxes]
-    total = np.zeros((height, width))
-    for field, place in zip(fields, places, strict=True):
-        total[place] += field[..., 3]
-    hidden = [field.copy() for field in fields]
-    for field, place in zip(hidden, places, strict=True):
-        least, w = share * total[place], field[..., 3]
-        field[..., 3] -= np.where(w > least, least**2 / np.where(w > least, w, 1), least)
-    return hidden
-
-
 def blend_mark(
     stored: Sequence[Array],
     places: Sequence[Sequence[int]],
@@ -163,7 +149,7 @@ def blend_band(
     """Samples of the band, float64 but rounded and within 0..white for integer layers.
 
     stored, places      rows of each layer and their box.
-    ways, boxes         of `blend_hide`, and their boxes on the working grid.
+    ways, boxes         of `hidden_mark`, and their boxes on the working grid.
     gains               on the whole colour grid.
     offsets             and their boxes on their grid.
     """

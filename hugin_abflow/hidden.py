@@ -1,0 +1,26 @@
+"""What of layers nobody sees, in the rows of a band (kernels/hidden.cl): it need not be sampled."""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+
+from hugin_abflow.opencl import Buffer, Device
+
+
+def mark(
+    device: Device,
+    fields: Buffer,
+    places: npt.NDArray[np.int32],
+    part: tuple[int, int, int, int],
+    share: float,
+) -> None:
+    """Make weights negative that are less than a share of what all layers have in their place, in place; the
+    others hardly change.
+
+    fields      float32 (n, 4), those of layers one after the other; the weight last.
+    places      (layers, 8): of each its box (left, top, width, height) on the working grid, where it begins
+                in `fields`, and three numbers that are not read.
+    part        of the working grid, a box as well: where it is done.
+    """
+    device.run("hidden", "hidden_mark", part[2:], fields, device.upload(places), len(places), part, share)
