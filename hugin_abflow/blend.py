@@ -21,7 +21,7 @@ from hugin_abflow.layer import Box, Layer
 from hugin_abflow.opencl import Buffer, Device, DeviceMemoryError
 from hugin_abflow.progress import Advance
 from hugin_abflow.settings import Settings
-from hugin_abflow.working import Grid, device_dtype, device_rows, pixel_options
+from hugin_abflow.working import Grid, Place, device_dtype, device_rows, pixel_options
 
 _log = logging.getLogger(__name__)
 
@@ -51,7 +51,7 @@ _LAYER = np.dtype(
 )
 
 Span = tuple[int, int]
-_Coarse = tuple[tuple[int, int, int, int], Buffer]  # place on a coarse grid; float32 (height, width, 4)
+_Coarse = tuple[Place, Buffer]  # place on a coarse grid; float32 (height, width, 4)
 
 
 @dataclass(frozen=True)
@@ -67,7 +67,7 @@ class BlendLayer:
     """
 
     layer: Layer
-    box: tuple[int, int, int, int]
+    box: Place
     field: Buffer
     reach: Sequence[float]
     gain: Buffer | None
@@ -300,7 +300,7 @@ def _mark(
     return marks
 
 
-def _coarse_rows(box: tuple[int, int, int, int], part: Box, scale: float) -> Span:
+def _coarse_rows(box: Place, part: Box, scale: float) -> Span:
     """Rows of a coarse grid in `box` that a band reads, at least one; scale: band rows per coarse row."""
     _, top, _, height = box
     first = min(max(math.floor(part.top / scale) - 1, top), top + height - 1)

@@ -144,7 +144,7 @@ def _sphere(overlap: npt.NDArray[np.bool_], mask_grid: Grid, scale: float) -> Ch
     lon0, dlon = mask_grid.lens[:2]
     lon = lon0 + (np.arange(mask_grid.width, dtype=np.float64) + 0.5) * dlon
     rows, columns = np.nonzero(overlap)
-    points = directions(lon[columns], mask_grid.latitudes[rows])
+    points = directions(lon, mask_grid.latitudes, columns, rows)
     axes = _axes(points, mask_grid.row_widths[rows])
     x, y, z = axes @ points.T
     chart_lon = np.arctan2(x, y)

@@ -6,13 +6,14 @@ import numpy as np
 import numpy.typing as npt
 
 from hugin_abflow.opencl import Buffer, Device
+from hugin_abflow.working import Place
 
 
 def mark(
     device: Device,
     fields: Buffer,
     places: npt.NDArray[np.int32],
-    part: tuple[int, int, int, int],
+    part: Place,
     share: float,
 ) -> None:
     """Make weights negative that are less than a share of what all layers have in their place, in place; the
@@ -23,4 +24,7 @@ def mark(
                 in `fields`, and three numbers that are not read.
     part        of the working grid, a box as well: where it is done.
     """
-    device.run("hidden", "hidden_mark", part[2:], fields, device.upload(places), len(places), part, share)
+    eight_at_a_time = (-(-part[2] // 8), part[3])
+    device.run(
+        "hidden", "hidden_mark", eight_at_a_time, fields, device.upload(places), len(places), part, share,
+    )  # fmt: skip

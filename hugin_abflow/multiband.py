@@ -22,7 +22,7 @@ import numpy.typing as npt
 
 from hugin_abflow.colour import NEGLIGIBLE, Correction
 from hugin_abflow.opencl import Buffer, Device
-from hugin_abflow.working import Grid, WorkingLayer
+from hugin_abflow.working import Grid, Place, WorkingLayer
 
 # The shorter side is halved down to this many pixels: the lowest frequencies change over along all of it.
 _LEAST_SIDE = 4
@@ -31,7 +31,6 @@ _LEAST_SPREAD, _MOST_SPREAD = 0.7, 1 / 3
 # Of a grid that is none.
 _NONE = (0, 0, 0, 0)
 
-Place = tuple[int, int, int, int]
 Widths = npt.NDArray[np.float32]
 
 

@@ -14,6 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 Floats = npt.NDArray[np.float64]
+_Index = npt.NDArray[np.intp] | slice
 
 # Hugin's numbers (f of the p-line).
 RECTILINEAR, CYLINDRICAL, EQUIRECTANGULAR, FISHEYE, STEREOGRAPHIC, MERCATOR = range(6)
@@ -73,7 +74,12 @@ class Eye:
         return directions(x, latitudes)
 
 
-def directions(longitudes: Floats, latitudes: Floats) -> Floats:
-    """Unit vectors (n, 3) to places (n,) on a sphere, radians (kernels/common.cl)."""
-    level = np.cos(latitudes)
-    return np.stack([level * np.sin(longitudes), level * np.cos(longitudes), np.sin(latitudes)], 1)
+def directions(
+    longitudes: Floats, latitudes: Floats, column: _Index = slice(None), row: _Index = slice(None)
+) -> Floats:
+    """Unit vectors (n, 3) to places on a sphere, radians (kernels/common.cl): all longitudes and latitudes
+    (n,), or those of places on a grid, by their column and row (n,).
+    """
+    level = np.cos(latitudes)[row]
+    east, ahead = np.sin(longitudes)[column], np.cos(longitudes)[column]
+    return np.stack([level * east, level * ahead, np.sin(latitudes)[row]], 1)

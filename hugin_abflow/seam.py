@@ -36,7 +36,7 @@ from hugin_abflow.colour import Correction, clipping
 from hugin_abflow.geometry import Pair
 from hugin_abflow.labelling import Graph, energy, least
 from hugin_abflow.opencl import Buffer, Device
-from hugin_abflow.working import Grid, WorkingLayer, connected
+from hugin_abflow.working import Grid, Place, WorkingLayer, connected
 
 # Working pixels per cell of the seam grid.
 _CELL = 8
@@ -410,7 +410,7 @@ def _centres(cells: Grid, shape: Sequence[int]) -> tuple[npt.NDArray[np.intp], n
 
 
 def _at_centres(
-    weights: npt.NDArray[np.float32], box: tuple[int, int, int, int], grid: Grid, cells: Grid
+    weights: npt.NDArray[np.float32], box: Place, grid: Grid, cells: Grid
 ) -> npt.NDArray[np.float64]:
     """Weights at the cells' centres; 0 outside the layer's box."""
     left, top, width, height = box

@@ -41,6 +41,8 @@ _MOST_ROWS = 32_000
 # OpenCL type and full-scale value of each depth; half is widened on the host.
 PIXEL = {"uint8": ("uchar", 255.0), "uint16": ("ushort", 65535.0), "float32": ("float", 1.0)}
 
+Place = tuple[int, int, int, int]  # left, top, width, height on a grid
+
 
 @dataclass(frozen=True)
 class Grid:
@@ -148,13 +150,13 @@ def connected(mask: npt.NDArray[np.bool_], wraps: bool) -> npt.NDArray[np.int32]
 class WorkingLayer:
     """A layer on the working grid: pixels float32 (height, width, 4), r, g, b (full scale is 1) and valid.
 
-    box         (left, top, width, height) on the grid.
+    box         its place on the grid.
     checksum    of the stored pixels: tells layers of one size and place apart.
     white       r, g, b of what is clipped, of full scale.
     """
 
     layer: Layer
-    box: tuple[int, int, int, int]
+    box: Place
     pixels: Buffer
     checksum: int
     white: tuple[float, float, float] = (1.0, 1.0, 1.0)

@@ -1,24 +1,40 @@
 /* What of layers nobody sees. */
 
+/* Pixels of a row that a work item takes: where the boxes lie is looked up once for all of them. */
+#define HIDDEN_CHUNK 8
+
 /* Weights of fields that are less than a share of their sum become negative. */
-__kernel void hidden_mark(__global float4 *fields,      /* one after the other: (box.w, box.z) each; w: weight */
-                          __global const int8 *boxes,   /* (count) box on the working grid; s4: begin in fields */
+__kernel void hidden_mark(__global float4 *fields,    /* one after the other: (box.w, box.z) each; w: weight */
+                          __global const int8 *boxes, /* (count) box on the working grid; s4: begin in fields */
                           int count,
-                          int4 part,   /* of the working grid: run size */
+                          int4 part,   /* of the working grid: run size, its columns by HIDDEN_CHUNK, rounded up */
                           float share) /* below which they are hidden */
 {
-    const int2 p = (int2)(get_global_id(0), get_global_id(1)) + part.xy;
-    if (p.x >= part.x + part.z || p.y >= part.y + part.w)
+    const int left = part.x + (int)get_global_id(0) * HIDDEN_CHUNK, y = part.y + (int)get_global_id(1);
+    if (left >= part.x + part.z || y >= part.y + part.w)
         return;
-    float least = 0.0f;
+    const int right = LEAST(left + HIDDEN_CHUNK, part.x + part.z);
+    float least[HIDDEN_CHUNK];
+    for (int i = 0; i < HIDDEN_CHUNK; ++i)
+        least[i] = 0.0f;
     for (int k = 0; k < count; ++k) {
-        const int at = box_index(p, boxes[k].lo);
-        least += at < 0 ? 0.0f : share * fields[boxes[k].s4 + at].w;
+        const int8 box = boxes[k];
+        if (y < box.s1 || y >= box.s1 + box.s3)
+            continue;
+        __global const float4 *row = fields + box.s4 + (y - box.s1) * box.s2 - box.s0;
+        const int first = GREATEST(left, box.s0), end = LEAST(right, box.s0 + box.s2);
+        for (int x = first; x < end; ++x)
+            least[x - left] += share * row[x].w;
     }
     for (int k = 0; k < count; ++k) {
-        const int at = box_index(p, boxes[k].lo);
-        __global float4 *field = fields + boxes[k].s4 + at;
-        if (at >= 0)
-            field->w -= field->w > least ? least * least / field->w : least; /* hardly less where much is left */
+        const int8 box = boxes[k];
+        if (y < box.s1 || y >= box.s1 + box.s3)
+            continue;
+        __global float4 *row = fields + box.s4 + (y - box.s1) * box.s2 - box.s0;
+        const int first = GREATEST(left, box.s0), end = LEAST(right, box.s0 + box.s2);
+        for (int x = first; x < end; ++x) {
+            const float w = row[x].w, its = least[x - left];
+            row[x].w = w - (w > its ? its * its / w : its); /* hardly less where much is left */
+        }
     }
 }
