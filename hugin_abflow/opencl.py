@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import logging
 import math
 import threading
+import time
 import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -19,6 +21,11 @@ from hugin_abflow import launch, memory, pocl, signals, trace
 from hugin_abflow.devices import choose, kind_of, limited
 from hugin_abflow.errors import DeviceError
 from hugin_abflow.lane import Lane, StoppedError
+
+_log = logging.getLogger(__name__)
+
+# Seconds from which on a program was compiled; where a driver has kept what it compiled before it takes less.
+_COMPILED = 0.5
 
 # Work-group: rows suit both a GPU's wavefronts and the vector units of a CPU.
 _GROUP = 256
@@ -179,7 +186,7 @@ class Device:
         self._bytes, self._counting = 0, threading.RLock()  # buffers may be collected while it is held
         self._kernels: dict[tuple[str, str], dict[str, cl.Kernel]] = {}
         self._programs: dict[tuple[str, str], cl.Program] = {}  # Intel's driver does not keep a kernel's own
-        self._building, self._one_by_one = threading.Lock(), False
+        self._building, self._one_by_one, self._compiled = threading.Lock(), False, False
         self._repeated: dict[tuple[str, str, str], list[cl.Kernel]] = {}
         self._arguments = threading.Lock()  # a kernel keeps its arguments from when they are set to its start
 
@@ -291,7 +298,7 @@ class Device:
         self._kernels |= {(one, options): kernels for one in modules}
 
     def _build(self, modules: Sequence[str], options: str) -> dict[str, cl.Kernel]:
-        file = f"kernels/{modules[0]}.cl"  # of several nobody is told
+        file, began = f"kernels/{modules[0]}.cl", time.perf_counter()  # of several nobody is told
         try:
             # compilers chat; errors come with the exception
             with warnings.catch_warnings(), signals.held():
@@ -303,6 +310,9 @@ class Device:
                 f"{file} does not build on {self.device.name.strip()}: {error}; "
                 "update the OpenCL driver or choose another --device"
             ) from error
+        if not self._compiled and time.perf_counter() - began > _COMPILED:
+            self._compiled = True
+            _log.info("kernels: compiled for this device, once; this run takes longer than others will")
         self._programs |= {(one, options): program for one in modules}
         kernels = {kernel.function_name: kernel for kernel in program.all_kernels()}
         if not kernels:  # some drivers call that a success

@@ -145,6 +145,18 @@ def test_what_is_built_does_not_wait_for_what_is_being_built(
     assert device.kernel("working", "working_compare", "-DPIXEL=uchar -DSAMPLES=4") is first
 
 
+@pytest.mark.parametrize(("seconds", "told"), [(-1.0, 1), (1e9, 0)])
+def test_that_kernels_were_compiled_is_told_once(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, seconds: float, told: int
+) -> None:
+    monkeypatch.setattr(opencl, "_COMPILED", seconds)
+    device = Device()
+    with caplog.at_level("INFO", opencl.__name__):
+        device.build("pyramid")
+        device.build("flow", "-DWRAPS=0")
+    assert [record.message.startswith("kernels: compiled") for record in caplog.records] == [True] * told
+
+
 def test_kernels_of_one_version_are_used(monkeypatch: pytest.MonkeyPatch) -> None:
     """A version that is installed while this one runs must not mix its kernels with this one's host code."""
     kernel_source("working")
