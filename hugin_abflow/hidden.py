@@ -1,4 +1,4 @@
-"""What of layers nobody sees, in the rows of a band (kernels/hidden.cl): it need not be sampled."""
+"""What of layers nobody sees (kernels/hidden.cl): it need not be sampled."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ def mark(
     part: Place,
     share: float,
 ) -> None:
-    """Make weights negative that are less than a share of what all layers have in their place, in place; the
-    others hardly change.
+    """Make weights negative, in place, that are less than a share of the sum of all layers' there; the others
+    hardly change.
 
     fields      float32 (n, 4), those of layers one after the other; the weight last.
     places      (layers, 8): of each its box (left, top, width, height) on the working grid, where it begins

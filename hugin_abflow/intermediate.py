@@ -59,13 +59,13 @@ def _passing(device: Device, pair: PairFlow, share: Buffer) -> PairFlow:
     direct = device.empty(flow.shape)
     device.run("intermediate", "intermediate_direct", size, flow, back, border, share, direct)
     passing, seen = device.copy(direct), device.zeros(shape, np.uint8)
-    places, bits, both = device.empty((2, *shape), np.int32), size[0].bit_length(), (*size, 2)
-    device.run("intermediate", "intermediate_follow", both, flow, back, border, share, bits, places)
+    places, both = device.empty((2, *shape), np.int32), (*size, 2)
+    device.run("intermediate", "intermediate_follow", both, flow, back, border, share, places)
     for _ in range(_ROUNDS):
         furthest, source = device.zeros(shape, np.uint32), device.zeros(shape, np.uint32)
         for named in (0, 1):
             device.run(
-                "intermediate", "intermediate_pass", both, flow, back, border, places, bits, passing, named,
+                "intermediate", "intermediate_pass", both, flow, back, border, places, passing, named,
                 furthest, source,
             )  # fmt: skip
         device.run(

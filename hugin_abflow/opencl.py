@@ -312,7 +312,7 @@ class Device:
             ) from error
         if not self._compiled and time.perf_counter() - began > _COMPILED:
             self._compiled = True
-            _log.info("kernels: compiled for this device, once; this run takes longer than others will")
+            _log.info("kernels: compiled for this device, and kept: later runs take less time")
         self._programs |= {(one, options): program for one in modules}
         kernels = {kernel.function_name: kernel for kernel in program.all_kernels()}
         if not kernels:  # some drivers call that a success

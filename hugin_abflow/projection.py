@@ -77,8 +77,8 @@ class Eye:
 def directions(
     longitudes: Floats, latitudes: Floats, column: _Index = slice(None), row: _Index = slice(None)
 ) -> Floats:
-    """Unit vectors (n, 3) to places on a sphere, radians (kernels/common.cl): all longitudes and latitudes
-    (n,), or those of places on a grid, by their column and row (n,).
+    """Unit vectors (n, 3) to places on a sphere, radians (kernels/common.cl): to longitudes and latitudes
+    (n,), or, of places on a grid, to longitudes[column] and latitudes[row] (n,), whose sines are found once.
     """
     level = np.cos(latitudes)[row]
     east, ahead = np.sin(longitudes)[column], np.cos(longitudes)[column]

@@ -103,13 +103,12 @@ static inline int intermediate_nearest(float2 u, int4 grid) {
     return grid_index((int2)(grid.z ? p.x : LIMITED(p.x, 0, grid.x - 1), LIMITED(p.y, 0, grid.y - 1)), grid);
 }
 
-/* Where a flow that leads back passes: the pixel from which on the four around that place lie, its row and, in the
-   lowest bits, its column, each and 1, for there may be one beside the grid; -1 for others. */
+/* Where a flow that leads back passes: the first of the four pixels around that place, by its number in a grid that has
+   a column and a row more, in front; -1 for others. */
 __kernel void intermediate_follow(__global const float2 *flow, /* (grid.y, grid.x) F_ab, px */
                                   __global const float2 *back, /* (grid.y, grid.x) F_ba, px */
                                   int4 grid,                   /* chart; run size: grid.x, grid.y, 2 */
                                   __global const float *share, /* (grid.y, grid.x) of b */
-                                  int bits,                    /* so many that grid.x has no more */
                                   __global int *places)        /* (2, grid.y, grid.x) of F_ab and of F_ba */
 {
     const int x = get_global_id(0), y = get_global_id(1), other = get_global_id(2);
@@ -128,9 +127,9 @@ __kernel void intermediate_follow(__global const float2 *flow, /* (grid.y, grid.
     }
     int2 corner = floor_int2(u - 0.5f);
     if (grid.z)
-        corner.x -= floor_int((float)corner.x / grid.x) * grid.x;
+        corner.x = (corner.x % grid.x + grid.x) % grid.x;
     if (corner.x >= -1 && corner.x < grid.x && corner.y >= -1 && corner.y < grid.y)
-        places[at] = (corner.y + 1) << bits | (corner.x + 1);
+        places[at] = (corner.y + 1) * (grid.x + 1) + corner.x + 1;
 }
 
 /* Where a thing that is narrower than its way passes, no flow that starts there is the thing's. So each flow that leads
@@ -140,7 +139,7 @@ __kernel void intermediate_follow(__global const float2 *flow, /* (grid.y, grid.
 __kernel void intermediate_pass(__global const float2 *flow, /* (grid.y, grid.x) F_ab, px */
                                 __global const float2 *back, /* (grid.y, grid.x) F_ba, px */
                                 int4 grid,                   /* chart; run size: grid.x, grid.y, 2 */
-                                __global const int *places, int bits, /* of intermediate_follow */
+                                __global const int *places,  /* (2, grid.y, grid.x) of intermediate_follow */
                                 __global const float2 *through, /* (grid.y, grid.x) what is there, from a to b */
                                 int named,                   /* 0: the difference is found; 1: whose it is */
                                 __global uint *furthest,     /* (grid.y, grid.x) bits of the squared difference */
@@ -153,7 +152,7 @@ __kernel void intermediate_pass(__global const float2 *flow, /* (grid.y, grid.x)
     if (place < 0)
         return;
     const float2 f = other ? -back[pixel] : flow[pixel];
-    const int2 corner = (int2)(place & ((1 << bits) - 1), place >> bits) - 1;
+    const int2 corner = (int2)(place % (grid.x + 1), place / (grid.x + 1)) - 1;
     for (int tap = 0; tap < 4; ++tap) {
         const int there = grid_index(corner + (int2)(tap & 1, tap >> 1), grid);
         if (there < 0)

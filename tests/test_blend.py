@@ -232,6 +232,20 @@ def test_bands_of_any_height_give_the_same(device: Device, name: str, dtype: typ
         assert np.array_equal(merged(device, layers, full, grid, rows=rows), whole), rows
 
 
+def test_what_nobody_sees_is_marked_in_the_rows_that_a_band_reads(
+    device: Device, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    full, parts = GRIDS["sphere"], []
+    grid = full.resized(48, 25)
+    layer = blend_layer(device, stored_pixels(1, 78, 39, np.uint8, 3, 1.0), 0, 0, full, grid)
+    monkeypatch.setattr(blend.hidden, "mark", lambda *given: parts.append(given[3]))
+    merged(device, [layer], full, grid, rows=10)
+    for (left, first, width, height), top in zip(parts, (0, 10, 20, 30), strict=True):
+        begin, end = (np.array([top, min(top + 10, 39) - 1]) + 0.5) * 25 / 39 - 0.5  # between coarse rows
+        assert (left, width) == (0, 48)
+        assert first <= max(0, begin) and first + height >= min(25, math.floor(end) + 2)
+
+
 def test_a_band_sees_the_next_rows_displacements(device: Device) -> None:
     """Only one working row moves, far; rows of the picture beside it move by a share of that."""
     full = plane(60, 120)

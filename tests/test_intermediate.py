@@ -93,17 +93,17 @@ def test_kernels_equal_their_twins(device: Device, wraps: bool, seed: int) -> No
     direct = eighths(direct)
     through.set(direct)
     furthest, source = (device.zeros((HEIGHT, WIDTH), np.uint32) for _ in range(2))
-    places, bits = device.empty((2, HEIGHT, WIDTH), np.int32), WIDTH.bit_length()
-    device.run("intermediate", "intermediate_follow", (*size, 2), *ways, grid, shares, bits, places)
+    places = device.empty((2, HEIGHT, WIDTH), np.int32)
+    device.run("intermediate", "intermediate_follow", (*size, 2), *ways, grid, shares, places)
     corners = twin.intermediate_follow((flow, back), grid, share)
-    told = np.where(corners[..., 1] < -1, -1, (corners[..., 1] + 1 << bits) + corners[..., 0] + 1)
+    told = np.where(corners[..., 1] < -1, -1, (corners + 1) @ [1, WIDTH + 1])
     assert 0.1 < (told < 0).mean() < 0.9
     assert (places.get() != told).mean() <= DECISIONS
 
     places.set(told.astype(np.int32))
     for named in (0, 1):
         device.run(
-            "intermediate", "intermediate_pass", (*size, 2), *ways, grid, places, bits, through, named,
+            "intermediate", "intermediate_pass", (*size, 2), *ways, grid, places, through, named,
             furthest, source,
         )  # fmt: skip
     apart, sources = twin.intermediate_pass((flow, back), grid, corners, direct)
@@ -145,6 +145,27 @@ def settled(
     flows = [PairFlow(0, 1, found, *(device.upload(way.astype(np.float32)) for way in ways))]
     intermediate.settle(device, [p[0] for p in parts], [p[1] for p in parts], flows, grid, Settings())
     return flows[0].forward.get(), flows[0].backward.get()
+
+
+@pytest.mark.parametrize(("width", "wraps"), [(64, False), (61, False), (128, True)])
+def test_settling_is_what_the_twins_do(device: Device, width: int, wraps: bool) -> None:
+    """One after the other, of flow that is wrong in places, from both layers."""
+    chart = whole_chart(plane(width, HEIGHT, wraps=wraps))
+    flow, back = (np.tile(one, (1, 3, 1))[:, :width] for one in scene(3)[:2])
+    share, border = np.full((HEIGHT, width), 0.375), chart.border
+    direct = twin.intermediate_direct(flow, back, border, share)
+    passing, seen = direct, np.zeros((HEIGHT, width), bool)
+    corners = twin.intermediate_follow((flow, back), border, share)
+    for _ in range(2):
+        _, sources = twin.intermediate_pass((flow, back), border, corners, passing)
+        passing, its = twin.intermediate_choose(flow, back, border, share, sources, passing)
+        seen = seen | its
+    kept = twin.intermediate_keep(passing, seen, border)
+    expected = twin.intermediate_settle(direct, passing, kept, border)
+    assert kept.mean() > 0.02
+    found, opposite = settled(device, plane(width, HEIGHT, wraps=wraps), chart, (flow, back), 0.375)
+    assert (np.abs(found - expected).max(-1) > 1e-3).mean() < 1e-3
+    assert np.array_equal(opposite, -found)
 
 
 def bar(left: float, width: int, way: float, around: float) -> tuple[np.ndarray, np.ndarray]:
