@@ -21,9 +21,10 @@ CURRENT := $(shell $(PY) -P -c "import importlib.util, os, sys; \
 PACKAGES := hugin-tools enblend enfuse libimage-exiftool-perl
 PROGRAMS := nona pano_trafo hugin_executor enblend enfuse exiftool
 
-# Several tests at a time: most of them leave one core idle. No more than four, whatever the machine has, as each
-# process holds kernels and panoramas of its own.
-PYTEST_ARGS ?= --numprocesses logical --maxprocesses 4 --dist worksteal
+# One test more at a time than there are cores: some wait for what they started. No more than four, whatever the
+# machine has, as each process holds kernels and panoramas of its own.
+CORES := $(shell getconf _NPROCESSORS_ONLN 2>/dev/null || echo 2)
+PYTEST_ARGS ?= --numprocesses $(shell expr $(CORES) + 1) --maxprocesses 4 --dist worksteal
 
 .PHONY: sample test lint clean programs FORCE
 
