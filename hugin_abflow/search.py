@@ -150,7 +150,7 @@ def _coupled(
     parameters: SearchParameters,
 ) -> Buffer:  # fmt: skip
     """The displacements of least cost, ever less free to differ from `flow`, then from their own mean."""
-    eight_at_a_time = (-(-grid[0] // 8) * grid[1],)
+    sixteen_at_a_time = (-(-grid[0] // 16) * grid[1],)
     smooth, best, median = (device.empty(flow.shape) for _ in range(3))
     for turn, coupling in enumerate(parameters.couplings):
         if turn:
@@ -158,7 +158,7 @@ def _coupled(
                 best, median = filtered(device, best, grid, median), best
             device.run("search", "search_mean", grid[:2], best, grid, smooth)
         device.run(
-            "search", "search_best", eight_at_a_time, cost, smooth if turn else flow, grid, reach, coupling,
+            "search", "search_best", sixteen_at_a_time, cost, smooth if turn else flow, grid, reach, coupling,
             cost.shape[2], best,
         )  # fmt: skip
     return best

@@ -151,42 +151,55 @@ __kernel void search_turned(__global const float *cost, /* (grid.y, displacement
     vstore8(costs, 0, turned + row * pitch + x);
 }
 
-/* The displacement that costs least, with what it is away from `flow`; eight pixels at a time. */
+/* The displacement that costs least, with what it is away from `flow`; sixteen pixels at a time. No cost is below 0, so
+   what is so far away from all sixteen that this alone is more than they pay next to their flow is not tried. */
 __kernel void search_best(__global const float *cost,  /* (grid.y, displacements, pitch) of this direction */
                           __global const float2 *flow, /* (grid.y, grid.x) px */
-                          int4 grid,                   /* run size: ceil(grid.x / 8) x grid.y */
+                          int4 grid,                   /* run size: ceil(grid.x / 16) x grid.y */
                           int2 reach,                  /* px */
                           float coupling,              /* cost of a squared pixel away from flow */
                           int pitch,
                           __global float2 *best)       /* (grid.y, grid.x) px */
 {
-    const int2 eight = search_eight((grid.x + 7) / 8);
-    const int x = eight.x, y = eight.y, count = LEAST(8, grid.x - x);
+    const int item = get_global_id(0), sixteens = (grid.x + 15) / 16, y = item / sixteens;
+    const int x = 16 * (item - y * sixteens), count = LEAST(16, grid.x - x), span = 2 * reach.x + 1;
     if (y >= grid.y)
         return;
-    float near_x[8], near_y[8];
-    for (int i = 0; i < 8; ++i) {
-        const float2 near = flow[y * grid.x + x + LEAST(i, count - 1)];
+    cost += y * (2 * reach.y + 1) * span * pitch + x;
+    const float2 furthest = convert_float2(reach);
+    float2 first = (float2)(INFINITY), last = (float2)(-INFINITY); /* flow of the sixteen */
+    float near_x[16], near_y[16], most = 0.0f;
+    for (int i = 0; i < 16; ++i) {
+        const int lane = LEAST(i, count - 1);
+        const float2 near = flow[y * grid.x + x + lane], whole = clamp(rint(near), -furthest, furthest);
+        const float2 away = whole - near;
+        const int2 place = convert_int2(whole) + reach;
+        most = fmax(most, cost[(place.y * span + place.x) * pitch + lane] + coupling * dot(away, away));
+        first = fmin(first, near);
+        last = fmax(last, near);
         near_x[i] = near.x;
         near_y[i] = near.y;
     }
-    const float8 from_x = vload8(0, near_x), from_y = vload8(0, near_y);
-    float8 least = (float8)(INFINITY);
-    int8 found = (int8)(0);
-    int index = 0;
-    cost += y * (2 * reach.y + 1) * (2 * reach.x + 1) * pitch + x;
-    for (int v = -reach.y; v <= reach.y; ++v) {
-        const float8 away_y = (float)v - from_y, down = away_y * away_y;
-        for (int u = -reach.x; u <= reach.x; ++u, ++index, cost += pitch) {
-            const float8 away_x = (float)u - from_x, total = vload8(0, cost) + coupling * (away_x * away_x + down);
-            const int8 less = total < least; /* `select` would take one after the other on PoCL */
+    const float16 from_x = vload16(0, near_x), from_y = vload16(0, near_y);
+    /* by more than rounding could make up for; without a coupling everything is tried */
+    const float2 within = (float2)(1.001f * sqrt(most / fmax(coupling, 1e-9f)) + 0.001f);
+    const int2 low = convert_int2(fmax(ceil(first - within), -furthest));
+    const int2 high = convert_int2(fmin(floor(last + within), furthest));
+    float16 least = (float16)(INFINITY);
+    int16 found = (int16)(0);
+    for (int v = low.y; v <= high.y; ++v) {
+        const float16 away_y = (float)v - from_y, down = away_y * away_y;
+        int index = (v + reach.y) * span + low.x + reach.x;
+        for (int u = low.x; u <= high.x; ++u, ++index) {
+            const float16 away_x = (float)u - from_x;
+            const float16 total = vload16(0, cost + index * pitch) + coupling * (away_x * away_x + down);
+            const int16 less = total < least; /* `select` would take one after the other on PoCL */
             least = less ? total : least;
-            found = less ? (int8)(index) : found;
+            found = less ? (int16)(index) : found;
         }
     }
-    int lanes[8];
-    vstore8(found, 0, lanes);
-    const int span = 2 * reach.x + 1;
+    int lanes[16];
+    vstore16(found, 0, lanes);
     for (int i = 0; i < count; ++i)
         best[y * grid.x + x + i] = (float2)(lanes[i] % span - reach.x, lanes[i] / span - reach.y);
 }

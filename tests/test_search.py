@@ -5,6 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from grids import patches
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from reference import common
 from reference import search as twin
 from scipy import ndimage
@@ -127,12 +129,42 @@ def test_best_equals_its_twin(device: Device, name: str, backward: int, coupling
     directed = volume(twin.directed(cost, grid, REACH, 0.5, backward))
     out = device.empty((grid[1], grid[0], 2))
     sent = device.upload(directed, np.float32), device.upload(near, np.float32)
-    device.run("search", "search_best", (5 * grid[1],), *sent, grid, REACH, coupling, 48, out)
+    device.run("search", "search_best", (3 * grid[1],), *sent, grid, REACH, coupling, 48, out)
     best = out.get()
     expected = twin.search_best(cost, near, grid, REACH, 0.5, coupling, backward)
     assert_close(best, expected, 0, DECISIONS)
     true = np.array([2, -1]) * (1 - 2 * backward)
     assert (best == true).all(-1).mean() > 0.3
+
+
+@settings(max_examples=40)
+@given(
+    width=st.integers(1, 40), height=st.integers(1, 5), seed=st.integers(0, 2**32 - 1),
+    reach=st.tuples(st.integers(0, 5), st.integers(0, 5)), coupling=st.sampled_from([0.001, 0.03, 0.3, 10.0]),
+    spread=st.sampled_from([0.0, 0.3, 8.0]), zeros=st.sampled_from([0.0, 0.5, 1.0]),
+)  # fmt: skip
+def test_best_tries_all_that_could_be(
+    device: Device, width: int, height: int, seed: int, reach: tuple[int, int], coupling: float,
+    spread: float, zeros: float,
+) -> None:  # fmt: skip
+    """Wherever flow is, within reach or beyond, and however it differs among those that are tried together:
+    what is found costs what the best of all does.
+    """
+    rng, grid = np.random.default_rng(seed), (width, height, 0, 0)
+    count = (2 * reach[0] + 1) * (2 * reach[1] + 1)
+    cost = rng.random((count, height, width)) * (rng.random((count, height, width)) >= zeros)
+    cost = cost.astype(np.float32)
+    flow = rng.normal(0, 4, (1, 1, 2)) + rng.normal(0, 1, (height, width, 2)) * spread
+    flow = flow.astype(np.float32)
+    out = device.empty((height, width, 2))
+    sent = device.upload(volume(cost), np.float32), device.upload(flow, np.float32)
+    device.run("search", "search_best", (-(-width // 16) * height,), *sent, grid, reach, coupling, 48, out)
+    found = out.get()
+    index = ((found[..., 1] + reach[1]) * (2 * reach[0] + 1) + found[..., 0] + reach[0]).astype(int)
+    total = cost + coupling * ((np.array(twin.displacements(reach))[:, None, None] - flow) ** 2).sum(-1)
+    paid = np.take_along_axis(total, index[None], 0)[0]
+    assert (np.abs(found) <= reach).all()
+    assert_close(paid, total.min(0), 1e-5)
 
 
 def test_backward_costs_are_those_of_the_exchanged_images() -> None:
