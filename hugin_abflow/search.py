@@ -17,6 +17,9 @@ from hugin_abflow.pyramid import on_level
 
 Grid = tuple[int, int, int, int]  # (width, height, wraps, 0), as the kernels take it
 
+# SEARCH_MARGIN and SEARCH_RADIUS of kernels/search.cl.
+_MARGIN, _LARGEST_RADIUS = 16, 4
+
 
 @dataclass(frozen=True)
 class SearchParameters:
@@ -61,15 +64,22 @@ class SearchParameters:
     refined_patience: float = 0.2
 
     def __post_init__(self) -> None:
-        if max(self.radius) > 4:  # SEARCH_WINDOW of kernels/search.cl
-            raise ValueError(f"radius is {self.radius}; windows have a radius of at most 4")
+        if max(self.radius) > _LARGEST_RADIUS:
+            raise ValueError(f"radius is {self.radius}; windows have a radius of at most {_LARGEST_RADIUS}")
 
 
 def descriptor(device: Device, feature: Buffer, grid: Grid, parameters: SearchParameters) -> Buffer:
-    """Descriptors float32 (height, width, 4) of features of the same shape."""
-    result = device.empty(feature.shape)
-    device.run("search", "search_descriptor", grid[:2], feature, grid, parameters.noise, result)
+    """Descriptors float32 (height, 4, columns) of features (height, width, 4): see kernels/search.cl."""
+    single, wide = device.empty(feature.shape), _pitch(grid) + 2 * _MARGIN
+    device.run("search", "search_descriptor", grid[:2], feature, grid, parameters.noise, single)
+    result = device.empty((grid[1], 4, wide))
+    device.run("search", "search_planes", (wide, grid[1]), single, grid, wide, result)
     return result
+
+
+def _pitch(grid: Grid) -> int:
+    """Columns of costs: what is read eight at a time from up to two columns further on ends within them."""
+    return 8 * (-(-grid[0] // 8) + 1)
 
 
 def filtered(
@@ -127,18 +137,15 @@ def volumes(
     a, b: descriptors; outside: the cost of what the other image does not show.
     """
     width, height = grid[:2]
-    count, chunks = (2 * reach[0] + 1) * (2 * reach[1] + 1), -(-width // 8)
-    pitch, margin = 8 * (chunks + 1), reach[0] + 1
-    wide = pitch + 2 * margin
-    planes = [device.empty((height, 4, wide)) for _ in range(2)]
-    for image, target in zip((a, b), planes, strict=True):
-        device.run("search", "search_planes", (wide, height), image, grid, margin, wide, target)
+    if reach[0] >= _MARGIN:
+        raise ValueError(f"reach is {reach[0]} px; descriptors have a margin of {_MARGIN}")
+    count, pitch, wide = (2 * reach[0] + 1) * (2 * reach[1] + 1), _pitch(grid), a.shape[2]
     pixel_cost, cost = (device.empty((height, count, pitch)) for _ in range(2))
     device.run(
-        "search", "search_pixel_cost", (pitch // 8 * count * height,), *planes, grid, reach, (wide, margin),
-        outside, pitch, pixel_cost,
+        "search", "search_pixel_cost", (pitch // 8 * count * height,), a, b, grid, reach, wide, outside,
+        pitch, pixel_cost,
     )  # fmt: skip
-    rows = (chunks * count * height,)
+    rows = (-(-width // 8) * count * height,)
     device.run("search", "search_cost", rows, pixel_cost, grid, count, outside, pitch, cost)
     turned = pixel_cost  # has done its part
     device.run("search", "search_turned", rows, cost, grid, reach, outside, pitch, turned)
@@ -150,7 +157,7 @@ def _coupled(
     parameters: SearchParameters,
 ) -> Buffer:  # fmt: skip
     """The displacements of least cost, ever less free to differ from `flow`, then from their own mean."""
-    sixteen_at_a_time = (-(-grid[0] // 16) * grid[1],)
+    eight_at_a_time = (-(-grid[0] // 8) * grid[1],)
     smooth, best, median = (device.empty(flow.shape) for _ in range(3))
     for turn, coupling in enumerate(parameters.couplings):
         if turn:
@@ -158,7 +165,7 @@ def _coupled(
                 best, median = filtered(device, best, grid, median), best
             device.run("search", "search_mean", grid[:2], best, grid, smooth)
         device.run(
-            "search", "search_best", sixteen_at_a_time, cost, smooth if turn else flow, grid, reach, coupling,
+            "search", "search_best", eight_at_a_time, cost, smooth if turn else flow, grid, reach, coupling,
             cost.shape[2], best,
         )  # fmt: skip
     return best
@@ -176,7 +183,7 @@ def choose(
     for step in on_level(parameters.steps, level):
         chosen = device.empty(flow.shape)
         device.run(
-            "search", "search_choose", grid[:2], a, b, flow, other, grid, step, radius,
+            "search", "search_choose", grid[:2], a, b, flow, other, grid, a.shape[2], step, radius,
             parameters.focus, (parameters.own_outside, parameters.other_outside), parameters.patience, chosen,
         )  # fmt: skip
         flow = other = chosen

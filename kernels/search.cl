@@ -4,12 +4,16 @@
 
    A descriptor is (h, dh/dx, dh/dy, valid), divided by how strongly its neighbourhood varies: the same in bright
    and dark, sharp and dull places. Flow is in pixels of the level's grid; grid = (width, height, wraps, 0).
+   Descriptors lie by rows and components, each of `wide` columns, of which SEARCH_MARGIN are before the grid's first
+   one and as many or more behind its last: there is what is beside the border where the grid wraps, else nothing known.
    A displacement has the index (d.y + reach.y) * (2 reach.x + 1) + d.x + reach.x. The costs of a row lie together, by
    displacement, in columns of which the first grid.x count: what is tried at a pixel is near in memory. */
 
 #define SEARCH_SLOPE 1.5f /* weight of the derivatives beside h */
 #define SEARCH_UNLIKE 0.5f /* squared difference of descriptors that is half a misfit */
-#define SEARCH_WINDOW 81  /* pixels of the largest window in which flows are compared: its radius is 4 */
+#define SEARCH_MARGIN 16
+#define SEARCH_RADIUS 4   /* px, of the largest window in which flows are compared */
+#define SEARCH_ROW 16     /* columns of a window's row: they are compared eight at a time */
 
 /* Features over the root of their mean square in 7 x 7 pixels. */
 __kernel void search_descriptor(__global const float4 *feature, /* (grid.y, grid.x) kernels/flow.cl */
@@ -35,31 +39,34 @@ __kernel void search_descriptor(__global const float4 *feature, /* (grid.y, grid
     descriptor[y * grid.x + x] = (float4)(f.x * scale, SEARCH_SLOPE * scale * f.yz, f.w);
 }
 
-/* How badly two descriptors fit, 0..1; `outside` where one is not known. */
-static inline float search_misfit(float4 a, float4 b, float outside) {
-    const float3 d = a.xyz - b.xyz;
-    const float e = dot(d, d);
-    return a.w * b.w > 0.0f ? e / (e + SEARCH_UNLIKE) : outside;
-}
-
-/* Descriptors by component, with columns beyond both borders: what is beside the border where the grid wraps, else
-   what is not known. */
+/* Descriptors by component, with margins. */
 __kernel void search_planes(__global const float4 *descriptor, /* (grid.y, grid.x) */
                             int4 grid,
-                            int margin,                        /* columns before the grid's first one */
-                            int wide,                          /* columns; run size: (wide, grid.y) */
+                            int wide,                          /* run size: (wide, grid.y) */
                             __global float *planes)            /* (grid.y, 4, wide) */
 {
     const int column = get_global_id(0), y = get_global_id(1);
     if (column >= wide || y >= grid.y)
         return;
-    int2 p = (int2)(column - margin, y);
+    int2 p = (int2)(column - SEARCH_MARGIN, y);
     const float4 d = grid_border(&p, grid) ? descriptor[p.y * grid.x + p.x] : (float4)(0.0f);
     __global float *to = planes + 4 * y * wide + column;
     to[0] = d.x;
     to[wide] = d.y;
     to[2 * wide] = d.z;
     to[3 * wide] = d.w;
+}
+
+/* A component of the descriptors of row y, from column x on. */
+static inline __global const float *search_place(__global const float *descriptor, int x, int y, int component,
+                                                 int wide) {
+    return descriptor + (4 * y + component) * wide + SEARCH_MARGIN + x;
+}
+
+/* How badly eight descriptors, given by component, fit others that are known. */
+static inline float8 search_misfit(float8 a0, float8 a1, float8 a2, float8 b0, float8 b1, float8 b2) {
+    const float8 d0 = a0 - b0, d1 = a1 - b1, d2 = a2 - b2, e = d0 * d0 + d1 * d1 + d2 * d2;
+    return e / (e + SEARCH_UNLIKE);
 }
 
 /* Eight pixels of one row: x of the first one, in whole eights, and the row, of rows of so many eights. */
@@ -69,34 +76,32 @@ static inline int2 search_eight(int eights) {
 }
 
 /* Misfit of each pixel, and of those beside the grid's borders, under each displacement; -1 where the first image is
-   not known. `search_misfit`, of eight pixels at a time. */
-__kernel void search_pixel_cost(__global const float *a, /* (grid.y, 4, wide) planes */
+   not known. Eight pixels at a time. */
+__kernel void search_pixel_cost(__global const float *a, /* (grid.y, 4, wide) descriptors */
                                 __global const float *b, /* (grid.y, 4, wide) of the other image */
                                 int4 grid,
-                                int2 reach,              /* largest displacement, px */
-                                int2 columns,            /* of planes: wide, and margin, more than reach.x */
+                                int2 reach,              /* largest displacement, px, less than SEARCH_MARGIN */
+                                int wide,
                                 float outside,           /* misfit where one of both is not known */
                                 int pitch,               /* run size: pitch / 8 x displacements x grid.y */
                                 __global float *cost)    /* (grid.y, displacements, pitch): the first one is at x = -1 */
 {
     const int span = 2 * reach.x + 1, count = span * (2 * reach.y + 1);
     const int2 eight = search_eight(pitch / 8);
-    const int x = eight.x, row = eight.y;
+    const int x = eight.x - 1, row = eight.y;
     const int y = row / count, index = row - y * count, there = y + index / span - reach.y;
     if (y >= grid.y)
         return;
-    __global const float *own = a + 4 * y * columns.x + columns.y - 1 + x;
-    const float8 known = vload8(0, own + 3 * columns.x);
+    __global const float *own = search_place(a, x, y, 0, wide);
+    const float8 known = vload8(0, own + 3 * wide);
     float8 misfit = (float8)(outside);
     if (there >= 0 && there < grid.y) {
-        __global const float *other = b + 4 * there * columns.x + columns.y - 1 + x + index % span - reach.x;
-        const float8 d0 = vload8(0, own) - vload8(0, other);
-        const float8 d1 = vload8(0, own + columns.x) - vload8(0, other + columns.x);
-        const float8 d2 = vload8(0, own + 2 * columns.x) - vload8(0, other + 2 * columns.x);
-        const float8 e = d0 * d0 + d1 * d1 + d2 * d2, both = known * vload8(0, other + 3 * columns.x);
-        misfit = both > 0.0f ? e / (e + SEARCH_UNLIKE) : misfit;
+        __global const float *other = search_place(b, x + index % span - reach.x, there, 0, wide);
+        const float8 found = search_misfit(vload8(0, own), vload8(0, own + wide), vload8(0, own + 2 * wide),
+                                           vload8(0, other), vload8(0, other + wide), vload8(0, other + 2 * wide));
+        misfit = known * vload8(0, other + 3 * wide) > 0.0f ? found : misfit;
     }
-    vstore8(known > 0.0f ? misfit : (float8)(-1.0f), 0, cost + row * pitch + x);
+    vstore8(known > 0.0f ? misfit : (float8)(-1.0f), 0, cost + row * pitch + eight.x);
 }
 
 /* Mean over what is known of 3 x 3 pixels, under each displacement; eight pixels at a time. */
@@ -151,25 +156,25 @@ __kernel void search_turned(__global const float *cost, /* (grid.y, displacement
     vstore8(costs, 0, turned + row * pitch + x);
 }
 
-/* The displacement that costs least, with what it is away from `flow`; sixteen pixels at a time. No cost is below 0, so
-   what is so far away from all sixteen that this alone is more than they pay next to their flow is not tried. */
+/* The displacement that costs least, with what it is away from `flow`; eight pixels at a time. No cost is below 0, so
+   what is so far away from all eight that this alone is more than they pay next to their flow is not tried. */
 __kernel void search_best(__global const float *cost,  /* (grid.y, displacements, pitch) of this direction */
                           __global const float2 *flow, /* (grid.y, grid.x) px */
-                          int4 grid,                   /* run size: ceil(grid.x / 16) x grid.y */
+                          int4 grid,                   /* run size: ceil(grid.x / 8) x grid.y */
                           int2 reach,                  /* px */
                           float coupling,              /* cost of a squared pixel away from flow */
                           int pitch,
                           __global float2 *best)       /* (grid.y, grid.x) px */
 {
-    const int item = get_global_id(0), sixteens = (grid.x + 15) / 16, y = item / sixteens;
-    const int x = 16 * (item - y * sixteens), count = LEAST(16, grid.x - x), span = 2 * reach.x + 1;
+    const int2 eight = search_eight((grid.x + 7) / 8);
+    const int x = eight.x, y = eight.y, count = LEAST(8, grid.x - x), span = 2 * reach.x + 1;
     if (y >= grid.y)
         return;
     cost += y * (2 * reach.y + 1) * span * pitch + x;
     const float2 furthest = convert_float2(reach);
-    float2 first = (float2)(INFINITY), last = (float2)(-INFINITY); /* flow of the sixteen */
-    float near_x[16], near_y[16], most = 0.0f;
-    for (int i = 0; i < 16; ++i) {
+    float2 first = (float2)(INFINITY), last = (float2)(-INFINITY); /* flow of the eight */
+    float near_x[8], near_y[8], most = 0.0f;
+    for (int i = 0; i < 8; ++i) {
         const int lane = LEAST(i, count - 1);
         const float2 near = flow[y * grid.x + x + lane], whole = clamp(rint(near), -furthest, furthest);
         const float2 away = whole - near;
@@ -180,26 +185,26 @@ __kernel void search_best(__global const float *cost,  /* (grid.y, displacements
         near_x[i] = near.x;
         near_y[i] = near.y;
     }
-    const float16 from_x = vload16(0, near_x), from_y = vload16(0, near_y);
+    const float8 from_x = vload8(0, near_x), from_y = vload8(0, near_y);
     /* by more than rounding could make up for; without a coupling everything is tried */
     const float2 within = (float2)(1.001f * sqrt(most / fmax(coupling, 1e-9f)) + 0.001f);
     const int2 low = convert_int2(fmax(ceil(first - within), -furthest));
     const int2 high = convert_int2(fmin(floor(last + within), furthest));
-    float16 least = (float16)(INFINITY);
-    int16 found = (int16)(0);
+    float8 least = (float8)(INFINITY);
+    int8 found = (int8)(0);
     for (int v = low.y; v <= high.y; ++v) {
-        const float16 away_y = (float)v - from_y, down = away_y * away_y;
+        const float8 away_y = (float)v - from_y, down = away_y * away_y;
         int index = (v + reach.y) * span + low.x + reach.x;
         for (int u = low.x; u <= high.x; ++u, ++index) {
-            const float16 away_x = (float)u - from_x;
-            const float16 total = vload16(0, cost + index * pitch) + coupling * (away_x * away_x + down);
-            const int16 less = total < least; /* `select` would take one after the other on PoCL */
+            const float8 away_x = (float)u - from_x;
+            const float8 total = vload8(0, cost + index * pitch) + coupling * (away_x * away_x + down);
+            const int8 less = total < least; /* `select` would take one after the other on PoCL */
             least = less ? total : least;
-            found = less ? (int16)(index) : found;
+            found = less ? (int8)(index) : found;
         }
     }
-    int lanes[16];
-    vstore16(found, 0, lanes);
+    int lanes[8];
+    vstore8(found, 0, lanes);
     for (int i = 0; i < count; ++i)
         best[y * grid.x + x + i] = (float2)(lanes[i] % span - reach.x, lanes[i] / span - reach.y);
 }
@@ -264,84 +269,72 @@ __kernel void search_agree(__global const float *cost,   /* (grid.y, displacemen
     agreed[at] = found[at];
 }
 
-/* Descriptor at a position between pixels, by its four neighbours; w is 0 unless all that count are known. */
-static inline float4 search_sample(__global const float4 *b, int2 corner, float2 t, int4 grid) {
-    float4 sum = (float4)(0.0f);
-    for (int j = 0; j < 2; ++j)
-        for (int i = 0; i < 2; ++i) {
-            int2 p = corner + (int2)(i, j);
-            if (grid_border(&p, grid))
-                sum += (i ? t.x : 1.0f - t.x) * (j ? t.y : 1.0f - t.y) * b[p.y * grid.x + p.x];
-        }
-    return sum.w > 0.999f ? sum : (float4)(0.0f);
-}
-
-/* Weights of a window, in its rows' order, and their sum: pixels that look like the middle count most, what is not
+/* Weights of a window, by rows of SEARCH_ROW, and their sum: pixels that look like the middle count most, what is not
    known counts nothing. */
-static inline float search_weights(__global const float4 *a, int2 at, int4 grid, int radius, float focus,
+static inline float search_weights(__global const float *a, int2 at, int4 grid, int wide, int radius, float focus,
                                    float *weights) {
-    const float middle = a[at.y * grid.x + at.x].x;
+    const int side = 2 * radius + 1;
+    const float middle = *search_place(a, at.x, at.y, 0, wide);
     float sum = 0.0f;
-    for (int j = -radius; j <= radius; ++j)
-        for (int i = -radius; i <= radius; ++i) {
-            int2 p = at + (int2)(i, j);
-            const bool inside = grid_border(&p, grid);
-            const float4 own = inside ? a[p.y * grid.x + p.x] : (float4)(0.0f);
-            const float weight = own.w == 0.0f ? 0.0f : exp(-focus * fabs(own.x - middle));
-            *weights++ = weight;
-            sum += weight;
+    for (int j = -radius; j <= radius; ++j, weights += SEARCH_ROW) {
+        const int y = at.y + j;
+        for (int i = 0; i < side; i += 8) {
+            float8 weight = (float8)(0.0f);
+            if (y >= 0 && y < grid.y) {
+                const float8 own = vload8(0, search_place(a, at.x - radius + i, y, 0, wide));
+                const float8 known = vload8(0, search_place(a, at.x - radius + i, y, 3, wide));
+                weight = known != 0.0f ? exp(-focus * fabs(own - middle)) : weight;
+            }
+            vstore8(weight, 0, weights + i);
         }
-    return sum;
-}
-
-/* Weighted sum of the misfits of a window's row; between pixels of `b`, by fraction t from there on. All are known
-   to lie within both grids. */
-static inline float search_row_misfit(__global const float4 *a, __global const float4 *b, float2 t, int pitch, int count,
-                                      const float *weights, float outside) {
-    float4 left = (1.0f - t.y) * b[0] + t.y * b[pitch];
-    float sum = 0.0f;
-    for (int i = 0; i < count; ++i) {
-        const float4 right = (1.0f - t.y) * b[i + 1] + t.y * b[pitch + i + 1];
-        const float4 there = (1.0f - t.x) * left + t.x * right;
-        left = right;
-        if (weights[i] != 0.0f)
-            sum += weights[i] * (there.w > 0.999f ? search_misfit(a[i], there, outside) : outside);
+        for (int i = 0; i < side; ++i)
+            sum += weights[i];
     }
     return sum;
 }
 
-/* `sum` and the same of a row of 2 radius + 1 pixels around `at`, of which some may lie beyond a grid. */
-static inline float search_row_at_border(__global const float4 *a, __global const float4 *b, int2 at, int2 shift,
-                                         float2 t, int4 grid, int radius, const float *weights, float outside,
-                                         float sum) {
-    for (int i = -radius; i <= radius; ++i) {
-        const float weight = *weights++;
-        int2 p = at + (int2)(i, 0);
-        const int2 to = p + shift;
-        if (weight == 0.0f)
-            continue;
-        grid_border(&p, grid);
-        sum += weight * search_misfit(a[p.y * grid.x + p.x], search_sample(b, to, t, grid), outside);
+/* Eight values of a component between two rows, by their shares, and by t between columns from p's on. */
+static inline float8 search_between(__global const float *upper, __global const float *lower, float2 shares, float t) {
+    const float8 left = shares.x * vload8(0, upper) + shares.y * vload8(0, lower);
+    const float8 right = shares.x * vload8(0, upper + 1) + shares.y * vload8(0, lower + 1);
+    return (1.0f - t) * left + t * right;
+}
+
+/* Weighted sum of the misfits of a window's row and what lies between two of the other image. */
+static inline float search_row(__global const float *own, __global const float *upper, __global const float *lower,
+                               float2 shares, float t, int wide, int side, const float *weights, float outside) {
+    float sum = 0.0f;
+    for (int i = 0; i < side; i += 8, own += 8, upper += 8, lower += 8) {
+        float8 there[4];
+        for (int k = 0; k < 4; ++k)
+            there[k] = search_between(upper + k * wide, lower + k * wide, shares, t);
+        const float8 found = search_misfit(vload8(0, own), vload8(0, own + wide), vload8(0, own + 2 * wide), there[0],
+                                           there[1], there[2]);
+        float misfits[8];
+        vstore8(there[3] > 0.999f ? found : (float8)(outside), 0, misfits);
+        for (int k = 0; k < 8 && i + k < side; ++k)
+            sum += weights[i + k] * misfits[k];
     }
     return sum;
 }
 
 /* Mean misfit of a window under one flow, or something above `least` if it is more than that. */
-static inline float search_window(__global const float4 *a, __global const float4 *b, int2 at, float2 f, int4 grid,
-                                  int radius, const float *weights, float total, float outside, float least) {
+static inline float search_window(__global const float *a, __global const float *b, int2 at, float2 f, int4 grid,
+                                  int wide, int radius, const float *weights, float total, float outside,
+                                  float least) {
     const float2 base = floor(f), t = f - base;
-    const int2 shift = convert_int2(base), first = at - radius, last = at + radius;
-    const int side = 2 * radius + 1;
-    /* nearly all windows, and where they are looked for: no border rule is needed */
-    const bool inner = min(first.x, first.x + shift.x) >= 0 && max(last.x, last.x + shift.x + 1) < grid.x &&
-                       min(first.y, first.y + shift.y) >= 0 && max(last.y, last.y + shift.y + 1) < grid.y;
+    const int side = 2 * radius + 1, above = at.y + (int)base.y - radius;
+    int left = at.x + (int)base.x - radius; /* of which nothing is in the grid is as unknown next to it */
+    left = grid.z ? (left % grid.x + grid.x) % grid.x : clamp(left, -SEARCH_MARGIN, grid.x);
     float sum = 0.0f;
-    for (int j = -radius; j <= radius; ++j, weights += side) {
-        const int row = (at.y + j) * grid.x + first.x, there = row + shift.y * grid.x + shift.x;
-        if (inner)
-            sum += search_row_misfit(a + row, b + there, t, grid.x, side, weights, outside);
-        else
-            sum = search_row_at_border(a, b, at + (int2)(0, j), shift, t, grid, radius, weights, outside, sum);
+    for (int j = 0; j < side; ++j, weights += SEARCH_ROW) {
+        const int own = clamp(at.y - radius + j, 0, grid.y - 1), y = above + j; /* beyond, nothing has a weight */
+        const float2 shares =
+            (float2)(y >= 0 && y < grid.y ? 1.0f - t.y : 0.0f, y + 1 >= 0 && y + 1 < grid.y ? t.y : 0.0f);
+        sum += search_row(search_place(a, at.x - radius, own, 0, wide),
+                          search_place(b, left, clamp(y, 0, grid.y - 1), 0, wide),
+                          search_place(b, left, clamp(y + 1, 0, grid.y - 1), 0, wide), shares, t.x, wide, side, weights,
+                          outside);
         if (sum > least * total * 1.001f) /* by more than rounding could make up for */
             return INFINITY;
     }
@@ -350,13 +343,14 @@ static inline float search_window(__global const float4 *a, __global const float
 
 /* Each pixel keeps its flow, or takes over the other field's or one from `step` px beside it in either field, if
    it fits better by more than `patience`. */
-__kernel void search_choose(__global const float4 *a,     /* (grid.y, grid.x) descriptors */
-                            __global const float4 *b,     /* (grid.y, grid.x) of the other image */
+__kernel void search_choose(__global const float *a,      /* (grid.y, 4, wide) descriptors */
+                            __global const float *b,      /* (grid.y, 4, wide) of the other image */
                             __global const float2 *flow,  /* (grid.y, grid.x) px */
                             __global const float2 *other, /* (grid.y, grid.x) px; may be flow itself */
                             int4 grid,                    /* run size */
+                            int wide,
                             int step,                     /* px */
-                            int radius,                   /* px, of the window compared, at most 4 */
+                            int radius,                   /* px, of the window compared, at most SEARCH_RADIUS */
                             float focus,                  /* e-folds for a difference of 1 from the middle */
                             float2 outside,               /* misfit where not known: own flow, another */
                             float patience,               /* by how much another must fit better */
@@ -368,8 +362,8 @@ __kernel void search_choose(__global const float4 *a,     /* (grid.y, grid.x) de
     const int at = y * grid.x + x;
     const float2 own = flow[at];
     float2 best = own;
-    if (a[at].w > 0.0f) {
-        float weights[SEARCH_WINDOW], total = 0.0f, least = INFINITY;
+    if (*search_place(a, x, y, 3, wide) > 0.0f) {
+        float weights[(2 * SEARCH_RADIUS + 1) * SEARCH_ROW], total = 0.0f, least = INFINITY;
         const int count = other == flow ? 5 : 10;
         for (int k = 0; k < count; ++k) {
             const int side = k % 5; /* itself, left, right, above, below; Mesa 22 misreads a table of vectors */
@@ -381,13 +375,13 @@ __kernel void search_choose(__global const float4 *a,     /* (grid.y, grid.x) de
             if (dot(from_own, from_own) < 0.25f || dot(from_best, from_best) < 0.25f)
                 continue;
             if (total == 0.0f) { /* nothing is calculated where all agree */
-                total = search_weights(a, (int2)(x, y), grid, radius, focus, weights);
-                least = search_window(a, b, (int2)(x, y), own, grid, radius, weights, total, outside.x, INFINITY);
+                total = search_weights(a, (int2)(x, y), grid, wide, radius, focus, weights);
+                least = search_window(a, b, (int2)(x, y), own, grid, wide, radius, weights, total, outside.x, INFINITY);
                 least -= patience;
                 if (least <= 0.0f)
                     break; /* nothing fits so much better */
             }
-            const float cost = search_window(a, b, (int2)(x, y), f, grid, radius, weights, total, outside.y, least);
+            const float cost = search_window(a, b, (int2)(x, y), f, grid, wide, radius, weights, total, outside.y, least);
             if (cost < least) {
                 least = cost;
                 best = f;

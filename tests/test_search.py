@@ -18,6 +18,7 @@ from hugin_abflow.opencl import Buffer, Device
 from hugin_abflow.pyramid import Level
 from hugin_abflow.settings import LargeMotion
 
+MARGIN = 16  # SEARCH_MARGIN of kernels/search.cl
 GRIDS = {"plane": (37, 23, 0, 0), "cylinder": (38, 23, 1, 0), "odd cylinder": (37, 23, 1, 0)}
 REACH = (4, 3)
 
@@ -47,6 +48,25 @@ def run(device: Device, name: str, grid: tuple[int, int, int, int], *arguments: 
     return out.get()
 
 
+def planes(device: Device, descriptor: np.ndarray, grid: tuple[int, int, int, int]) -> Buffer:
+    """Descriptors as kernels take them."""
+    wide = 8 * (grid[0] // 8 + 2) + 2 * MARGIN
+    target = device.empty((grid[1], 4, wide))
+    device.run(
+        "search", "search_planes", (wide, grid[1]), device.upload(descriptor, np.float32), grid, wide, target
+    )
+    return target
+
+
+def choose(
+    device: Device, a: np.ndarray, b: np.ndarray, own: np.ndarray, other: np.ndarray,
+    grid: tuple[int, int, int, int], *arguments: object,
+) -> np.ndarray:  # fmt: skip
+    """`search_choose` of descriptors (height, width, 4)."""
+    both = [planes(device, image, grid) for image in (a, b)]
+    return run(device, "search_choose", grid, *both, own, other, grid, both[0].shape[2], *arguments)
+
+
 @pytest.mark.parametrize("name", list(GRIDS))
 def test_descriptor_equals_its_twin(device: Device, name: str) -> None:
     grid = GRIDS[name]
@@ -68,7 +88,8 @@ def test_descriptor_is_blind_to_contrast(device: Device) -> None:
 def test_costs_equal_their_twins(device: Device, name: str) -> None:
     grid = GRIDS[name]
     a, b = descriptors(5, grid)
-    both = search.volumes(device, device.upload(a), device.upload(b), grid, REACH, 0.5)
+    sent = planes(device, a, grid), planes(device, b, grid)
+    both = search.volumes(device, *sent, grid, REACH, 0.5)
     there, back = (np.moveaxis(cost.get()[..., : grid[0]], 1, 0) for cost in both)
     expected = twin.costs(a, b, grid, REACH, 0.5)
     assert_close(there, expected, SUM)
@@ -79,19 +100,14 @@ def test_costs_equal_their_twins(device: Device, name: str) -> None:
 def test_costs_of_pixels_reach_beyond_borders(device: Device, name: str) -> None:
     """By a column, as the mean of 3 x 3 pixels does."""
     grid = GRIDS[name]
-    images, wide, margin = descriptors(5, grid), 62, 6
-    planes = [device.empty((grid[1], 4, wide)) for _ in images]
-    for image, target in zip(images, planes, strict=True):
-        device.run(
-            "search", "search_planes", (wide, grid[1]), device.upload(image), grid, margin, wide, target
-        )
-        assert_close(target.get(), twin.search_planes(image, grid, margin, wide), 0)
+    images = descriptors(5, grid)
+    both = [planes(device, image, grid) for image in images]
+    wide = both[0].shape[2]
+    for image, found in zip(images, both, strict=True):
+        assert_close(found.get(), twin.search_planes(image, grid, MARGIN, wide), 0)
     count = (2 * REACH[0] + 1) * (2 * REACH[1] + 1)
     cost = device.empty((grid[1], count, 48))
-    device.run(
-        "search", "search_pixel_cost", (6 * count * grid[1],), *planes, grid, REACH, (wide, margin), 0.5, 48,
-        cost,
-    )  # fmt: skip
+    device.run("search", "search_pixel_cost", (6 * count * grid[1],), *both, grid, REACH, wide, 0.5, 48, cost)
     expected = twin.search_pixel_cost(*images, grid, REACH, 0.5)
     mode = {"mode": "wrap"} if grid[2] else {"constant_values": -1}
     expected = np.pad(expected, ((0, 0), (0, 0), (1, 1)), **mode)
@@ -129,7 +145,7 @@ def test_best_equals_its_twin(device: Device, name: str, backward: int, coupling
     directed = volume(twin.directed(cost, grid, REACH, 0.5, backward))
     out = device.empty((grid[1], grid[0], 2))
     sent = device.upload(directed, np.float32), device.upload(near, np.float32)
-    device.run("search", "search_best", (3 * grid[1],), *sent, grid, REACH, coupling, 48, out)
+    device.run("search", "search_best", (5 * grid[1],), *sent, grid, REACH, coupling, 48, out)
     best = out.get()
     expected = twin.search_best(cost, near, grid, REACH, 0.5, coupling, backward)
     assert_close(best, expected, 0, DECISIONS)
@@ -158,7 +174,7 @@ def test_best_tries_all_that_could_be(
     flow = flow.astype(np.float32)
     out = device.empty((height, width, 2))
     sent = device.upload(volume(cost), np.float32), device.upload(flow, np.float32)
-    device.run("search", "search_best", (-(-width // 16) * height,), *sent, grid, reach, coupling, 48, out)
+    device.run("search", "search_best", (-(-width // 8) * height,), *sent, grid, reach, coupling, 48, out)
     found = out.get()
     index = ((found[..., 1] + reach[1]) * (2 * reach[0] + 1) + found[..., 0] + reach[0]).astype(int)
     total = cost + coupling * ((np.array(twin.displacements(reach))[:, None, None] - flow) ** 2).sum(-1)
@@ -227,7 +243,7 @@ def test_choose_equals_its_twin(device: Device, name: str, step: int, radius: in
     arguments = (a, b, own, other, grid, step, radius, 2.0, (0.25, 0.75), 0.06)
     expected = twin.search_choose(*arguments)
     assert 0.2 < (expected != own).any(-1).mean() < 0.95
-    assert_close(run(device, "search_choose", grid, *arguments), expected, 1e-6, 5 * DECISIONS)
+    assert_close(choose(device, *arguments), expected, 1e-6, 5 * DECISIONS)
 
 
 @pytest.mark.parametrize("by", [(0.5, 0.0), (0.0, 0.5), (-0.5, -0.5)])
@@ -243,7 +259,26 @@ def test_windows_end_where_the_images_do(device: Device, by: tuple[float, float]
         arguments = (a, b, own, own, grid, 1, radius, 0.0, (0.25, 0.25), 0.0)
         expected = twin.search_choose(*arguments)
         assert 0.1 < (expected != own).any(-1).mean() < 0.9
-        assert np.array_equal(run(device, "search_choose", grid, *arguments), expected)
+        assert np.array_equal(choose(device, *arguments), expected)
+
+
+@settings(max_examples=40)
+@given(
+    width=st.integers(1, 40), height=st.integers(1, 9), wraps=st.booleans(), radius=st.integers(0, 4),
+    seed=st.integers(0, 2**32 - 1), far=st.sampled_from([1.0, 15.0, 90.0]), t=st.sampled_from([0.0, 0.3]),
+)  # fmt: skip
+def test_windows_lie_wherever_flow_leads(
+    device: Device, width: int, height: int, wraps: bool, radius: int, seed: int, far: float, t: float
+) -> None:
+    """Half beyond a border, far beyond both margins, or several times around a cylinder."""
+    rng, grid = np.random.default_rng(seed), (width, height, int(wraps), 0)
+    a, b = (rng.normal(size=(height, width, 4)).astype(np.float32) for _ in range(2))
+    for image in (a, b):
+        image[..., 3] = rng.random((height, width)) < 0.9
+        image *= image[..., 3:]
+    own, other = (np.round(rng.normal(0, far, (height, width, 2))).astype(np.float32) + t for _ in range(2))
+    arguments = (a, b, own, other, grid, 1, radius, 1.0, (0.5, 0.5), 0.01)
+    assert_close(choose(device, *arguments), twin.search_choose(*arguments), 1e-6, DECISIONS)
 
 
 def test_twin_of_window_by_hand() -> None:
