@@ -66,6 +66,8 @@ class SearchParameters:
     def __post_init__(self) -> None:
         if max(self.radius) > _LARGEST_RADIUS:
             raise ValueError(f"radius is {self.radius}; windows have a radius of at most {_LARGEST_RADIUS}")
+        if max(self.furthest) >= _MARGIN:
+            raise ValueError(f"furthest is {self.furthest}; descriptors have a margin of {_MARGIN}")
 
 
 def descriptor(device: Device, feature: Buffer, grid: Grid, parameters: SearchParameters) -> Buffer:
@@ -78,7 +80,9 @@ def descriptor(device: Device, feature: Buffer, grid: Grid, parameters: SearchPa
 
 
 def _pitch(grid: Grid) -> int:
-    """Columns of costs: what is read eight at a time from up to two columns further on ends within them."""
+    """Columns of costs, and of descriptors without margins: what is read eight at a time, from up to two
+    columns further on, ends within them.
+    """
     return 8 * (-(-grid[0] // 8) + 1)
 
 
@@ -137,8 +141,6 @@ def volumes(
     a, b: descriptors; outside: the cost of what the other image does not show.
     """
     width, height = grid[:2]
-    if reach[0] >= _MARGIN:
-        raise ValueError(f"reach is {reach[0]} px; descriptors have a margin of {_MARGIN}")
     count, pitch, wide = (2 * reach[0] + 1) * (2 * reach[1] + 1), _pitch(grid), a.shape[2]
     pixel_cost, cost = (device.empty((height, count, pitch)) for _ in range(2))
     device.run(

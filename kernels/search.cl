@@ -11,7 +11,7 @@
 
 #define SEARCH_SLOPE 1.5f /* weight of the derivatives beside h */
 #define SEARCH_UNLIKE 0.5f /* squared difference of descriptors that is half a misfit */
-#define SEARCH_MARGIN 16
+#define SEARCH_MARGIN 16  /* more than a reach, and no less than SEARCH_ROW */
 #define SEARCH_RADIUS 4   /* px, of the largest window in which flows are compared */
 #define SEARCH_ROW 16     /* columns of a window's row: they are compared eight at a time */
 
@@ -84,7 +84,7 @@ __kernel void search_pixel_cost(__global const float *a, /* (grid.y, 4, wide) de
                                 int wide,
                                 float outside,           /* misfit where one of both is not known */
                                 int pitch,               /* run size: pitch / 8 x displacements x grid.y */
-                                __global float *cost)    /* (grid.y, displacements, pitch): the first one is at x = -1 */
+                                __global float *cost)    /* (grid.y, displacements, pitch), from x = -1 on */
 {
     const int span = 2 * reach.x + 1, count = span * (2 * reach.y + 1);
     const int2 eight = search_eight(pitch / 8);
@@ -159,7 +159,7 @@ __kernel void search_turned(__global const float *cost, /* (grid.y, displacement
 /* The displacement that costs least, with what it is away from `flow`; eight pixels at a time. No cost is below 0, so
    what is so far away from all eight that this alone is more than they pay next to their flow is not tried. */
 __kernel void search_best(__global const float *cost,  /* (grid.y, displacements, pitch) of this direction */
-                          __global const float2 *flow, /* (grid.y, grid.x) px */
+                          __global const float2 *flow, /* (grid.y, grid.x) px, finite */
                           int4 grid,                   /* run size: ceil(grid.x / 8) x grid.y */
                           int2 reach,                  /* px */
                           float coupling,              /* cost of a squared pixel away from flow */
@@ -186,8 +186,8 @@ __kernel void search_best(__global const float *cost,  /* (grid.y, displacements
         near_y[i] = near.y;
     }
     const float8 from_x = vload8(0, near_x), from_y = vload8(0, near_y);
-    /* by more than rounding could make up for; without a coupling everything is tried */
-    const float2 within = (float2)(1.001f * sqrt(most / fmax(coupling, 1e-9f)) + 0.001f);
+    /* by more than rounding could make up for; without a coupling, all but what would gain less than that */
+    const float2 within = (float2)(1.001f * ROOT(most / GREATEST(coupling, 1e-9f)) + 0.001f);
     const int2 low = convert_int2(fmax(ceil(first - within), -furthest));
     const int2 high = convert_int2(fmin(floor(last + within), furthest));
     float8 least = (float8)(INFINITY);
@@ -305,13 +305,14 @@ static inline float search_row(__global const float *own, __global const float *
                                float2 shares, float t, int wide, int side, const float *weights, float outside) {
     float sum = 0.0f;
     for (int i = 0; i < side; i += 8, own += 8, upper += 8, lower += 8) {
-        float8 there[4];
-        for (int k = 0; k < 4; ++k)
-            there[k] = search_between(upper + k * wide, lower + k * wide, shares, t);
-        const float8 found = search_misfit(vload8(0, own), vload8(0, own + wide), vload8(0, own + 2 * wide), there[0],
-                                           there[1], there[2]);
+        const float8 b0 = search_between(upper, lower, shares, t);
+        const float8 b1 = search_between(upper + wide, lower + wide, shares, t);
+        const float8 b2 = search_between(upper + 2 * wide, lower + 2 * wide, shares, t);
+        const float8 known = search_between(upper + 3 * wide, lower + 3 * wide, shares, t);
+        const float8 a0 = vload8(0, own), a1 = vload8(0, own + wide), a2 = vload8(0, own + 2 * wide);
+        const float8 found = search_misfit(a0, a1, a2, b0, b1, b2);
         float misfits[8];
-        vstore8(there[3] > 0.999f ? found : (float8)(outside), 0, misfits);
+        vstore8(known > 0.999f ? found : (float8)(outside), 0, misfits);
         for (int k = 0; k < 8 && i + k < side; ++k)
             sum += weights[i + k] * misfits[k];
     }
@@ -324,17 +325,19 @@ static inline float search_window(__global const float *a, __global const float 
                                   float least) {
     const float2 base = floor(f), t = f - base;
     const int side = 2 * radius + 1, above = at.y + (int)base.y - radius;
-    int left = at.x + (int)base.x - radius; /* of which nothing is in the grid is as unknown next to it */
-    left = grid.z ? (left % grid.x + grid.x) % grid.x : clamp(left, -SEARCH_MARGIN, grid.x);
+    /* columns beside the grid are all unknown: a window there may as well lie next to it, in the margins */
+    int left = at.x + (int)base.x - radius;
+    left = grid.z ? (left % grid.x + grid.x) % grid.x : LIMITED(left, -SEARCH_MARGIN, grid.x);
     float sum = 0.0f;
     for (int j = 0; j < side; ++j, weights += SEARCH_ROW) {
-        const int own = clamp(at.y - radius + j, 0, grid.y - 1), y = above + j; /* beyond, nothing has a weight */
+        /* of its own rows those beyond the grid have no weight: any will do */
+        const int own = LIMITED(at.y - radius + j, 0, grid.y - 1), y = above + j;
         const float2 shares =
             (float2)(y >= 0 && y < grid.y ? 1.0f - t.y : 0.0f, y + 1 >= 0 && y + 1 < grid.y ? t.y : 0.0f);
         sum += search_row(search_place(a, at.x - radius, own, 0, wide),
-                          search_place(b, left, clamp(y, 0, grid.y - 1), 0, wide),
-                          search_place(b, left, clamp(y + 1, 0, grid.y - 1), 0, wide), shares, t.x, wide, side, weights,
-                          outside);
+                          search_place(b, left, LIMITED(y, 0, grid.y - 1), 0, wide),
+                          search_place(b, left, LIMITED(y + 1, 0, grid.y - 1), 0, wide), shares, t.x, wide, side,
+                          weights, outside);
         if (sum > least * total * 1.001f) /* by more than rounding could make up for */
             return INFINITY;
     }
@@ -381,7 +384,8 @@ __kernel void search_choose(__global const float *a,      /* (grid.y, 4, wide) d
                 if (least <= 0.0f)
                     break; /* nothing fits so much better */
             }
-            const float cost = search_window(a, b, (int2)(x, y), f, grid, wide, radius, weights, total, outside.y, least);
+            const float cost =
+                search_window(a, b, (int2)(x, y), f, grid, wide, radius, weights, total, outside.y, least);
             if (cost < least) {
                 least = cost;
                 best = f;

@@ -50,7 +50,7 @@ def run(device: Device, name: str, grid: tuple[int, int, int, int], *arguments: 
 
 def planes(device: Device, descriptor: np.ndarray, grid: tuple[int, int, int, int]) -> Buffer:
     """Descriptors as kernels take them."""
-    wide = 8 * (grid[0] // 8 + 2) + 2 * MARGIN
+    wide = 8 * (-(-grid[0] // 8) + 1) + 2 * MARGIN
     target = device.empty((grid[1], 4, wide))
     device.run(
         "search", "search_planes", (wide, grid[1]), device.upload(descriptor, np.float32), grid, wide, target
@@ -472,6 +472,9 @@ def test_levels_of_the_search() -> None:
     assert search.reaches(3, 6, how, finest=1) == {0: 3}
 
 
-def test_a_window_that_kernels_do_not_hold_is_refused() -> None:
+def test_what_kernels_do_not_hold_is_refused() -> None:
+    """A larger window, and displacements beyond the margin of descriptors."""
     with pytest.raises(ValueError, match="at most 4"):
         search.SearchParameters(radius=(2, 5))
+    with pytest.raises(ValueError, match="margin of 16"):
+        search.SearchParameters(furthest=(10, 16))
