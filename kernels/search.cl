@@ -57,10 +57,9 @@ __kernel void search_planes(__global const float4 *descriptor, /* (grid.y, grid.
     to[3 * wide] = d.w;
 }
 
-/* A component of the descriptors of row y, from column x on. */
-static inline __global const float *search_place(__global const float *descriptor, int x, int y, int component,
-                                                 int wide) {
-    return descriptor + (4 * y + component) * wide + SEARCH_MARGIN + x;
+/* The first component of the descriptors of row y, from column x on; the others are `wide` columns further each. */
+static inline __global const float *search_place(__global const float *descriptor, int x, int y, int wide) {
+    return descriptor + 4 * y * wide + SEARCH_MARGIN + x;
 }
 
 /* How badly eight descriptors, given by component, fit others that are known. */
@@ -92,11 +91,11 @@ __kernel void search_pixel_cost(__global const float *a, /* (grid.y, 4, wide) de
     const int y = row / count, index = row - y * count, there = y + index / span - reach.y;
     if (y >= grid.y)
         return;
-    __global const float *own = search_place(a, x, y, 0, wide);
+    __global const float *own = search_place(a, x, y, wide);
     const float8 known = vload8(0, own + 3 * wide);
     float8 misfit = (float8)(outside);
     if (there >= 0 && there < grid.y) {
-        __global const float *other = search_place(b, x + index % span - reach.x, there, 0, wide);
+        __global const float *other = search_place(b, x + index % span - reach.x, there, wide);
         const float8 found = search_misfit(vload8(0, own), vload8(0, own + wide), vload8(0, own + 2 * wide),
                                            vload8(0, other), vload8(0, other + wide), vload8(0, other + 2 * wide));
         misfit = known * vload8(0, other + 3 * wide) > 0.0f ? found : misfit;
@@ -176,20 +175,21 @@ __kernel void search_best(__global const float *cost,  /* (grid.y, displacements
     float near_x[8], near_y[8], most = 0.0f;
     for (int i = 0; i < 8; ++i) {
         const int lane = LEAST(i, count - 1);
-        const float2 near = flow[y * grid.x + x + lane], whole = clamp(rint(near), -furthest, furthest);
+        const float2 near = flow[y * grid.x + x + lane], whole = LIMITED(rint(near), -furthest, furthest);
         const float2 away = whole - near;
         const int2 place = convert_int2(whole) + reach;
-        most = fmax(most, cost[(place.y * span + place.x) * pitch + lane] + coupling * dot(away, away));
-        first = fmin(first, near);
-        last = fmax(last, near);
+        const float pays = cost[(place.y * span + place.x) * pitch + lane] + coupling * square2(away);
+        most = GREATEST(most, pays);
+        first = LEAST(first, near);
+        last = GREATEST(last, near);
         near_x[i] = near.x;
         near_y[i] = near.y;
     }
     const float8 from_x = vload8(0, near_x), from_y = vload8(0, near_y);
     /* by more than rounding could make up for; without a coupling, all but what would gain less than that */
     const float2 within = (float2)(1.001f * ROOT(most / GREATEST(coupling, 1e-9f)) + 0.001f);
-    const int2 low = convert_int2(fmax(ceil(first - within), -furthest));
-    const int2 high = convert_int2(fmin(floor(last + within), furthest));
+    const int2 low = convert_int2(GREATEST(ceil(first - within), -furthest));
+    const int2 high = convert_int2(LEAST(floor(last + within), furthest));
     float8 least = (float8)(INFINITY);
     int8 found = (int8)(0);
     for (int v = low.y; v <= high.y; ++v) {
@@ -274,16 +274,16 @@ __kernel void search_agree(__global const float *cost,   /* (grid.y, displacemen
 static inline float search_weights(__global const float *a, int2 at, int4 grid, int wide, int radius, float focus,
                                    float *weights) {
     const int side = 2 * radius + 1;
-    const float middle = *search_place(a, at.x, at.y, 0, wide);
+    const float middle = *search_place(a, at.x, at.y, wide);
     float sum = 0.0f;
     for (int j = -radius; j <= radius; ++j, weights += SEARCH_ROW) {
         const int y = at.y + j;
+        __global const float *own = search_place(a, at.x - radius, y, wide);
         for (int i = 0; i < side; i += 8) {
             float8 weight = (float8)(0.0f);
             if (y >= 0 && y < grid.y) {
-                const float8 own = vload8(0, search_place(a, at.x - radius + i, y, 0, wide));
-                const float8 known = vload8(0, search_place(a, at.x - radius + i, y, 3, wide));
-                weight = known != 0.0f ? exp(-focus * fabs(own - middle)) : weight;
+                const float8 looks = exp(-focus * fabs(vload8(0, own + i) - middle));
+                weight = vload8(0, own + 3 * wide + i) != 0.0f ? looks : weight;
             }
             vstore8(weight, 0, weights + i);
         }
@@ -293,7 +293,7 @@ static inline float search_weights(__global const float *a, int2 at, int4 grid, 
     return sum;
 }
 
-/* Eight values of a component between two rows, by their shares, and by t between columns from p's on. */
+/* Eight values of a component: between two rows by their shares, and between columns by t. */
 static inline float8 search_between(__global const float *upper, __global const float *lower, float2 shares, float t) {
     const float8 left = shares.x * vload8(0, upper) + shares.y * vload8(0, lower);
     const float8 right = shares.x * vload8(0, upper + 1) + shares.y * vload8(0, lower + 1);
@@ -334,9 +334,9 @@ static inline float search_window(__global const float *a, __global const float 
         const int own = LIMITED(at.y - radius + j, 0, grid.y - 1), y = above + j;
         const float2 shares =
             (float2)(y >= 0 && y < grid.y ? 1.0f - t.y : 0.0f, y + 1 >= 0 && y + 1 < grid.y ? t.y : 0.0f);
-        sum += search_row(search_place(a, at.x - radius, own, 0, wide),
-                          search_place(b, left, LIMITED(y, 0, grid.y - 1), 0, wide),
-                          search_place(b, left, LIMITED(y + 1, 0, grid.y - 1), 0, wide), shares, t.x, wide, side,
+        sum += search_row(search_place(a, at.x - radius, own, wide),
+                          search_place(b, left, LIMITED(y, 0, grid.y - 1), wide),
+                          search_place(b, left, LIMITED(y + 1, 0, grid.y - 1), wide), shares, t.x, wide, side,
                           weights, outside);
         if (sum > least * total * 1.001f) /* by more than rounding could make up for */
             return INFINITY;
@@ -365,7 +365,7 @@ __kernel void search_choose(__global const float *a,      /* (grid.y, 4, wide) d
     const int at = y * grid.x + x;
     const float2 own = flow[at];
     float2 best = own;
-    if (*search_place(a, x, y, 3, wide) > 0.0f) {
+    if (search_place(a, x, y, wide)[3 * wide] > 0.0f) {
         float weights[(2 * SEARCH_RADIUS + 1) * SEARCH_ROW], total = 0.0f, least = INFINITY;
         const int count = other == flow ? 5 : 10;
         for (int k = 0; k < count; ++k) {

@@ -15,7 +15,6 @@ from tolerances import DECISIONS, SUM, TRIGONOMETRY, assert_close
 from hugin_abflow import search
 from hugin_abflow.opencl import Buffer, Device
 
-MARGIN = 16  # SEARCH_MARGIN of kernels/search.cl
 GRIDS = {"plane": (37, 23, 0, 0), "cylinder": (38, 23, 1, 0), "odd cylinder": (37, 23, 1, 0)}
 REACH = (4, 3)
 
@@ -47,7 +46,7 @@ def run(device: Device, name: str, grid: tuple[int, int, int, int], *arguments: 
 
 def planes(device: Device, descriptor: np.ndarray, grid: tuple[int, int, int, int]) -> Buffer:
     """Descriptors as kernels take them."""
-    wide = 8 * (-(-grid[0] // 8) + 1) + 2 * MARGIN
+    wide = search._pitch(grid) + 2 * search._MARGIN
     target = device.empty((grid[1], 4, wide))
     device.run(
         "search", "search_planes", (wide, grid[1]), device.upload(descriptor, np.float32), grid, wide, target
@@ -101,7 +100,7 @@ def test_costs_of_pixels_reach_beyond_borders(device: Device, name: str) -> None
     both = [planes(device, image, grid) for image in images]
     wide = both[0].shape[2]
     for image, found in zip(images, both, strict=True):
-        assert_close(found.get(), twin.search_planes(image, grid, MARGIN, wide), 0)
+        assert_close(found.get(), twin.search_planes(image, grid, search._MARGIN, wide), 0)
     count = (2 * REACH[0] + 1) * (2 * REACH[1] + 1)
     cost = device.empty((grid[1], count, 48))
     device.run("search", "search_pixel_cost", (6 * count * grid[1],), *both, grid, REACH, wide, 0.5, 48, cost)
