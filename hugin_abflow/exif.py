@@ -56,7 +56,8 @@ class Metadata:
 
     def attributes(self) -> dict[str, str | tuple[float, ...]]:
         """What EXR holds, by OpenImageIO's names: texts, and degrees, minutes, seconds."""
-        found: dict[str, str | tuple[float, ...]] = {}
+        # Without a date OpenImageIO writes that of now, and equal panoramas would be unequal files.
+        found: dict[str, str | tuple[float, ...]] = {"DateTime": ""}
         for directory, names in _EXR_NAMES.items():
             for tag, value in self.exif.get(directory, {}).items():
                 if tag in names and value.kind == ASCII:

@@ -145,7 +145,7 @@ class ImageWriter:
             if canvas_size is not None:
                 spec.full_x, spec.full_y = 0, 0
                 spec.full_width, spec.full_height = canvas_size
-            for name, value in self.metadata.attributes().items() if self.metadata else ():
+            for name, value in (self.metadata or Metadata({})).attributes().items():
                 if isinstance(value, str):
                     spec[name] = value
                 else:

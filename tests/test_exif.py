@@ -156,6 +156,16 @@ def test_exr_carries_what_openimageio_can(exiftool: str, tmp_path: Path) -> None
     assert tags["OpenEXR:GPSLatitude"].startswith("48 30 12.34")
 
 
+@pytest.mark.parametrize("dated", ["no metadata", "no date", "a date"])
+def test_exr_is_dated_as_the_photos_only(tmp_path: Path, dated: str) -> None:
+    """OpenImageIO dates what has no date itself: to the second, so that equal panoramas seldom differed."""
+    path = tmp_path / "a.exr"
+    date = {306: text("2020:01:02 03:04:05")} if dated == "a date" else {}
+    picture(path, np.float16, None if dated == "no metadata" else Metadata({MAIN: TAGS[MAIN] | date}))
+    assert (b"capDate" in path.read_bytes()) == bool(date)
+    assert (b"2020:01:02 03:04:05" in path.read_bytes()) == bool(date)
+
+
 @pytest.mark.parametrize("ending", [*FORMATS, ".exr"])
 def test_equal_panoramas_are_equal_files(tmp_path: Path, ending: str) -> None:
     dtype = np.float16 if ending == ".exr" else np.uint8
