@@ -17,6 +17,9 @@ Mask = npt.NDArray[np.bool_]
 Flows = tuple[npt.NDArray[np.float32], npt.NDArray[np.float32]]
 Places = npt.NDArray[np.float64]  # (n, 2): x right, y down, px of the chart; a pixel's centre at .5
 
+# Cells of a chart, (height, width), by the number of the thing that they show; 0: none.
+Things = npt.NDArray[np.int32]
+
 # Chart pixels per cell: a cell is told by the flow at its centre.
 CELL = 4
 # Cells by which what is found is to be grown: flow is smooth across outlines.
@@ -25,6 +28,10 @@ GROWN = 3
 LEAST = 20
 # Chart pixels between start and return of a flow that is believed.
 CONSISTENT = 1.0
+
+# Cells of a thing that may lie at a photo's border, beyond which the other photo goes on, for it still to
+# show the whole, and their share of those at the other's border; and how far from a border lies at it.
+_FEW, _FEWER, _AT = 2, 0.15, 2
 
 
 @dataclass(frozen=True)
@@ -146,6 +153,20 @@ def reached(ends: Places, shape: tuple[int, ...], chart: Chart) -> Mask:
     _, (row, column) = cells_at(ends, found.shape, chart)
     found[row, column] = True
     return found
+
+
+def ends_within(
+    shown: Sequence[Things], count: int, masks: tuple[Mask, Mask], wraps: bool
+) -> npt.NDArray[np.bool_]:
+    """Which things one photo shows as far as the other one does: they cross the other's border alone."""
+    crossing = np.zeros((2, count))
+    for number, (own, other) in enumerate((masks, masks[::-1])):
+        border = grown(own & ~other, _AT, wraps)
+        for its in shown:
+            crossing[number] += np.bincount(its[border], minlength=count)
+    within: npt.NDArray[np.bool_] = crossing.min(0) <= _FEW + _FEWER * crossing.max(0)
+    within[0] = False
+    return within
 
 
 def grown(mask: Mask, by: int, wraps: bool) -> Mask:

@@ -19,12 +19,23 @@ import numpy as np
 import numpy.typing as npt
 import scipy
 
-from hugin_abflow.cells import CELL, LEAST, Flows, Mask, Places, View, Way, Whole, at_centres, cells_at, grown
+from hugin_abflow.cells import (
+    CELL,
+    LEAST,
+    Flows,
+    Mask,
+    Places,
+    Things,
+    View,
+    Way,
+    Whole,
+    at_centres,
+    cells_at,
+    ends_within,
+    grown,
+)
 from hugin_abflow.chart import Chart
 from hugin_abflow.working import connected
-
-# Cells of a chart, (height, width), by the number of the thing that they show; 0: none.
-Things = npt.NDArray[np.int32]
 
 # Chart pixels by which flow may differ from cell to cell within a surface.
 _ALIKE = 0.75
@@ -34,9 +45,6 @@ _WIDE, _SHARE = 40, 0.15
 _APART, _FAR = 4.0, 6.0
 # Strain from which on a thing is taken whole.
 _STRAIN = 0.08
-# Cells of a thing that may lie at a photo's border, beyond which the other photo goes on, for it still to
-# show the whole, and their share of those at the other's border; and how far from a border lies at it.
-_FEW, _FEWER, _AT = 2, 0.15, 2
 # Cells that a thing's outline is smoothed by.
 _CLOSED = 2
 
@@ -56,7 +64,7 @@ def find(
     width = _width(masks, chart.wraps)
     found = [_standing_out(way, width, (vouched[k], vouched[1 - k])) for k, way in enumerate(ways)]
     shown, strain = _joined(chart, ways, found)
-    kept = (strain >= _STRAIN) & _ends_within(shown, len(strain), masks, chart.wraps)
+    kept = (strain >= _STRAIN) & ends_within(shown, len(strain), masks, chart.wraps)
     return Whole.of([_filled(kept[its], chart.wraps) for its in shown], chart.wraps)
 
 
@@ -105,20 +113,6 @@ def _joined(
     strains = np.zeros(total)
     np.maximum.at(strains, thing, np.concatenate([strain, other_strain[1:]]))
     return [thing[its] for its in shown], strains
-
-
-def _ends_within(
-    shown: Sequence[Things], count: int, masks: tuple[Mask, Mask], wraps: bool
-) -> npt.NDArray[np.bool_]:
-    """Which things one photo shows as far as the other one does: they cross the other's border alone."""
-    crossing = np.zeros((2, count))
-    for number, (own, other) in enumerate((masks, masks[::-1])):
-        border = grown(own & ~other, _AT, wraps)
-        for its in shown:
-            crossing[number] += np.bincount(its[border], minlength=count)
-    within: npt.NDArray[np.bool_] = crossing.min(0) <= _FEW + _FEWER * crossing.max(0)
-    within[0] = False
-    return within
 
 
 def _surfaces(way: Way) -> npt.NDArray[np.int32]:

@@ -27,6 +27,8 @@ from hugin_abflow.cells import (
     View,
     Way,
     Whole,
+    at_centres,
+    ends_within,
     grown,
     reached,
 )
@@ -91,7 +93,8 @@ def find(
         apart = np.where(its_way, np.minimum(apart, 1.0), apart).reshape(way.shown.shape)
         if searched:  # only what is certain
             apart *= way.believed
-        its = _things(way, apart, (views[index], views[1 - index]), (vouched[index], vouched[1 - index]))
+        sides = (views[index], views[1 - index]), (vouched[index], vouched[1 - index])
+        its = _things(chart, way, apart, *sides)
         found[index] |= its
         found[1 - index] |= reached(way.ends[its & way.believed], its.shape, chart)
     return Whole.of(found, chart.wraps)
@@ -103,16 +106,31 @@ def _seen(eye: Eye, way: Way, index: int) -> tuple[epipolar.Points, epipolar.Poi
     return seen[index], seen[1 - index]
 
 
-def _things(way: Way, apart: Places, views: tuple[View, View], vouched: tuple[Places, Places]) -> Mask:
+def _things(
+    chart: Chart, way: Way, apart: Places, views: tuple[View, View], vouched: tuple[Places, Places]
+) -> Mask:
     """The cells of what moves by itself; apart: by how much each misses parallax, of the limit."""
     things = connected(apart > _WEAK, way.around > 0)
     clear = np.bincount(things[(apart > 1) & way.shown], minlength=things.max() + 1)
     kept = clear >= np.maximum(LEAST, _CLEAR * np.bincount(things.ravel()))
     kept[way.vouched(things, vouched)] = False
     for thing in np.flatnonzero(kept):
-        kept[thing] = _differs(*views, way, things == thing)
+        kept[thing] = _ends_within(chart, way, views, things == thing) and _differs(
+            *views, way, things == thing
+        )
     its: Mask = kept[things]
     return its
+
+
+def _ends_within(chart: Chart, way: Way, views: tuple[View, View], thing: Mask) -> bool:
+    """Whether one photo shows a thing as far as the other one does: taken from either, what crosses the
+    overlap would break at a border. Most often it is no thing: photos that are badly aligned miss parallax.
+    """
+    its = thing & way.shown
+    there = reached(way.ends[its & way.believed], its.shape, chart)
+    masks = at_centres(views[0].mask) > 0, at_centres(views[1].mask) > 0
+    shown = [its.astype(np.int32), there.astype(np.int32)]
+    return bool(ends_within(shown, 2, masks, chart.wraps)[1])
 
 
 def _differs(here: View, there: View, way: Way, thing: Mask) -> bool:

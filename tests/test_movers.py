@@ -311,6 +311,33 @@ def test_what_only_one_photo_shows_is_not_told() -> None:
             assert (replace(one, views=tuple(views)).found() is not None) == expected
 
 
+@BOTH
+def test_what_crosses_the_overlap_is_left_alone(wraps: bool) -> None:
+    """Taken from either photo, it would break at that one's border. What one photo shows as far as the other
+    one does is found: where one border crosses it, and where both photos end, so that nothing goes on.
+    """
+    one = scene(Thing(AHEAD, UP, 0.15), wraps=wraps)
+    columns = np.flatnonzero(one.shown[0][0].any(0))
+    beside = np.s_[columns[0] - 16 : columns[-1] + 17]
+    rows = [np.flatnonzero(shown.any(1)) for shown in one.shown[0]]
+    top, bottom = max(its[0] for its in rows) + 8, min(its[-1] for its in rows) - 8
+    nothing = np.s_[:0]
+    for first, second, expected in (
+        (nothing, nothing, True),
+        (np.s_[:top], nothing, True),
+        (nothing, np.s_[bottom:], True),
+        (np.s_[:top], np.s_[:top], True),
+        (np.s_[:top], np.s_[bottom:], False),
+    ):
+        views = []
+        for view, gone in zip(one.views, (first, second), strict=True):
+            mask = view.mask.copy()
+            mask[gone, beside] = 0
+            views.append(replace(view, mask=mask))
+        for flows, seen in ((one.flows, views), (one.flows[::-1], views[::-1])):
+            assert (replace(one, flows=flows, views=tuple(seen)).found() is not None) == expected
+
+
 @pytest.mark.parametrize("index", [0, 1])
 def test_flow_beside_a_mask_tells_nothing_of_the_move(index: int) -> None:
     """A third of the chart, of which one photo shows nothing; flow has been carried there, anyhow, and leads
