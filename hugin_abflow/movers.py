@@ -149,8 +149,8 @@ def _differs(here: View, there: View, way: Way, thing: Mask) -> bool:
     inside = _difference(here, there, its, way.flow[tuple(nearest[:, its[0], its[1]])])
     if min(beside.size, inside.size) < LEAST:
         return False
-    exposure = np.median(beside)
-    off, around = (np.abs(one - exposure).mean() for one in (inside, beside))
+    # each from its own median: exposure may be another one there, and change faster than anything tells
+    off, around = (np.abs(one - np.median(one)).mean() for one in (inside, beside))
     return bool(off >= max(_DIFFERS, _MORE * around))
 
 
