@@ -167,8 +167,8 @@ def test_flow_that_the_photos_do_not_ask_for_is_left_alone() -> None:
 
 @pytest.mark.parametrize("index", [0, 1])
 def test_a_photo_that_is_darker_in_a_place_has_no_thing_there(index: int) -> None:
-    """Towards a lens's border, say: all of it by about as much, and by more than what is around. What took a step
-    there is found still."""
+    """Towards a lens's border, say: all of it by about as much, and by more than what is around. What took a
+    step there is found still."""
     he = scene(Thing(AHEAD, UP))
     place = near(he.shown[0][0] | he.shown[0][1], 8, False).astype(np.float32)
     darker = 0.8 * ndimage.gaussian_filter(place, 3)
