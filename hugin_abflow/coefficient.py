@@ -10,7 +10,7 @@ import math
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import repeat
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -35,6 +35,22 @@ class Masks:
     def only(self, indices: Sequence[int]) -> Masks:
         """The masks of some of the layers."""
         return Masks(self.grid, tuple(self.buffers[i] for i in indices), self.host[list(indices)])
+
+
+class Overlaps(Sequence[npt.NDArray[np.bool_]]):
+    """Where pairs of layers overlap, (height, width) on the mask grid. Each is made when it is asked for: all
+    of 300 layers take gigabytes.
+    """
+
+    def __init__(self, masks: Masks, pairs: Sequence[tuple[int, int]]) -> None:
+        self._covered, self._pairs = masks.host, pairs
+
+    def __len__(self) -> int:
+        return len(self._pairs)
+
+    def __getitem__(self, index: Any) -> Any:  # of numbers only
+        first, second = self._pairs[index]
+        return self._covered[first] & self._covered[second]
 
 
 def on_cells(values: npt.NDArray[_Kind], cells: Grid, rule: np.ufunc) -> npt.NDArray[_Kind]:

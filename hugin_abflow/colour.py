@@ -30,7 +30,7 @@ from hugin_abflow.coefficient import on_cells
 from hugin_abflow.geometry import Pair
 from hugin_abflow.opencl import Buffer, Device
 from hugin_abflow.settings import Settings
-from hugin_abflow.working import Grid, WorkingLayer
+from hugin_abflow.working import Grid, Place, WorkingLayer, cells_under, common
 
 # Working pixels per cell of the colour grid.
 _CELL = 16
@@ -69,11 +69,13 @@ _MISFIT = 0.05
 
 @dataclass(frozen=True)
 class Difference:
-    """How layers a and b (indices) differ, float64 (height, width, 4) on the colour grid.
+    """How layers a and b (indices) differ, float64 (height, width, 4) on cells of the colour grid.
 
     values  a - b on the exposure scale, r, g, b, and a weight 0..1.
     beyond  the same where only one of them is clipped, a if the weight is positive, b if it is negative: at
             least that much.
+    mixing  how far both are seen, (height, width).
+    place   the first cell's column and row: there are none where only one layer can be.
     """
 
     a: int
@@ -81,6 +83,13 @@ class Difference:
     values: npt.NDArray[np.float64]
     beyond: npt.NDArray[np.float64]
     mixing: npt.NDArray[np.float64]
+    place: tuple[int, int] = (0, 0)
+
+    @property
+    def cells(self) -> tuple[slice, slice]:
+        """Those cells, of the colour grid's rows and columns."""
+        (left, top), (height, width) = self.place, self.mixing.shape
+        return slice(top, top + height), slice(left, left + width)
 
 
 @dataclass(frozen=True)
@@ -159,7 +168,7 @@ def correction(
     differences = measured.differences
     if ignored is not None:
         counts = ~on_cells(ignored[None], cells, np.logical_or)[0]
-        differences = tuple(_weighed(d, counts) for d in differences)
+        differences = tuple(_weighed(d, counts[d.cells]) for d in differences)
     if settings.flow:  # without, layers are not mixed but cut, somewhere
         differences = tuple(_weighed(d, d.mixing + _UNSEEN) for d in differences)
     if not any(np.any(v[..., :3] * v[..., 3:]) for d in differences for v in (d.values, d.beyond)):
@@ -203,24 +212,32 @@ class _Overlap:
         """What both kernels begin with."""
         pairs = [(self.layers[k], self.fields[k]) for k in (self.pair.a, self.pair.b)]
         sides = [value for layer, field in pairs for value in (layer.pixels, field, layer.box)]
-        return [*sides, self.grid.border, self.grid.lens, self.cells.border]
+        return [*sides, self.grid.border, self.grid.lens, self.cells.border, self._part]
+
+    @property
+    def _part(self) -> Place:
+        """The cells that both layers' boxes reach into."""
+        first, second = (self.layers[k].box for k in (self.pair.a, self.pair.b))
+        return cells_under(common(first, second), self.grid, self.cells)
 
     def difference(self, shoulder: float) -> Difference:
         """The difference on the exposure scale of a shoulder."""
-        values, beyond = (self.device.empty((*self.cells.shape, 4)) for _ in range(2))
-        mixing = self.device.empty(self.cells.shape)
+        left, top, *size = self._part
+        values, beyond = (self.device.empty((*size[::-1], 4)) for _ in range(2))
+        mixing = self.device.empty(size[::-1])
         self.device.run(
-            "colour", "colour_difference", self.cells.border[:2],
+            "colour", "colour_difference", size,
             *self._sides, shoulder, *self._clipping, _SPREAD, values, beyond, mixing,
         )  # fmt: skip
-        host = (v.get().astype(np.float64) for v in (values, beyond, mixing))
-        return Difference(self.pair.a, self.pair.b, *host)
+        one, other, seen = (v.get().astype(np.float64) for v in (values, beyond, mixing))
+        return Difference(self.pair.a, self.pair.b, one, other, seen, (left, top))
 
     def misfit(self) -> npt.NDArray[np.float64]:
         """What is left of the difference on the scale of each of _SHOULDERS: (cells, shoulders)."""
-        misfit = self.device.empty((*self.cells.shape, 4))
+        size = self._part[2:]
+        misfit = self.device.empty((*size[::-1], 4))
         self.device.run(
-            "colour", "colour_misfit", self.cells.border[:2],
+            "colour", "colour_misfit", size,
             *self._sides, _SHOULDERS, *self._clipping, misfit,
         )  # fmt: skip
         return misfit.get().astype(np.float64).reshape(-1, len(_SHOULDERS))
@@ -252,10 +269,14 @@ def solve(measured: Measured, rounds: Sequence[tuple[float, float]] = _ROUNDS) -
     step, stiffness = _steps(
         [(number, np.roll(number, -1, 2), east), (number, np.roll(number, -1, 1), south)], count
     )
-    # what a layer is measured to be beside its own cells binds nothing else
-    evidence = [d.values[..., 3] * area * (inside[d.a] & inside[d.b]) for d in differences]
+    evidence = []
+    for d in differences:
+        # what a layer is measured to be beside its own cells binds nothing else
+        both = inside[d.a][d.cells] & inside[d.b][d.cells]
+        evidence.append(d.values[..., 3] * area[d.cells[0]] * both)
     link, weight = _steps(
-        [(number[d.a], number[d.b], e) for d, e in zip(differences, evidence, strict=True)], count
+        [(number[d.a][d.cells], number[d.b][d.cells], e) for d, e in zip(differences, evidence, strict=True)],
+        count,
     )
     difference = np.concatenate([d.values[e > 0, :3] for d, e in zip(differences, evidence, strict=True)])
     bounds = _Bounds(measured, number, area, count)
@@ -332,8 +353,9 @@ class _Bounds:
         unknowns, targets, weights = [], [], []
         for d in measured.differences:
             for other, sign in ((d.b, 1.0), (d.a, -1.0)):
-                weight = np.maximum(sign * d.beyond[..., 3], 0) * area * measured.inside[other]
-                unknowns.append(number[other][weight > 0])
+                its = measured.inside[other][d.cells]
+                weight = np.maximum(sign * d.beyond[..., 3], 0) * area[d.cells[0]] * its
+                unknowns.append(number[other][d.cells][weight > 0])
                 targets.append(sign * d.beyond[weight > 0, :3])
                 weights.append(weight[weight > 0])
         self._count = count

@@ -57,7 +57,8 @@ def share(overlap: npt.NDArray[np.bool_], cells: Grid, regions: npt.NDArray[np.b
 
 def tell(
     layers: Sequence[WorkingLayer],
-    overlaps: Sequence[tuple[Pair, npt.NDArray[np.bool_]]],
+    pairs: Sequence[Pair],
+    overlaps: Sequence[npt.NDArray[np.bool_]],
     shifts: Sequence[Parallax],
     cells: Grid,
     whole: npt.NDArray[np.bool_] | None,
@@ -67,9 +68,9 @@ def tell(
     The log record has the same as `overlap`, for reports. shifts: empty where there is no flow. whole: where
     one layer was taken, on the grid `cells`; None: nowhere.
     """
-    for number, (pair, overlap) in enumerate(overlaps):
+    for number, pair in enumerate(pairs):
         names = layers[pair.a].layer.name, layers[pair.b].layer.name
-        one_layer = share(overlap, cells, whole) if shifts else 1.0
+        one_layer = share(overlaps[number], cells, whole) if shifts else 1.0
         found: dict[str, object] = {"layers": list(names), "one_layer": round(one_layer, 4)}
         said = f"{one_layer:.0%} from one layer"
         if shifts:

@@ -51,7 +51,7 @@ def charts(
     coarse = quality.coarseness(settings.flow_quality, grid.width * grid.height)
     draw = partial(chart.pair_chart, mask_grid=masks, grid=grid, coarse=coarse)
     with ThreadPoolExecutor(settings.cores, "chart") as drawing:
-        return list(drawing.map(draw, overlaps))
+        return list(drawing.map(lambda index: draw(overlaps[index]), range(len(overlaps))))
 
 
 def finest(drawn: Sequence[Chart], grid: Grid, settings: Settings) -> Sequence[Chart]:

@@ -126,16 +126,16 @@ def relayed(pairs: Sequence[Pair], overlaps: Sequence[npt.NDArray[np.bool_]], gr
     overlaps    of `pairs`, on `grid`.
     """
     keys = [(pair.a, pair.b) for pair in pairs]
-    shared, area = dict[Key, npt.NDArray[np.bool_]](), dict[Key, float]()
-    for (a, c), overlap in zip(keys, overlaps, strict=True):
-        shared[a, c] = shared[c, a] = overlap
-        area[a, c] = area[c, a] = _area(overlap, grid)
+    number, area = dict[Key, int](), dict[Key, float]()
+    for index, (a, c) in enumerate(keys):
+        number[a, c] = number[c, a] = index
+        area[a, c] = area[c, a] = _area(overlaps[index], grid)
     beside, found = _beside(keys), set[Key]()
     for a, c in sorted(keys, key=lambda key: (-area[key], key)):
         legs = [b for b in beside[a] & beside[c] if found.isdisjoint(((a, b), (b, c)))]
         smaller = {b: min(area[a, b], area[b, c]) for b in legs}
         large = [b for b in _largest(smaller) if smaller[b] >= _MUCH * area[a, c]]
-        shown = [shared[a, b] & shared[b, c] for b in large]
+        shown = [overlaps[number[a, b]] & overlaps[number[b, c]] for b in large]
         if shown and _area(np.logical_or.reduce(shown), grid) >= _ALL * area[a, c]:
             found |= {(a, c), (c, a)}
     return [key in found for key in keys]

@@ -36,7 +36,7 @@ from hugin_abflow.colour import Correction, clipping
 from hugin_abflow.geometry import Pair
 from hugin_abflow.labelling import Graph, energy, least
 from hugin_abflow.opencl import Buffer, Device
-from hugin_abflow.working import Grid, Place, WorkingLayer, connected
+from hugin_abflow.working import Grid, Place, WorkingLayer, cells_under, common, connected
 
 # Working pixels per cell of the seam grid.
 _CELL = 8
@@ -102,13 +102,14 @@ def residuals(
     cells = seam_grid(grid)
     mean, square, told = np.zeros(cells.shape), np.zeros(cells.shape), np.zeros(cells.shape, bool)
     clipped = [clipping(layer) for layer in layers]
-    for found in _differences(device, layers, fields, pairs, correction, grid, cells, clipped):
+    for its, found in _differences(device, layers, fields, pairs, correction, grid, cells, clipped):
         share = found[..., 4:]
-        smooth = _smooth(np.concatenate([found[..., :4] * share, share], -1), cells.wraps)
+        around = cells.wraps and found.shape[1] == cells.width  # else nothing is at the other side
+        smooth = _smooth(np.concatenate([found[..., :4] * share, share], -1), around)
         smooth = (share > 0) * smooth[..., :4] / np.where(share > 0, smooth[..., 4:], 1)
-        mean = np.maximum(mean, np.abs(smooth[..., :3]).max(-1))
-        square = np.maximum(square, smooth[..., 3])
-        told |= share[..., 0] > 0
+        mean[its] = np.maximum(mean[its], np.abs(smooth[..., :3]).max(-1))
+        square[its] = np.maximum(square[its], smooth[..., 3])
+        told[its] |= share[..., 0] > 0
     return Residuals(mean, np.sqrt(square), told)
 
 
@@ -132,10 +133,10 @@ def lost(
     told = np.zeros((len(layers), *cells.shape), bool)
     all_tells = [(math.inf,) * 4] * len(layers)
     differences = _differences(device, layers, fields, pairs, correction, grid, cells, all_tells)
-    for pair, found in zip(pairs, differences, strict=True):
+    for pair, (its, found) in zip(pairs, differences, strict=True):
         brighter, both = found[..., :3].mean(-1), found[..., 4] > 0
-        told[pair.a] |= both & (brighter < _DARKER)
-        told[pair.b] |= both & (-brighter < _DARKER)
+        told[pair.a][its] |= both & (brighter < _DARKER)
+        told[pair.b][its] |= both & (-brighter < _DARKER)
     row, column = _centres(cells, clipped.shape)
     prices: Prices = _CLIPPED * told * clipped[:, row[:, None], column]
     return prices
@@ -184,8 +185,9 @@ def divide(
     cells = grid.coarser(_FINE_CELL)
     square = np.zeros(cells.shape)
     all_tells = [(math.inf,) * 4] * len(layers)
-    for found in _differences(device, layers, fields, pairs, correction, grid, cells, all_tells):
-        square = np.maximum(square, np.where(found[..., 4] > 0, _SHORTER + found[..., 3], 0))
+    for its, found in _differences(device, layers, fields, pairs, correction, grid, cells, all_tells):
+        told = found[..., 4] > 0
+        square[its] = np.maximum(square[its], np.where(told, _SHORTER + found[..., 3], 0))
     whole = square > 0
     owner = _owners(layers, fields, Residuals(square, square), whole, masks, grid, cells, _FINE_CUT)
     yields = [(whole & (owner != k)).astype(np.float32) for k in range(len(layers))]
@@ -274,28 +276,33 @@ def _differences(
     grid: Grid,
     cells: Grid,
     clipped: Sequence[tuple[float, ...]],
-) -> Iterator[npt.NDArray[np.float64]]:
-    """Of each two corrected layers, (height, width, 5): per cell the mean of their difference in r, g, b and
-    the largest mean square of these, where neither is brighter than `clipped`, and the share of the pixels
-    that tell.
+) -> Iterator[tuple[tuple[slice, slice], npt.NDArray[np.float64]]]:
+    """Of each two corrected layers, rows and columns of the cells that both may be in, and of these
+    (height, width, 5): the mean of the layers' difference in r, g, b and the largest mean square of these,
+    where neither is brighter than `clipped`, and the share of the pixels that tell.
     """
     none = device.zeros((*correction.grid.shape, 4))
 
-    def start(pair: Pair) -> tuple[Buffer, Buffer]:
-        difference, square = device.empty((*cells.shape, 4)), device.empty(cells.shape)
+    def start(pair: Pair) -> tuple[Place, Buffer, Buffer]:
+        part = cells_under(common(layers[pair.a].box, layers[pair.b].box), grid, cells)
+        size = part[2:]
+        difference, square = device.empty((*size[::-1], 4)), device.empty(size[::-1])
         sides: list[Any] = []
         for k in (pair.a, pair.b):
             sides += [layers[k].pixels, fields[k], layers[k].box, correction.gains[k] or none]
         device.run(
-            "seam", "seam_difference", cells.border[:2], *sides, grid.border, grid.lens,
-            correction.grid.border, cells.border, correction.shoulder, clipped[pair.a], clipped[pair.b],
-            difference, square,
+            "seam", "seam_difference", size, *sides, grid.border, grid.lens, correction.grid.border,
+            cells.border, part, correction.shoulder, clipped[pair.a], clipped[pair.b], difference, square,
         )  # fmt: skip
-        return difference, square
+        return part, difference, square
 
-    def fetch(difference: Buffer, square: Buffer) -> npt.NDArray[np.float64]:
+    def fetch(
+        part: Place, difference: Buffer, square: Buffer
+    ) -> tuple[tuple[slice, slice], npt.NDArray[np.float64]]:
+        left, top, width, height = part
         mean = difference.get()
-        return np.dstack([mean[..., :3], square.get(), mean[..., 3]]).astype(np.float64)
+        found = np.dstack([mean[..., :3], square.get(), mean[..., 3]]).astype(np.float64)
+        return (slice(top, top + height), slice(left, left + width)), found
 
     if not pairs:
         return

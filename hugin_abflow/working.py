@@ -133,6 +133,23 @@ class Grid:
         return replace(self, width=width, height=height, lens=lens)
 
 
+def common(first: Place, second: Place) -> Place:
+    """What two places share; without width or height where that is nothing."""
+    left, top = max(first[0], second[0]), max(first[1], second[1])
+    right, bottom = (min(first[k] + first[k + 2], second[k] + second[k + 2]) for k in (0, 1))
+    return left, top, max(0, right - left), max(0, bottom - top)
+
+
+def cells_under(place: Place, grid: Grid, cells: Grid) -> Place:
+    """What a place on `grid` reaches into of `cells`, into which kernels part the same region."""
+    first, count = [], []
+    for start, length, of, to in zip(place[:2], place[2:], grid.border, cells.border, strict=False):
+        edges = np.arange(to + 1) * of // to
+        first.append(int(np.searchsorted(edges, start, "right")) - 1)
+        count.append(int(np.searchsorted(edges, start + length)) - first[-1] if length else 0)
+    return first[0], first[1], count[0], count[1]
+
+
 def connected(mask: npt.NDArray[np.bool_], wraps: bool) -> npt.NDArray[np.int32]:
     """The connected parts of a mask over a grid, numbered from 1 on, not all numbers in use; 0 elsewhere."""
     labels = np.asarray(cv2.connectedComponents(mask.astype(np.uint8), connectivity=8)[1], np.int32)

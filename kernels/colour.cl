@@ -11,17 +11,18 @@ static inline bool colour_clips(float4 c, float4 clipped) {
 __kernel void colour_difference(__global const float4 *layer_a, __global const float4 *field_a, int4 box_a,
                                 __global const float4 *layer_b, __global const float4 *field_b, int4 box_b,
                                 int4 border, float4 lens,   /* working grid */
-                                int4 cells,                 /* colour grid, run size */
+                                int4 cells, int4 part,      /* colour grid; its cells that are compared, run size */
                                 float shoulder,             /* of the exposure scale */
                                 float4 clipped_a, float4 clipped_b, /* brighter samples may have been any brighter */
                                 float spread,               /* disagreement that halves the trust */
-                                __global float4 *difference, /* (cells.y, cells.x): r, g, b, weight 0..1 */
+                                __global float4 *difference, /* (part.w, part.z): r, g, b, weight 0..1 */
                                 __global float4 *beyond,     /* the same; weight > 0: a is clipped, < 0: b */
-                                __global float *mixing)      /* (cells.y, cells.x) 0..1 */
+                                __global float *mixing)      /* (part.w, part.z) 0..1 */
 {
-    const int cx = get_global_id(0), cy = get_global_id(1);
-    if (cx >= cells.x || cy >= cells.y)
+    const int column = get_global_id(0), row = get_global_id(1);
+    if (column >= part.z || row >= part.w)
         return;
+    const int cx = part.x + column, cy = part.y + row;
     const int left = cx * border.x / cells.x, right = (cx + 1) * border.x / cells.x;
     const int top = cy * border.y / cells.y, bottom = (cy + 1) * border.y / cells.y;
     float3 sum = (float3)(0.0f), more = (float3)(0.0f), less = (float3)(0.0f);
@@ -55,14 +56,14 @@ __kernel void colour_difference(__global const float4 *layer_a, __global const f
         const float variance = squares / n - square3(mean);
         result = (float4)(mean, n / tried / (1.0f + GREATEST(variance, 0.0f) / (spread * spread)));
     }
-    difference[cy * cells.x + cx] = result;
+    difference[row * part.z + column] = result;
     result = (float4)(0.0f);
     if (2.0f * above > tried)
         result = (float4)(more / above, 2.0f * above / tried - 1.0f);
     if (2.0f * below > tried)
         result = (float4)(less / below, 1.0f - 2.0f * below / tried);
-    beyond[cy * cells.x + cx] = result;
-    mixing[cy * cells.x + cx] = mixed / GREATEST(tried, 1.0f);
+    beyond[row * part.z + column] = result;
+    mixing[row * part.z + column] = mixed / GREATEST(tried, 1.0f);
 }
 
 /* How far exposure scales of four shoulders are from explaining the difference of two aligned layers: per cell
@@ -70,14 +71,15 @@ __kernel void colour_difference(__global const float4 *layer_a, __global const f
 __kernel void colour_misfit(__global const float4 *layer_a, __global const float4 *field_a, int4 box_a,
                             __global const float4 *layer_b, __global const float4 *field_b, int4 box_b,
                             int4 border, float4 lens,  /* working grid */
-                            int4 cells,                /* colour grid, run size */
+                            int4 cells, int4 part,     /* colour grid; its cells that are compared, run size */
                             float4 shoulders,
                             float4 clipped_a, float4 clipped_b, /* brighter samples are not used */
-                            __global float4 *misfit)   /* (cells.y, cells.x), for each shoulder */
+                            __global float4 *misfit)   /* (part.w, part.z), for each shoulder */
 {
-    const int cx = get_global_id(0), cy = get_global_id(1);
-    if (cx >= cells.x || cy >= cells.y)
+    const int column = get_global_id(0), row = get_global_id(1);
+    if (column >= part.z || row >= part.w)
         return;
+    const int cx = part.x + column, cy = part.y + row;
     const int left = cx * border.x / cells.x, right = (cx + 1) * border.x / cells.x;
     const int top = cy * border.y / cells.y, bottom = (cy + 1) * border.y / cells.y;
     float4 weight[3], first[3], second[3];
@@ -105,5 +107,5 @@ __kernel void colour_misfit(__global const float4 *layer_a, __global const float
     float4 left_over = (float4)(0.0f);
     for (int k = 0; k < 3; ++k)
         left_over += second[k] - first[k] * first[k] / GREATEST(weight[k], (float4)(1e-12f));
-    misfit[cy * cells.x + cx] = left_over / GREATEST(tried, 1.0f);
+    misfit[row * part.z + column] = left_over / GREATEST(tried, 1.0f);
 }

@@ -14,15 +14,17 @@ __kernel void seam_difference(__global const float4 *layer_a, __global const flo
                               __global const float4 *layer_b, __global const float4 *field_b, int4 box_b,
                               __global const float4 *gain_b, /* (colours.y, colours.x) */
                               int4 border, float4 lens,    /* working grid */
-                              int4 colours, int4 cells,    /* grid of the gains; seam grid, run size */
+                              int4 colours, int4 cells,    /* grid of the gains; seam grid */
+                              int4 part,                   /* cells that are compared, run size */
                               float shoulder,              /* of the exposure scale */
                               float4 clipped_a, float4 clipped_b, /* brighter samples are not used */
-                              __global float4 *difference, /* (cells.y, cells.x): r, g, b, share */
-                              __global float *square)      /* (cells.y, cells.x) */
+                              __global float4 *difference, /* (part.w, part.z): r, g, b, share */
+                              __global float *square)      /* (part.w, part.z) */
 {
-    const int cx = get_global_id(0), cy = get_global_id(1);
-    if (cx >= cells.x || cy >= cells.y)
+    const int column = get_global_id(0), row = get_global_id(1);
+    if (column >= part.z || row >= part.w)
         return;
+    const int cx = part.x + column, cy = part.y + row;
     const int left = cx * border.x / cells.x, right = (cx + 1) * border.x / cells.x;
     const int top = cy * border.y / cells.y, bottom = (cy + 1) * border.y / cells.y;
     /* gains are smooth: the cell's centre will do */
@@ -41,7 +43,7 @@ __kernel void seam_difference(__global const float4 *layer_a, __global const flo
             squares += d * d;
             n += 1.0f;
         }
-    const int at = cy * cells.x + cx;
+    const int at = row * part.z + column;
     difference[at] = n > 0.0f ? (float4)(sum / n, n / tried) : (float4)(0.0f);
     square[at] = n > 0.0f ? GREATEST(squares.x, GREATEST(squares.y, squares.z)) / n : 0.0f;
 }

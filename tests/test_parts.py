@@ -1,0 +1,121 @@
+"""Layers are compared where both of their boxes are, and nowhere else: nothing depends on that."""
+
+from __future__ import annotations
+
+from itertools import combinations
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from grids import GRIDS, on_device, plane, random_layer
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy import ndimage
+
+from hugin_abflow import colour, seam
+from hugin_abflow.coefficient import Masks, Overlaps
+from hugin_abflow.geometry import Pair
+from hugin_abflow.opencl import Device
+from hugin_abflow.settings import Settings
+from hugin_abflow.working import cells_under, common
+
+SPANS = st.tuples(st.integers(0, 40), st.integers(0, 40))
+
+
+@given(columns=st.tuples(SPANS, SPANS), rows=st.tuples(SPANS, SPANS))
+def test_common_is_what_is_in_both(columns: tuple, rows: tuple) -> None:
+    places = [(x, y, width, height) for (x, width), (y, height) in zip(columns, rows, strict=True)]
+    shown = []
+    for left, top, width, height in places:
+        mask = np.zeros((80, 80), bool)
+        mask[top : top + height, left : left + width] = True
+        shown.append(mask)
+    left, top, width, height = common(*places)
+    both = np.zeros((80, 80), bool)
+    both[top : top + height, left : left + width] = True
+    assert np.array_equal(both, shown[0] & shown[1])
+    assert common(*places[::-1])[2:] == (width, height)
+
+
+@given(data=st.data(), width=st.integers(1, 60), height=st.integers(1, 60))
+def test_cells_under_a_place_are_those_that_have_a_pixel_of_it(
+    data: st.DataObject, width: int, height: int
+) -> None:
+    """Also where cells are smaller than pixels, and some have none."""
+    grid = plane(width, height)
+    cells = grid.resized(data.draw(st.integers(1, 70)), data.draw(st.integers(1, 70)))
+    left, top = data.draw(st.integers(0, width - 1)), data.draw(st.integers(0, height - 1))
+    place = left, top, data.draw(st.integers(0, width - left)), data.draw(st.integers(0, height - top))
+    found = cells_under(place, grid, cells)
+    for first, count, start, length, of, to in zip(
+        found[:2], found[2:], place[:2], place[2:], (width, height), (cells.width, cells.height), strict=True
+    ):
+        pixels = [set(range(c * of // to, (c + 1) * of // to)) for c in range(to)]
+        within = {c for c, its in enumerate(pixels) if its & set(range(start, start + length))}
+        assert within <= set(range(first, first + count))
+        if within:
+            assert (first, first + count - 1) == (min(within), max(within))
+        else:
+            assert count == 0
+
+
+@pytest.mark.parametrize("name", list(GRIDS))
+def test_cells_beside_are_as_if_compared(device: Device, name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Layers at both borders, in the middle and all along a grid; the same to the bit if all cells are."""
+    grid = GRIDS[name]
+    width, height = grid.width, grid.height
+    places = [(0, 0, 31, height), (19, 3, 40, height - 5), (0, 2, width, 15), (width - 40, 7, 40, height - 7)]
+    places.append((0, 1, width, height - 2))
+    pairs = [Pair(a, b) for a, b in combinations(range(len(places)), 2)]
+    layers, fields = [], []
+    covered = np.zeros((len(places), *grid.shape), bool)
+    for number, place in enumerate(places):
+        pixels = random_layer(30 + number, *place[2:], 0.9)
+        field = ndimage.gaussian_filter(np.random.default_rng(number).normal(size=pixels.shape), (4, 4, 0))
+        field *= 3 * (grid.lens[1] or 1)
+        field[..., 2] *= grid.lens[1] > 0
+        field[..., 3] = np.abs(field[..., 3]) + 0.1
+        covered[number][place[1] :, place[0] :][: place[3], : place[2]] = pixels[..., 3] > 0
+        layers.append(on_device(device, pixels, *place[:2]))
+        fields.append(device.upload(field, np.float32))
+    results = []
+    for everything in (False, True):
+        if everything:
+            for module in (colour, seam):
+                monkeypatch.setattr(module, "cells_under", lambda _, __, cells: (0, 0, *cells.border[:2]))
+        measured = colour.measure(device, layers, fields, pairs, grid, covered)
+        of_all = [difference.mixing.shape == measured.grid.shape for difference in measured.differences]
+        assert all(of_all) == everything
+        correction = colour.correction(device, measured, Settings())
+        residual = seam.residuals(device, layers, fields, pairs, correction, grid)
+        excess = np.ones((len(layers), *grid.shape), np.float32)
+        lost = seam.lost(device, layers, fields, pairs, correction, excess, grid)
+        gains = [gain.get() for gain in correction.gains]
+        results.append([*gains, residual.mean, residual.rms, residual.told, lost])
+    for few, every in zip(*results, strict=True):
+        assert np.array_equal(few, every)
+        assert few.any()
+
+
+def test_residuals_are_smoothed_across_the_border(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of a canvas that wraps, by what is compared all along it; the same at each column."""
+    found = np.random.default_rng(4).random((9, 12, 5))
+    layers = [SimpleNamespace(layer=SimpleNamespace(dtype=np.dtype(np.uint8)), white=(1.0, 1.0, 1.0))] * 2
+    means = []
+    for wraps in (True, False):
+        for shift in (0, 5):
+            turned = np.roll(found, shift, 1)
+            monkeypatch.setattr(seam, "_differences", lambda *_, its=turned: [(np.s_[0:9, 0:12], its)])
+            residual = seam.residuals(None, layers, [], [Pair(0, 1)], None, plane(96, 72, wraps))
+            means.append(np.roll(residual.mean, -shift, 1))
+    assert np.array_equal(means[0], means[1])
+    assert not np.array_equal(means[2], means[3]) and not np.array_equal(means[0], means[2])
+
+
+def test_overlaps_are_what_both_layers_cover() -> None:
+    covered = np.random.default_rng(1).random((5, 13, 17)) < 0.5
+    pairs = [(0, 1), (3, 2), (4, 0)]
+    overlaps = Overlaps(Masks(plane(17, 13), (), covered), pairs)
+    assert len(overlaps) == 3
+    for (a, b), overlap in zip(pairs, overlaps, strict=True):
+        assert np.array_equal(overlap, covered[a] & covered[b])
