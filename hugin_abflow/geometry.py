@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from hugin_abflow.chart import Chart
-from hugin_abflow.opencl import Buffer, Device
+from hugin_abflow.opencl import MUCH, Buffer, Device
 from hugin_abflow.settings import Settings
 from hugin_abflow.working import Grid, WorkingLayer
 
@@ -65,7 +65,7 @@ def fields(
     for index in range(len(layers)):
         result.append(_displacement(device, index, layers, coefficients, flows, grid))
         flows[:] = [flow for flow in flows if max(flow.a, flow.b) > index]
-        device.give_back()
+        device.give_back(MUCH)
     highest = device.zeros(grid.shape)
     furthest = _PLAUSIBLE * grid.circumference
     for layer, field, coefficient in zip(layers, result, coefficients, strict=True):

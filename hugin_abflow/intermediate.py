@@ -16,7 +16,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from hugin_abflow.geometry import PairFlow
-from hugin_abflow.opencl import Buffer, Device
+from hugin_abflow.opencl import MUCH, Buffer, Device
 from hugin_abflow.settings import Settings
 from hugin_abflow.working import Grid, WorkingLayer
 
@@ -49,7 +49,7 @@ def settle(
             share,
         )  # fmt: skip
         flows[number] = _passing(device, pair, share)
-        device.give_back()
+        device.give_back(MUCH)
 
 
 def _passing(device: Device, pair: PairFlow, share: Buffer) -> PairFlow:

@@ -21,7 +21,7 @@ import numpy as np
 import numpy.typing as npt
 
 from hugin_abflow.colour import NEGLIGIBLE, Correction
-from hugin_abflow.opencl import Buffer, Device
+from hugin_abflow.opencl import MUCH, Buffer, Device
 from hugin_abflow.working import Grid, Place, WorkingLayer
 
 # The shorter side is halved down to this many pixels: the lowest frequencies change over along all of it.
@@ -82,7 +82,7 @@ def offsets(
     finest = []
     for k, (layer, field) in enumerate(zip(layers, fields, strict=True)):
         finest.append(_finest(device, layer, field, total, correction, k, grid, grids[1], widths[1]))
-        device.give_back()  # layers are of different sizes
+        device.give_back(MUCH)  # layers are of different sizes
     del total
     _differ(device, finest, widths[1], np.zeros((1, 1)) if once is None else once)
     blend = _blend(device, finest, grids[1:], widths[1:])
@@ -91,7 +91,7 @@ def offsets(
         level = finest.pop(0)
         result.append((level.box, _offset(device, level, blend)))
         del level
-        device.give_back()
+        device.give_back(MUCH)
     return Offsets(grids[1], tuple(result))
 
 
@@ -146,7 +146,7 @@ def _differ(device: Device, finest: list[_Level], widths: Widths, once: npt.NDAr
         )  # fmt: skip
         finest[k] = _spread(device, level, widths)
         del level
-        device.give_back()
+        device.give_back(MUCH)
 
 
 def _blend(
@@ -160,7 +160,7 @@ def _blend(
             _add(device, level, smaller, one)
             level = smaller
         _add(device, level, None, sums[-1])
-        device.give_back()
+        device.give_back(MUCH)
     _join(device, sums[-1], grids[-1], None, None)
     for k in reversed(range(len(grids) - 1)):
         _join(device, sums[k], grids[k], sums[k + 1], grids[k + 1])

@@ -27,6 +27,9 @@ _log = logging.getLogger(__name__)
 # Seconds from which on a program was compiled; where a driver has kept what it compiled before it takes less.
 _COMPILED = 0.5
 
+# Bytes of buffers that are worth giving back after each of many layers or pairs.
+MUCH = 16 << 20
+
 # Work-group: rows suit both a GPU's wavefronts and the vector units of a CPU.
 _GROUP = 256
 
@@ -184,6 +187,7 @@ class Device:
             self._first = self._another_lane()
         self._free, self._entering, self._entered = list[Lane](), threading.Lock(), threading.local()
         self._bytes, self._counting = 0, threading.RLock()  # buffers may be collected while it is held
+        self._freed = 0
         self._kernels: dict[tuple[str, str], dict[str, cl.Kernel]] = {}
         self._programs: dict[tuple[str, str], cl.Program] = {}  # Intel's driver does not keep a kernel's own
         self._building, self._one_by_one, self._compiled = threading.Lock(), False, False
@@ -205,6 +209,7 @@ class Device:
         """Have buffers take so many bytes more. For any thread."""
         with self._counting:
             self._bytes += more
+            self._freed += max(0, -more)
 
     @property
     def vector_floats(self) -> int:
@@ -379,10 +384,16 @@ class Device:
         made += [cl.Kernel(self._programs[module, options], name) for _ in range(count - len(made))]
         return made[:count]
 
-    def give_back(self) -> None:
+    def give_back(self, least: int = 0) -> None:
         """Return freed memory to the system, on the device and the host, at the end of a step. The driver
         keeps what other lanes still work with.
+
+        least: bytes of buffers that are freed by then, or it is left to later steps: it takes milliseconds.
         """
+        with self._counting:
+            if self._freed < least:
+                return
+            self._freed = 0
         self.finish()  # what still waits for its kernels would stay
         for lane in self._lanes:
             lane.spare.release()
