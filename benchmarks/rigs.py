@@ -65,6 +65,22 @@ def handheld_cameras(turn: float, seed: int) -> list[Camera]:
     return cameras
 
 
+def gigapixel_cameras() -> list[Camera]:
+    """Ten rows of thirty narrow photos, by a camera on a head that turns 5 cm behind it."""
+    rng = np.random.default_rng(1)
+    cameras = []
+    for pitch in np.arange(-67.5, 70, 15):
+        for k in range(30):
+            yaw, tilt, roll = rng.normal(0, 0.3, 3)
+            ahead = np.radians(12 * k)
+            arm = np.array([0.05 * np.sin(ahead), 0.05 * np.cos(ahead), 0.0])
+            x, y, z = np.array(EYE) + arm + rng.normal(0, 0.004, 3)
+            heading = (12 * k + yaw + 180) % 360 - 180
+            place = float(x), float(y), float(z)
+            cameras.append(Camera(place, heading, pitch + tilt, roll, 480, 500, 20.0, RECTILINEAR))
+    return cameras
+
+
 RIGS: dict[str, Callable[[int], list[Camera]]] = {
     "ring": lambda seed: ring_cameras(turn=_turn(seed)),
     "dual": lambda seed: dual_cameras(turn=_turn(seed)),
@@ -136,12 +152,21 @@ def make_set(folder: Path, rig: str, seed: int, width: int) -> None:
 
 
 def render_layer(
-    camera: Camera, tracer: Tracer, width: int, gain: float = 1.0, grid: int = 2
+    camera: Camera,
+    tracer: Tracer,
+    width: int,
+    gain: float = 1.0,
+    grid: int = 2,
+    within: tuple[int, int] | None = None,
 ) -> tuple[Pixels, int, int]:
-    """What nona makes of that camera's photo: (rows, columns, 4) cropped RGBA, and its left and top."""
+    """What nona makes of that camera's photo: (rows, columns, 4) cropped RGBA, and its left and top.
+
+    within: rows of the canvas between which all of it is known to lie.
+    """  # fmt: skip
     strips, step = [], 256
-    for top in range(0, width // 2, step):
-        bottom = min(width // 2, top + step)
+    first, last = within or (0, width // 2)
+    for top in range(first, last, step):
+        bottom = min(last, top + step)
         y, x = np.mgrid[top:bottom, 0:width] + 0.5
         covered = camera.covers(lens.equirect_directions(x, y, width))
         strip = np.zeros((bottom - top, width, 4), np.uint8)
@@ -154,7 +179,7 @@ def render_layer(
     canvas = np.concatenate(strips)
     rows, columns = np.flatnonzero(canvas[..., 3].any(1)), np.flatnonzero(canvas[..., 3].any(0))
     left, top = int(columns[0]), int(rows[0])
-    return canvas[top : rows[-1] + 1, left : columns[-1] + 1], left, top
+    return canvas[top : rows[-1] + 1, left : columns[-1] + 1], left, first + top
 
 
 def write_layer(path: Path, layer: Pixels, left: int, top: int, width: int) -> None:

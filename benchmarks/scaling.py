@@ -5,6 +5,8 @@ as high) and blended. Wall time, CPU time (user + system) and peak memory are me
 the plot `scaling.svg` shows time per megapixel and peak memory. Enlarged layers are smoother than photos of
 that size, so they take less time to decode and encode. They are kept in --cache: 36,000 px take 2 GB.
 
+With --many 300 photos of 480x500 px, which overlap in 1,900 pairs, are blended on 9,000 px instead.
+
 With --tall two cylinders of 9,000 px are blended instead, with the same layers, whose rows the second has
 twice: how much does peak memory grow with height alone?
 """
@@ -20,10 +22,12 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
-from benchmarks.rigs import RIGS
+from benchmarks.rigs import RIGS, gigapixel_cameras, render_layer, write_layer
 from benchmarks.speed import ROOT, Run, make_layers, measure, median
 from hugin_abflow.images import ImageWriter, read_layer
 from sample_projects.project import project_text
+from sample_projects.scene import room
+from sample_projects.tracer import Tracer
 
 BASE = 9000  # the width that is rendered
 STRIP = 64  # rows of the rendered layer at a time; even
@@ -71,6 +75,24 @@ def make_set(cache: Path, width: int) -> Path:
             print(f"{width} px: {source.name}", file=sys.stderr)
             resize_layer(source, folder / source.name, width / BASE)
         cameras = RIGS["ring"](1)
+        names = [f"photo{index:04d}.jpg" for index in range(len(cameras))]
+        (folder / "project.pto").write_text(project_text(cameras, names, width), encoding="utf-8")
+    return folder
+
+
+def make_many_set(cache: Path, width: int) -> Path:
+    """The folder with 300 small layers and their project."""
+    folder = cache / "many"
+    if not (folder / "project.pto").exists():
+        folder.mkdir(parents=True, exist_ok=True)
+        cameras, tracer = gigapixel_cameras(), Tracer(room(1), folder.parent, samples=4)
+        for index, camera in enumerate(cameras):
+            if index % 30 == 0:
+                print(f"{index} of {len(cameras)} layers", file=sys.stderr)
+            above, below = (round((90 - camera.pitch + reach) / 180 * width / 2) for reach in (-14, 14))
+            within = max(0, above), min(width // 2, below)
+            layer, left, top = render_layer(camera, tracer, width, 1 + 0.01 * (index % 3 - 1), 1, within)
+            write_layer(folder / f"layer{index:04d}.tif", layer, left, top, width)
         names = [f"photo{index:04d}.jpg" for index in range(len(cameras))]
         (folder / "project.pto").write_text(project_text(cameras, names, width), encoding="utf-8")
     return folder
@@ -171,6 +193,7 @@ def main() -> None:
     )
     parser.add_argument("--widths", type=int, nargs="+", default=[4500, 9000, 18000, 36000])
     parser.add_argument("--tall", action="store_true", help="a cylinder, and one twice as high, instead")
+    parser.add_argument("--many", action="store_true", help="300 small layers instead")
     parser.add_argument("--runs", type=int, default=1, help="of each width")
     parser.add_argument("--max-memory", metavar="SIZE", help="of hugin-abflow")
     parser.add_argument("--plot", type=Path, default=ROOT / "benchmarks" / "scaling.svg")
@@ -181,6 +204,8 @@ def main() -> None:
         if width != BASE // 2 and width % BASE:
             raise SystemExit(f"{width} is neither half of {BASE} nor a multiple of it")
     make, sizes = (make_tall_set, [1, 2]) if options.tall else (make_set, options.widths)
+    if options.many:
+        make, sizes = make_many_set, [BASE]
     folders = {size: make(options.cache, size) for size in sizes}
     if options.only_layers:
         return
@@ -195,7 +220,8 @@ def main() -> None:
         print(tall_table(runs))
         return
     print(table(runs))
-    plot(runs, options.plot)
+    if not options.many:
+        plot(runs, options.plot)
 
 
 if __name__ == "__main__":

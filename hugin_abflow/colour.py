@@ -66,6 +66,9 @@ _BETTER = 0.8
 # Misfit, of full scale, that halves the trust in a cell.
 _MISFIT = 0.05
 
+# Of the layers' cells, as the unknowns of `solve`.
+_Numbers = npt.NDArray[np.signedinteger[Any]]
+
 
 @dataclass(frozen=True)
 class Difference:
@@ -176,11 +179,13 @@ def correction(
     gains = solve(replace(measured, differences=differences), _STRICT if strict else _ROUNDS)
     gains = np.sign(gains) * np.maximum(np.abs(gains) - NEGLIGIBLE, 0)
     result: list[Buffer | None] = []
-    for gain, mask in zip(gains, inside, strict=True):
-        if not gain.any():
+    ends = np.cumsum(np.count_nonzero(inside, axis=(1, 2)))
+    for mask, its in zip(inside, np.split(gains, ends[:-1]), strict=True):
+        if not its.any():
             result.append(None)
             continue
-        packed = np.zeros((*cells.shape, 4), np.float32)
+        gain, packed = np.zeros((*cells.shape, 3)), np.zeros((*cells.shape, 4), np.float32)
+        gain[mask] = its
         packed[..., :3] = _extend(gain, mask, cells.wraps)
         result.append(device.upload(packed))
     return replace(none, gains=tuple(result))
@@ -255,19 +260,21 @@ def _shoulder(overlaps: Sequence[_Overlap]) -> float:
 
 
 def solve(measured: Measured, rounds: Sequence[tuple[float, float]] = _ROUNDS) -> npt.NDArray[np.float64]:
-    """Gains (layers, height, width, 3) for differences."""
+    """Gains (cells, 3) of the layers' cells, in the order of `measured.inside`, for differences."""
     cells, inside, differences = measured.grid, measured.inside, measured.differences
     area = np.maximum(cells.row_widths, 0.02)[:, None]
+    layer, row, column = np.nonzero(inside)
+    count = layer.size
+    number = np.zeros(inside.shape, np.int32)  # of a layer's cell among the unknowns
+    own = np.arange(count)
+    number[inside] = own
     # a cell's sides: steps along a row are shorter near a pole, so neighbours there are bound closer
-    east = (inside & np.roll(inside, -1, 2)) / area
-    if not cells.wraps:
-        east[:, :, -1] = 0
-    south = np.zeros(inside.shape)
-    south[:, :-1] = (inside[:, :-1] & inside[:, 1:]) * np.sqrt(area[:-1] * area[1:])
-    number = np.cumsum(inside).reshape(inside.shape) - 1  # of a layer's cell among the unknowns
-    count = int(np.count_nonzero(inside))
+    right, below = (column + 1) % cells.width, np.minimum(row + 1, cells.height - 1)
+    goes_on = (column + 1 < cells.width) | cells.wraps
+    east = (inside[layer, row, right] & goes_on) / area[row, 0]
+    south = (inside[layer, below, column] & (below > row)) * np.sqrt(area[row, 0] * area[below, 0])
     step, stiffness = _steps(
-        [(number, np.roll(number, -1, 2), east), (number, np.roll(number, -1, 1), south)], count
+        [(own, number[layer, row, right], east), (own, number[layer, below, column], south)], count
     )
     evidence = []
     for d in differences:
@@ -288,7 +295,7 @@ def solve(measured: Measured, rounds: Sequence[tuple[float, float]] = _ROUNDS) -
     solution, solver, rough_solver = np.zeros((count, 3)), _Solver(), _Solver()
     for data, limit in rounds:
         fade = _TREND_FADE if rounds is _STRICT and data < rounds[-1][0] else _FADE
-        hold = (inside * area)[inside] / max(1.0, fade * round_) ** 2
+        hold = area[row, 0] / max(1.0, fade * round_) ** 2
         off = link @ solution + difference if solution.any() else np.zeros_like(difference)
         trusted = data * weight * _biweight(off, limit)
         held, pull = bounds.active(solution, limit)
@@ -299,9 +306,7 @@ def solve(measured: Measured, rounds: Sequence[tuple[float, float]] = _ROUNDS) -
             solution = blocks @ rough_solver.solve(matrix, blocks.T @ wanted)
         else:
             solution = solver.solve(data_term + smooth, wanted)
-    result = np.zeros((*inside.shape, 3))
-    result[inside] = solution
-    return result
+    return np.asarray(solution)
 
 
 def _blocks(inside: npt.NDArray[np.bool_]) -> scipy.sparse.csr_array:
@@ -326,7 +331,7 @@ class _Solver:
     }
 
     def __init__(self) -> None:
-        self._order: npt.NDArray[np.intp] | None = None
+        self._order: _Numbers | None = None
 
     def solve(
         self, matrix: scipy.sparse.csr_array, wanted: npt.NDArray[np.float64]
@@ -348,7 +353,7 @@ class _Bounds:
     """Where only one of two layers is clipped, the other is to be raised by their difference at least."""
 
     def __init__(
-        self, measured: Measured, number: npt.NDArray[np.intp], area: npt.NDArray[np.float64], count: int
+        self, measured: Measured, number: _Numbers, area: npt.NDArray[np.float64], count: int
     ) -> None:
         unknowns, targets, weights = [], [], []
         for d in measured.differences:
@@ -379,7 +384,7 @@ def _biweight(off: npt.NDArray[np.float64], limit: float) -> npt.NDArray[np.floa
 
 
 def _steps(
-    weighted: Sequence[tuple[npt.NDArray[np.intp], npt.NDArray[np.intp], npt.NDArray[np.float64]]], count: int
+    weighted: Sequence[tuple[_Numbers, _Numbers, npt.NDArray[np.float64]]], count: int
 ) -> tuple[scipy.sparse.csr_array, npt.NDArray[np.float64]]:
     """A matrix (n, count) that takes differences of `count` unknowns, and the weights (n,) of these.
 
