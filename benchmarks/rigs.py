@@ -162,7 +162,7 @@ def render_layer(
     """What nona makes of that camera's photo: (rows, columns, 4) cropped RGBA, and its left and top.
 
     within: rows of the canvas between which all of it is known to lie.
-    """  # fmt: skip
+    """
     strips, step = [], 256
     first, last = within or (0, width // 2)
     for top in range(first, last, step):

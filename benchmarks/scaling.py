@@ -192,8 +192,9 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--widths", type=int, nargs="+", default=[4500, 9000, 18000, 36000])
-    parser.add_argument("--tall", action="store_true", help="a cylinder, and one twice as high, instead")
-    parser.add_argument("--many", action="store_true", help="300 small layers instead")
+    instead = parser.add_mutually_exclusive_group()
+    instead.add_argument("--tall", action="store_true", help="a cylinder, and one twice as high, instead")
+    instead.add_argument("--many", action="store_true", help="300 small layers instead")
     parser.add_argument("--runs", type=int, default=1, help="of each width")
     parser.add_argument("--max-memory", metavar="SIZE", help="of hugin-abflow")
     parser.add_argument("--plot", type=Path, default=ROOT / "benchmarks" / "scaling.svg")

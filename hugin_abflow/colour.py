@@ -78,7 +78,7 @@ class Difference:
     beyond  the same where only one of them is clipped, a if the weight is positive, b if it is negative: at
             least that much.
     mixing  how far both are seen, (height, width).
-    place   the first cell's column and row: there are none where only one layer can be.
+    place   the first cell's column and row; cells where only one layer can be are left out.
     """
 
     a: int

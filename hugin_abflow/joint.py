@@ -178,7 +178,7 @@ def prepare(
         aligned = _align(device, reduced, overlapping, flows, once, masks, grid, settings)
         if _log.isEnabledFor(logging.INFO):
             figures.tell(reduced, overlapping, overlaps, shifts, seam.seam_grid(grid), aligned.whole)
-        del masks, overlaps, shared  # what comes takes the most memory
+        del masks, overlaps, shared, fast  # what comes takes the most memory
         offsets, correction = multiband.none(grid, len(reduced)), aligned.correction
         if settings.exposure and overlapping:
             offsets = multiband.offsets(device, reduced, aligned.fields, correction, grid, once)

@@ -3,8 +3,9 @@
 The flow of what stands still is parallax (epipolar.py). Somebody who took a step is matched like a near thing
 where he has not left his place wholly; but halfway between two such matches he and what is beside him are
 bent, as it did not move along. Flow that leads clearly away from parallax, in an overlap where all else is
-parallax, and over a place where the photos differ without it, is of something that moved: consistency.py
-fills its place with the flow of what is around, and seam.py takes it from one photo, whole.
+parallax, and over a place where the photos differ without it, is of something that moved. If one photo shows
+all of it that the other one does, consistency.py fills its place with the flow of what is around, and seam.py
+takes it from that photo, whole.
 """
 
 from __future__ import annotations
@@ -48,8 +49,8 @@ _WEAK = 0.3
 # The share of a thing's cells that have to miss it so far, and be shown by both photos: of a near thing an
 # edge may, where flow errs.
 _CLEAR = 0.125
-# Mean difference of log brightness that shows without the thing's own flow, and times that of what is around,
-# as far as so many cells: plain walls and floors are matched with anything.
+# Mean deviation of differences of log brightness from their median, without the thing's own flow, and times
+# that of what is around, as far as so many cells: plain walls and floors are matched with anything.
 _DIFFERS, _MORE, _RING = 0.12, 2.0, 4
 # Of a mask, between pixels: all of them show something.
 _SHOWN = 0.999
@@ -115,11 +116,10 @@ def _things(
     kept = clear >= np.maximum(LEAST, _CLEAR * np.bincount(things.ravel()))
     kept[way.vouched(things, vouched)] = False
     for thing in np.flatnonzero(kept):
-        kept[thing] = _ends_within(chart, way, views, things == thing) and _differs(
-            *views, way, things == thing
-        )
-    its: Mask = kept[things]
-    return its
+        its = things == thing
+        kept[thing] = _ends_within(chart, way, views, its) and _differs(*views, way, its)
+    moved: Mask = kept[things]
+    return moved
 
 
 def _ends_within(chart: Chart, way: Way, views: tuple[View, View], thing: Mask) -> bool:
@@ -136,7 +136,8 @@ def _ends_within(chart: Chart, way: Way, views: tuple[View, View], thing: Mask) 
 def _differs(here: View, there: View, way: Way, thing: Mask) -> bool:
     """Whether the photos differ in a thing's place if it moves as what is around, more than they do there.
 
-    What is across the border of a chart that wraps does not count as around.
+    What is across the border of a chart that wraps does not count as around. A plain thing that left its
+    place wholly differs there by as much all over, as a place that one photo shows darker, and is not told.
     """
     wider = grown(thing, GROWN, wraps=False)
     ring = np.nonzero(grown(wider, _RING, wraps=False) & ~wider & way.believed)

@@ -42,8 +42,8 @@ from hugin_abflow.working import Grid, Place, WorkingLayer, cells_under, common,
 _CELL = 8
 # Without flow.
 _FINE_CELL = 4
-# Cells over which differences are averaged: texture that is a little off is no reason to cut.
-_SIGMA = 1.0
+# Cells over which differences are averaged: texture that is a little off is no reason to cut; and how far.
+_SIGMA, _REACH = 1.0, 3
 # Residual of low frequencies, of full scale, that makes a region one layer's, and that of its outskirts.
 # Where that of all frequencies reaches the first there are outskirts as well.
 _STRONG, _WEAK = 0.2, 0.045
@@ -104,8 +104,9 @@ def residuals(
     clipped = [clipping(layer) for layer in layers]
     for its, found in _differences(device, layers, fields, pairs, correction, grid, cells, clipped):
         share = found[..., 4:]
-        around = cells.wraps and found.shape[1] == cells.width  # else nothing is at the other side
-        smooth = _smooth(np.concatenate([found[..., :4] * share, share], -1), around)
+        gap = min(_REACH, cells.width - found.shape[1])  # more is between its ends if columns wrap
+        values = np.pad(np.concatenate([found[..., :4] * share, share], -1), ((0, 0), (0, gap), (0, 0)))
+        smooth = _smooth(values, cells.wraps)[:, : found.shape[1]]
         smooth = (share > 0) * smooth[..., :4] / np.where(share > 0, smooth[..., 4:], 1)
         mean[its] = np.maximum(mean[its], np.abs(smooth[..., :3]).max(-1))
         square[its] = np.maximum(square[its], smooth[..., 3])
@@ -318,7 +319,7 @@ def _differences(
 def _smooth(values: npt.NDArray[np.float64], wraps: bool) -> npt.NDArray[np.float64]:
     """A Gaussian of _SIGMA cells, not normalised at the borders."""
     modes = ("constant", "wrap" if wraps else "constant", "constant")
-    return np.asarray(scipy.ndimage.gaussian_filter(values, (_SIGMA, _SIGMA, 0), mode=modes, truncate=3))
+    return np.asarray(scipy.ndimage.gaussian_filter(values, (_SIGMA, _SIGMA, 0), mode=modes, radius=_REACH))
 
 
 def _padded(values: npt.NDArray[Any], by: int, wraps: bool) -> npt.NDArray[Any]:

@@ -10,7 +10,7 @@ from reference import common
 from scenes import CANVAS, CHARTS
 from scipy import ndimage
 
-from hugin_abflow.cells import CELL, Whole
+from hugin_abflow.cells import CELL, Whole, ends_within
 from hugin_abflow.chart import pair_chart
 from hugin_abflow.layer import Box
 from hugin_abflow.working import Grid
@@ -66,3 +66,27 @@ def test_around_the_canvas_every_cell_has_one_of_the_chart() -> None:
     everywhere = Whole(np.ones(shape, bool), np.zeros(shape, bool))
     found = everywhere.on_canvas(chart, CANVAS.resized(90, 45))
     assert found[20:25].all() and not found[:5].any() and not found[-5:].any()
+
+
+@pytest.mark.parametrize("wraps", [False, True])
+def test_what_crosses_one_border_by_far_ends_within(wraps: bool) -> None:
+    """Of a photo that ends at column 10 and one that begins at column 4: at a border lies what is up to two
+    columns from where one photo alone is. Two cells may lie at the other border, and a seventh."""
+    own, other = np.ones((60, 30), bool), np.ones((60, 30), bool)
+    own[:, 10:], other[:, :4] = False, False
+    for at_left, at_right, within in (
+        (50, 0, True),
+        (0, 50, True),
+        (50, 9, True),
+        (50, 10, False),
+        (2, 2, True),
+    ):
+        things = np.zeros((60, 30), np.int32)
+        things[:at_left, 5], things[:at_right, 8] = 2, 2
+        for masks in ((own, other), (other, own)):
+            assert ends_within([things], 4, masks, wraps).tolist() == [False, True, within, True]
+            halves = [np.where(np.arange(30) < 7, things, 0), np.where(np.arange(30) >= 7, things, 0)]
+            assert ends_within(halves, 4, masks, wraps)[2] == within
+    things = np.zeros((60, 30), np.int32)
+    things[:50, 29] = 1
+    assert ends_within([things], 2, (own, other), wraps)[1] == (not wraps)

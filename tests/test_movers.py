@@ -165,6 +165,17 @@ def test_flow_that_the_photos_do_not_ask_for_is_left_alone() -> None:
     assert replace(scene(), flows=scene(Thing(AHEAD, UP)).flows).found() is None
 
 
+def test_a_plain_thing_is_found_where_both_photos_show_a_part_of_its_place() -> None:
+    """One that left it wholly looks like a place that one photo shows darker: seams see to that."""
+    for step, expected in ((1, True), (2, True), (3, False)):
+        one = scene(Thing(AHEAD, step * UP, 0.1), textured=(False, False))
+        views = tuple(
+            replace(view, image=view.image - 1.5 * shown)
+            for view, shown in zip(one.views, one.shown[0], strict=True)
+        )
+        assert (replace(one, views=views).found() is not None) == expected
+
+
 @pytest.mark.parametrize("index", [0, 1])
 def test_a_photo_that_is_darker_in_a_place_has_no_thing_there(index: int) -> None:
     """Towards a lens's border, say: all of it by about as much, and by more than what is around. What took a

@@ -258,6 +258,25 @@ def test_memory_of_buffers_that_are_gone_is_used_again() -> None:
     assert len(device.current.spare._kept) <= spare.MOST_BLOCKS
 
 
+def test_little_memory_is_not_given_back_where_much_is_asked_for() -> None:
+    """What was freed since it was given back last counts, however often less than that was."""
+    device = Device()
+    kept = device.current.spare._kept
+    for _ in range(2):
+        device.empty((1000,))
+        device.give_back(4001)
+        assert len(kept) == 1
+        still_in_use = device.empty((2000,))
+        device.give_back(4001)
+        assert len(kept) == 1
+        device.empty((1,))
+        device.give_back(4001)
+        assert not kept
+        del still_in_use
+        device.give_back()
+        assert not kept
+
+
 def test_only_memory_of_its_own_counts_for_the_device() -> None:
     device = Device()
     kept = device.zeros((1 << 20,))

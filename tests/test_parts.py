@@ -7,7 +7,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from grids import GRIDS, on_device, plane, random_layer
+from grids import GRIDS, on_device, patches, plane, random_layer, sphere
 from hypothesis import given
 from hypothesis import strategies as st
 from scipy import ndimage
@@ -65,12 +65,14 @@ def test_cells_beside_are_as_if_compared(device: Device, name: str, monkeypatch:
     grid = GRIDS[name]
     width, height = grid.width, grid.height
     places = [(0, 0, 31, height), (19, 3, 40, height - 5), (0, 2, width, 15), (width - 40, 7, 40, height - 7)]
-    places.append((0, 1, width, height - 2))
+    places += [(0, 1, width, height - 2), (0, 5, width - 9, height - 5)]
     pairs = [Pair(a, b) for a, b in combinations(range(len(places)), 2)]
+    monkeypatch.setattr(colour, "_CELL", 5)  # else all begin in the first row
     layers, fields = [], []
     covered = np.zeros((len(places), *grid.shape), bool)
     for number, place in enumerate(places):
         pixels = random_layer(30 + number, *place[2:], 0.9)
+        pixels[..., :3][patches(number, *place[2:], 0.3, 9) > 0] = 1  # clipped
         field = ndimage.gaussian_filter(np.random.default_rng(number).normal(size=pixels.shape), (4, 4, 0))
         field *= 3 * (grid.lens[1] or 1)
         field[..., 2] *= grid.lens[1] > 0
@@ -92,9 +94,34 @@ def test_cells_beside_are_as_if_compared(device: Device, name: str, monkeypatch:
         lost = seam.lost(device, layers, fields, pairs, correction, excess, grid)
         gains = [gain.get() for gain in correction.gains]
         results.append([*gains, residual.mean, residual.rms, residual.told, lost])
+        cut = [device.copy(field) for field in fields]
+        masks = Masks(grid, tuple(device.upload(mask, np.uint8) for mask in covered), covered)
+        seam.divide(device, layers, cut, pairs, correction, masks, grid)
+        results[-1] += [field.get() for field in cut]
     for few, every in zip(*results, strict=True):
         assert np.array_equal(few, every)
         assert few.any()
+
+
+def test_differences_count_in_their_rows_and_columns() -> None:
+    """Also what only bounds tell; rows of a sphere count by how wide they are."""
+    cells, random = sphere(24, 12), np.random.default_rng(7)
+    inside = random.random((2, *cells.shape)) < 0.9
+    few = [random.normal(size=(4, 7, 4)) for _ in range(2)]
+    wide = [np.zeros((*cells.shape, 4)) for _ in few]
+    for one, same in zip(few, wide, strict=True):
+        one[..., 3] = np.abs(one[..., 3]) if one is few[0] else np.round(one[..., 3])
+        same[1:5, 13:20] = one
+    differences = (
+        colour.Difference(0, 1, *few, np.ones((4, 7)), (13, 1)),
+        colour.Difference(0, 1, *wide, np.ones(cells.shape)),
+    )
+    for beyond_alone in (False, True):
+        if beyond_alone:
+            few[0][..., 3] = wide[0][..., 3] = 0
+        gains = [colour.solve(colour.Measured(cells, inside, 1.0, (one,))) for one in differences]
+        assert np.array_equal(*gains)
+        assert (np.abs(gains[0]) > 0.01).any()
 
 
 def test_residuals_are_smoothed_across_the_border(monkeypatch: pytest.MonkeyPatch) -> None:
