@@ -6,7 +6,7 @@ A set is a folder: ``layer0000.tif`` ..., ``project.pto``, ``views.npz``. It is 
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import combinations
 from pathlib import Path
@@ -146,8 +146,7 @@ def make_set(folder: Path, rig: str, seed: int, width: int) -> None:
     for index, camera in enumerate(cameras):
         layer, left, top = render_layer(camera, tracer, width, 1 + rng.uniform(-0.02, 0.02))
         write_layer(folder / f"layer{index:04d}.tif", layer, left, top, width)
-    names = [f"photo{index:04d}.jpg" for index in range(len(cameras))]
-    (folder / "project.pto").write_text(project_text(cameras, names, width), encoding="utf-8")
+    write_project(folder, cameras, width)
     _render_views(folder / "views.npz", cameras, tracer, width)
 
 
@@ -157,14 +156,15 @@ def render_layer(
     width: int,
     gain: float = 1.0,
     grid: int = 2,
-    within: tuple[int, int] | None = None,
+    reach: float = 180.0,
 ) -> tuple[Pixels, int, int]:
     """What nona makes of that camera's photo: (rows, columns, 4) cropped RGBA, and its left and top.
 
-    within: rows of the canvas between which all of it is known to lie.
+    reach: degrees above and below its pitch within which all of it is known to lie.
     """
     strips, step = [], 256
-    first, last = within or (0, width // 2)
+    highest, lowest = ((90 - camera.pitch + side) / 180 * width / 2 for side in (-reach, reach))
+    first, last = max(0, round(highest)), min(width // 2, round(lowest))
     for top in range(first, last, step):
         bottom = min(last, top + step)
         y, x = np.mgrid[top:bottom, 0:width] + 0.5
@@ -180,6 +180,12 @@ def render_layer(
     rows, columns = np.flatnonzero(canvas[..., 3].any(1)), np.flatnonzero(canvas[..., 3].any(0))
     left, top = int(columns[0]), int(rows[0])
     return canvas[top : rows[-1] + 1, left : columns[-1] + 1], left, first + top
+
+
+def write_project(folder: Path, cameras: Sequence[Camera], width: int) -> None:
+    """The project of the layers in a folder; its photos are not there."""
+    names = [f"photo{index:04d}.jpg" for index in range(len(cameras))]
+    (folder / "project.pto").write_text(project_text(cameras, names, width), encoding="utf-8")
 
 
 def write_layer(path: Path, layer: Pixels, left: int, top: int, width: int) -> None:

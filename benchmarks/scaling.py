@@ -22,12 +22,9 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
-from benchmarks.rigs import RIGS, gigapixel_cameras, render_layer, write_layer
-from benchmarks.speed import ROOT, Run, make_layers, measure, median
+from benchmarks.rigs import RIGS, gigapixel_cameras, write_project
+from benchmarks.speed import ROOT, Run, make_layers, measure, median, render_layers
 from hugin_abflow.images import ImageWriter, read_layer
-from sample_projects.project import project_text
-from sample_projects.scene import room
-from sample_projects.tracer import Tracer
 
 BASE = 9000  # the width that is rendered
 STRIP = 64  # rows of the rendered layer at a time; even
@@ -74,27 +71,14 @@ def make_set(cache: Path, width: int) -> Path:
         for source in sorted(base.glob("layer[0-9]*.tif")):
             print(f"{width} px: {source.name}", file=sys.stderr)
             resize_layer(source, folder / source.name, width / BASE)
-        cameras = RIGS["ring"](1)
-        names = [f"photo{index:04d}.jpg" for index in range(len(cameras))]
-        (folder / "project.pto").write_text(project_text(cameras, names, width), encoding="utf-8")
+        write_project(folder, RIGS["ring"](1), width)
     return folder
 
 
 def make_many_set(cache: Path, width: int) -> Path:
     """The folder with 300 small layers and their project."""
     folder = cache / "many"
-    if not (folder / "project.pto").exists():
-        folder.mkdir(parents=True, exist_ok=True)
-        cameras, tracer = gigapixel_cameras(), Tracer(room(1), folder.parent, samples=4)
-        for index, camera in enumerate(cameras):
-            if index % 30 == 0:
-                print(f"{index} of {len(cameras)} layers", file=sys.stderr)
-            above, below = (round((90 - camera.pitch + reach) / 180 * width / 2) for reach in (-14, 14))
-            within = max(0, above), min(width // 2, below)
-            layer, left, top = render_layer(camera, tracer, width, 1 + 0.01 * (index % 3 - 1), 1, within)
-            write_layer(folder / f"layer{index:04d}.tif", layer, left, top, width)
-        names = [f"photo{index:04d}.jpg" for index in range(len(cameras))]
-        (folder / "project.pto").write_text(project_text(cameras, names, width), encoding="utf-8")
+    render_layers(folder, gigapixel_cameras(), width, samples=4, reach=14.0)
     return folder
 
 

@@ -16,6 +16,7 @@ import statistics
 import sys
 import tempfile
 import time
+from collections.abc import Sequence
 from dataclasses import astuple, dataclass
 from pathlib import Path
 
@@ -23,9 +24,9 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
-from benchmarks.rigs import RIGS, render_layer, write_layer
+from benchmarks.rigs import RIGS, render_layer, write_layer, write_project
 from hugin_abflow.images import read_layer
-from sample_projects.project import project_text
+from sample_projects.lens import Camera
 from sample_projects.scene import room
 from sample_projects.tracer import Tracer
 
@@ -43,19 +44,27 @@ class Run:
 
 
 def make_layers(folder: Path, width: int) -> None:
-    """Render the layers and the project, unless they are there. One sample a pixel: speed needs no beauty."""
+    """Render the paper's rig."""
+    render_layers(folder, RIGS["ring"](1), width, samples=12)
+
+
+def render_layers(
+    folder: Path, cameras: Sequence[Camera], width: int, samples: int, reach: float = 180.0
+) -> None:
+    """Render the layers and the project, unless they are there. One sample a pixel: speed needs no beauty.
+
+    samples: of the light (tracer.py). reach: as `render_layer` takes it.
+    """
     if (folder / "project.pto").exists():
         return
     folder.mkdir(parents=True, exist_ok=True)
-    cameras = RIGS["ring"](1)
-    tracer = Tracer(room(1), folder.parent, samples=12)
+    tracer = Tracer(room(1), folder.parent, samples=samples)
     for index, camera in enumerate(cameras):
         start = time.perf_counter()
-        layer, left, top = render_layer(camera, tracer, width, 1 + 0.01 * (index % 3 - 1), grid=1)
+        layer, left, top = render_layer(camera, tracer, width, 1 + 0.01 * (index % 3 - 1), 1, reach)
         write_layer(folder / f"layer{index:04d}.tif", layer, left, top, width)
         print(f"layer {index}: rendered in {time.perf_counter() - start:.0f} s", file=sys.stderr)
-    names = [f"photo{index:04d}.jpg" for index in range(len(cameras))]
-    (folder / "project.pto").write_text(project_text(cameras, names, width), encoding="utf-8")
+    write_project(folder, cameras, width)
 
 
 def measure(command: list[str]) -> Run:

@@ -46,6 +46,11 @@ class View:
         """A copy of what is on the device."""
         return cls(level.image.get(), level.mask.get())
 
+    @property
+    def cells(self) -> Mask:
+        """The cells whose centre it shows."""
+        return at_centres(self.mask) > 0
+
 
 @dataclass(frozen=True)
 class Whole:
@@ -118,7 +123,7 @@ class Way:
         starts = np.stack([columns, rows], -1).astype(np.float64) * CELL + CELL // 2 + 0.5
         inside, (row, column) = pixels_at(starts + flow, chart.border)
         there = np.where(inside, row, 0), np.where(inside, column, 0)
-        shown = inside & (at_centres(views[index].mask) > 0) & (views[1 - index].mask[there] > 0)
+        shown = inside & views[index].cells & (views[1 - index].mask[there] > 0)
         believed = shown & (np.linalg.norm(flow + flows[1 - index][there], axis=-1) < gap)
         return cls(starts, starts + flow, shown, believed, chart.width * chart.wraps)
 

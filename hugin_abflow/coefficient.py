@@ -36,6 +36,10 @@ class Masks:
         """The masks of some of the layers."""
         return Masks(self.grid, tuple(self.buffers[i] for i in indices), self.host[list(indices)])
 
+    def overlap(self, first: int, second: int) -> npt.NDArray[np.bool_]:
+        """What two layers both cover, (height, width)."""
+        return np.asarray(self.host[first] & self.host[second])
+
 
 class Overlaps(Sequence[npt.NDArray[np.bool_]]):
     """Where pairs of layers overlap, (height, width) on the mask grid. Each is made when it is asked for: all
@@ -43,14 +47,13 @@ class Overlaps(Sequence[npt.NDArray[np.bool_]]):
     """
 
     def __init__(self, masks: Masks, pairs: Sequence[tuple[int, int]]) -> None:
-        self._covered, self._pairs = masks.host, pairs
+        self._masks, self._pairs = masks, pairs
 
     def __len__(self) -> int:
         return len(self._pairs)
 
     def __getitem__(self, index: Any) -> Any:  # of numbers only
-        first, second = self._pairs[index]
-        return self._covered[first] & self._covered[second]
+        return self._masks.overlap(*self._pairs[index])
 
 
 def on_cells(values: npt.NDArray[_Kind], cells: Grid, rule: np.ufunc) -> npt.NDArray[_Kind]:

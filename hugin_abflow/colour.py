@@ -20,6 +20,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any, Final
 
 import numpy as np
@@ -28,9 +29,10 @@ import scipy
 
 from hugin_abflow.coefficient import on_cells
 from hugin_abflow.geometry import Pair
+from hugin_abflow.layer import Box
 from hugin_abflow.opencl import Buffer, Device
 from hugin_abflow.settings import Settings
-from hugin_abflow.working import Grid, Place, WorkingLayer, cells_under, common
+from hugin_abflow.working import Grid, WorkingLayer, shared_cells
 
 # Working pixels per cell of the colour grid.
 _CELL = 16
@@ -78,7 +80,7 @@ class Difference:
     beyond  the same where only one of them is clipped, a if the weight is positive, b if it is negative: at
             least that much.
     mixing  how far both are seen, (height, width).
-    place   the first cell's column and row; cells where only one layer can be are left out.
+    cells   rows and columns of the grid that these are; what only one layer can be in is left out.
     """
 
     a: int
@@ -86,13 +88,7 @@ class Difference:
     values: npt.NDArray[np.float64]
     beyond: npt.NDArray[np.float64]
     mixing: npt.NDArray[np.float64]
-    place: tuple[int, int] = (0, 0)
-
-    @property
-    def cells(self) -> tuple[slice, slice]:
-        """Those cells, of the colour grid's rows and columns."""
-        (left, top), (height, width) = self.place, self.mixing.shape
-        return slice(top, top + height), slice(left, left + width)
+    cells: tuple[slice, slice] = (slice(None), slice(None))
 
 
 @dataclass(frozen=True)
@@ -217,32 +213,31 @@ class _Overlap:
         """What both kernels begin with."""
         pairs = [(self.layers[k], self.fields[k]) for k in (self.pair.a, self.pair.b)]
         sides = [value for layer, field in pairs for value in (layer.pixels, field, layer.box)]
-        return [*sides, self.grid.border, self.grid.lens, self.cells.border, self._part]
+        return [*sides, self.grid.border, self.grid.lens, self.cells.border, self._part.place]
 
-    @property
-    def _part(self) -> Place:
+    @cached_property
+    def _part(self) -> Box:
         """The cells that both layers' boxes reach into."""
-        first, second = (self.layers[k].box for k in (self.pair.a, self.pair.b))
-        return cells_under(common(first, second), self.grid, self.cells)
+        return shared_cells(self.layers[self.pair.a], self.layers[self.pair.b], self.grid, self.cells)
 
     def difference(self, shoulder: float) -> Difference:
         """The difference on the exposure scale of a shoulder."""
-        left, top, *size = self._part
-        values, beyond = (self.device.empty((*size[::-1], 4)) for _ in range(2))
-        mixing = self.device.empty(size[::-1])
+        width, height = self._part.width, self._part.height
+        values, beyond = (self.device.empty((height, width, 4)) for _ in range(2))
+        mixing = self.device.empty((height, width))
         self.device.run(
-            "colour", "colour_difference", size,
+            "colour", "colour_difference", (width, height),
             *self._sides, shoulder, *self._clipping, _SPREAD, values, beyond, mixing,
         )  # fmt: skip
         one, other, seen = (v.get().astype(np.float64) for v in (values, beyond, mixing))
-        return Difference(self.pair.a, self.pair.b, one, other, seen, (left, top))
+        return Difference(self.pair.a, self.pair.b, one, other, seen, self._part.slices)
 
     def misfit(self) -> npt.NDArray[np.float64]:
         """What is left of the difference on the scale of each of _SHOULDERS: (cells, shoulders)."""
-        size = self._part[2:]
-        misfit = self.device.empty((*size[::-1], 4))
+        width, height = self._part.width, self._part.height
+        misfit = self.device.empty((height, width, 4))
         self.device.run(
-            "colour", "colour_misfit", size,
+            "colour", "colour_misfit", (width, height),
             *self._sides, _SHOULDERS, *self._clipping, misfit,
         )  # fmt: skip
         return misfit.get().astype(np.float64).reshape(-1, len(_SHOULDERS))

@@ -29,7 +29,6 @@ from hugin_abflow.cells import (
     View,
     Way,
     Whole,
-    at_centres,
     cells_at,
     ends_within,
     grown,
@@ -57,7 +56,7 @@ def find(
     flows       from the first to the second photo and back, float32 (height, width, 2), chart px.
     vouched     where somebody says that both show the same: what is matched so is left alone.
     """
-    masks = at_centres(views[0].mask) > 0, at_centres(views[1].mask) > 0
+    masks = views[0].cells, views[1].cells
     ways = [Way.of(chart, flows, views, index) for index in (0, 1)]
     if not all(way.believed.any() for way in ways):
         return None

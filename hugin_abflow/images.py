@@ -123,7 +123,7 @@ def _describe(path: Path, name: str, page: int, source: Any, place: tifftags.Pla
     profile = spec.getattribute("ICCProfile")
     return Layer(
         name=name,
-        box=Box(left, top, left + spec.width, top + spec.height),
+        box=Box.at(left, top, spec.width, spec.height),
         dtype=rows.dtype,
         channels=rows.channels,
         read=rows.read,

@@ -39,6 +39,11 @@ class Box:
     right: int
     bottom: int
 
+    @classmethod
+    def at(cls, left: int, top: int, width: int, height: int) -> Box:
+        """By its corner and size."""
+        return cls(left, top, left + width, top + height)
+
     @property
     def width(self) -> int:
         """Columns."""
@@ -48,6 +53,16 @@ class Box:
     def height(self) -> int:
         """Rows."""
         return self.bottom - self.top
+
+    @property
+    def place(self) -> tuple[int, int, int, int]:
+        """Its corner and size, as kernels take it."""
+        return self.left, self.top, self.width, self.height
+
+    @property
+    def slices(self) -> tuple[slice, slice]:
+        """Its rows and columns, of an array over what it is a part of."""
+        return slice(self.top, self.bottom), slice(self.left, self.right)
 
     def intersect(self, other: Box) -> Box:
         """The common part; its width or height is 0 where there is none."""
@@ -147,7 +162,7 @@ class Layer:
         if stored.dtype.kind == "f":
             finite = np.isfinite(stored).all(axis=2, keepdims=True)
             stored = stored if finite.all() else np.where(finite, stored, stored.dtype.type(0))
-        box = Box(left, top, left + width, top + height)
+        box = Box.at(left, top, width, height)
         return cls(name, box, stored.dtype, samples - 1, lambda first, last: stored[first:last], icc)
 
 

@@ -28,7 +28,6 @@ from hugin_abflow.cells import (
     View,
     Way,
     Whole,
-    at_centres,
     ends_within,
     grown,
     reached,
@@ -94,8 +93,9 @@ def find(
         apart = np.where(its_way, np.minimum(apart, 1.0), apart).reshape(way.shown.shape)
         if searched:  # only what is certain
             apart *= way.believed
-        sides = (views[index], views[1 - index]), (vouched[index], vouched[1 - index])
-        its = _things(chart, way, apart, *sides)
+        its = _things(
+            chart, way, apart, (views[index], views[1 - index]), (vouched[index], vouched[1 - index])
+        )
         found[index] |= its
         found[1 - index] |= reached(way.ends[its & way.believed], its.shape, chart)
     return Whole.of(found, chart.wraps)
@@ -128,7 +128,7 @@ def _ends_within(chart: Chart, way: Way, views: tuple[View, View], thing: Mask) 
     """
     its = thing & way.shown
     there = reached(way.ends[its & way.believed], its.shape, chart)
-    masks = at_centres(views[0].mask) > 0, at_centres(views[1].mask) > 0
+    masks = views[0].cells, views[1].cells
     shown = [its.astype(np.int32), there.astype(np.int32)]
     return bool(ends_within(shown, 2, masks, chart.wraps)[1])
 

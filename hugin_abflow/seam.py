@@ -35,8 +35,9 @@ from hugin_abflow.coefficient import Masks, on_cells
 from hugin_abflow.colour import Correction, clipping
 from hugin_abflow.geometry import Pair
 from hugin_abflow.labelling import Graph, energy, least
+from hugin_abflow.layer import Box
 from hugin_abflow.opencl import Buffer, Device
-from hugin_abflow.working import Grid, Place, WorkingLayer, cells_under, common, connected
+from hugin_abflow.working import Grid, Place, WorkingLayer, connected, shared_cells
 
 # Working pixels per cell of the seam grid.
 _CELL = 8
@@ -104,9 +105,7 @@ def residuals(
     clipped = [clipping(layer) for layer in layers]
     for its, found in _differences(device, layers, fields, pairs, correction, grid, cells, clipped):
         share = found[..., 4:]
-        gap = min(_REACH, cells.width - found.shape[1])  # more is between its ends if columns wrap
-        values = np.pad(np.concatenate([found[..., :4] * share, share], -1), ((0, 0), (0, gap), (0, 0)))
-        smooth = _smooth(values, cells.wraps)[:, : found.shape[1]]
+        smooth = _smooth(np.concatenate([found[..., :4] * share, share], -1), cells)
         smooth = (share > 0) * smooth[..., :4] / np.where(share > 0, smooth[..., 4:], 1)
         mean[its] = np.maximum(mean[its], np.abs(smooth[..., :3]).max(-1))
         square[its] = np.maximum(square[its], smooth[..., 3])
@@ -284,26 +283,26 @@ def _differences(
     """
     none = device.zeros((*correction.grid.shape, 4))
 
-    def start(pair: Pair) -> tuple[Place, Buffer, Buffer]:
-        part = cells_under(common(layers[pair.a].box, layers[pair.b].box), grid, cells)
-        size = part[2:]
-        difference, square = device.empty((*size[::-1], 4)), device.empty(size[::-1])
+    def start(pair: Pair) -> tuple[Box, Buffer, Buffer]:
+        part = shared_cells(layers[pair.a], layers[pair.b], grid, cells)
+        difference = device.empty((part.height, part.width, 4))
+        square = device.empty((part.height, part.width))
         sides: list[Any] = []
         for k in (pair.a, pair.b):
             sides += [layers[k].pixels, fields[k], layers[k].box, correction.gains[k] or none]
         device.run(
-            "seam", "seam_difference", size, *sides, grid.border, grid.lens, correction.grid.border,
-            cells.border, part, correction.shoulder, clipped[pair.a], clipped[pair.b], difference, square,
+            "seam", "seam_difference", (part.width, part.height), *sides, grid.border, grid.lens,
+            correction.grid.border, cells.border, part.place, correction.shoulder, clipped[pair.a],
+            clipped[pair.b], difference, square,
         )  # fmt: skip
         return part, difference, square
 
     def fetch(
-        part: Place, difference: Buffer, square: Buffer
+        part: Box, difference: Buffer, square: Buffer
     ) -> tuple[tuple[slice, slice], npt.NDArray[np.float64]]:
-        left, top, width, height = part
         mean = difference.get()
         found = np.dstack([mean[..., :3], square.get(), mean[..., 3]]).astype(np.float64)
-        return (slice(top, top + height), slice(left, left + width)), found
+        return part.slices, found
 
     if not pairs:
         return
@@ -316,10 +315,14 @@ def _differences(
     yield fetch(*started)
 
 
-def _smooth(values: npt.NDArray[np.float64], wraps: bool) -> npt.NDArray[np.float64]:
-    """A Gaussian of _SIGMA cells, not normalised at the borders."""
-    modes = ("constant", "wrap" if wraps else "constant", "constant")
-    return np.asarray(scipy.ndimage.gaussian_filter(values, (_SIGMA, _SIGMA, 0), mode=modes, radius=_REACH))
+def _smooth(values: npt.NDArray[np.float64], cells: Grid) -> npt.NDArray[np.float64]:
+    """A Gaussian of _SIGMA cells, not normalised at the borders, of some of a grid's columns side by side."""
+    columns = values.shape[1]
+    gap = min(_REACH, cells.width - columns)  # what is between its ends if columns wrap, and matters
+    values = np.pad(values, ((0, 0), (0, gap), (0, 0)))
+    modes = ("constant", "wrap" if cells.wraps else "constant", "constant")
+    smooth = scipy.ndimage.gaussian_filter(values, (_SIGMA, _SIGMA, 0), mode=modes, radius=_REACH)
+    return np.asarray(smooth[:, :columns])
 
 
 def _padded(values: npt.NDArray[Any], by: int, wraps: bool) -> npt.NDArray[Any]:

@@ -133,23 +133,6 @@ class Grid:
         return replace(self, width=width, height=height, lens=lens)
 
 
-def common(first: Place, second: Place) -> Place:
-    """What two places share; without width or height where that is nothing."""
-    left, top = max(first[0], second[0]), max(first[1], second[1])
-    right, bottom = (min(first[k] + first[k + 2], second[k] + second[k + 2]) for k in (0, 1))
-    return left, top, max(0, right - left), max(0, bottom - top)
-
-
-def cells_under(place: Place, grid: Grid, cells: Grid) -> Place:
-    """What a place on `grid` reaches into of `cells`, into which kernels part the same region."""
-    first, count = [], []
-    for start, length, of, to in zip(place[:2], place[2:], grid.border, cells.border, strict=False):
-        edges = np.arange(to + 1) * of // to
-        first.append(int(np.searchsorted(edges, start, "right")) - 1)
-        count.append(int(np.searchsorted(edges, start + length)) - first[-1] if length else 0)
-    return first[0], first[1], count[0], count[1]
-
-
 def connected(mask: npt.NDArray[np.bool_], wraps: bool) -> npt.NDArray[np.int32]:
     """The connected parts of a mask over a grid, numbered from 1 on, not all numbers in use; 0 elsewhere."""
     labels = np.asarray(cv2.connectedComponents(mask.astype(np.uint8), connectivity=8)[1], np.int32)
@@ -177,6 +160,31 @@ class WorkingLayer:
     pixels: Buffer
     checksum: int
     white: tuple[float, float, float] = (1.0, 1.0, 1.0)
+
+
+def shared_box(a: WorkingLayer, b: WorkingLayer) -> Box:
+    """What both layers' boxes have in common."""
+    return Box.at(*a.box).intersect(Box.at(*b.box))
+
+
+def shared_cells(a: WorkingLayer, b: WorkingLayer, grid: Grid, cells: Grid) -> Box:
+    """Those of `cells`, over the region of their grid, that both layers' boxes reach into."""
+    return cells_under(shared_box(a, b), grid, cells)
+
+
+def cells_under(box: Box, grid: Grid, cells: Grid) -> Box:
+    """What a box of `grid` reaches into of `cells`, into which kernels part the same region."""
+    left, right = _cells(box.left, box.right, grid.width, cells.width)
+    top, bottom = _cells(box.top, box.bottom, grid.height, cells.height)
+    return Box(left, top, right, bottom)
+
+
+def _cells(start: int, end: int, pixels: int, cells: int) -> tuple[int, int]:
+    """The first cell that has one of the pixels from `start` up to `end`, and the one after the last; cell c
+    begins with pixel c * pixels // cells.
+    """
+    first = ((start + 1) * cells - 1) // pixels
+    return first, (end * cells - 1) // pixels + 1 if end > start else first
 
 
 def full_grid(canvas: Canvas, layers: Sequence[Layer]) -> Grid:

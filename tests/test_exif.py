@@ -158,7 +158,7 @@ def test_exr_carries_what_openimageio_can(exiftool: str, tmp_path: Path) -> None
 
 @pytest.mark.parametrize("dated", ["no metadata", "no date", "a date"])
 def test_exr_is_dated_as_the_photos_only(tmp_path: Path, dated: str) -> None:
-    """OpenImageIO dates what has no date itself: to the second, so that equal panoramas seldom differed."""
+    """OpenImageIO dates what has no date by the clock, and two of one project would differ by seconds."""
     path = tmp_path / "a.exr"
     date = {306: text("2020:01:02 03:04:05")} if dated == "a date" else {}
     picture(path, np.float16, None if dated == "no metadata" else Metadata({MAIN: TAGS[MAIN] | date}))

@@ -9,6 +9,13 @@ from hugin_abflow.errors import ImageReadError
 from hugin_abflow.layer import Box, Canvas, Layer, full_scale
 
 
+def test_box_is_a_place_and_a_part_of_arrays():
+    box = Box.at(4, 5, 10, 3)
+    assert box == Box(4, 5, 14, 8) and box.place == (4, 5, 10, 3)
+    assert np.zeros((20, 30))[box.slices].shape == (3, 10)
+    assert (box.slices[0].start, box.slices[1].start) == (5, 4)
+
+
 def test_box_measures_and_intersects():
     box = Box(3, 5, 14, 12)
     assert (box.width, box.height) == (11, 7)

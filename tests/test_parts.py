@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from itertools import combinations
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -15,9 +14,10 @@ from scipy import ndimage
 from hugin_abflow import colour, seam
 from hugin_abflow.coefficient import Masks, Overlaps
 from hugin_abflow.geometry import Pair
+from hugin_abflow.layer import Box
 from hugin_abflow.opencl import Device
 from hugin_abflow.settings import Settings
-from hugin_abflow.working import cells_under, common
+from hugin_abflow.working import cells_under
 
 SPANS = st.tuples(st.integers(0, 40), st.integers(0, 40))
 
@@ -30,11 +30,13 @@ def test_common_is_what_is_in_both(columns: tuple, rows: tuple) -> None:
         mask = np.zeros((80, 80), bool)
         mask[top : top + height, left : left + width] = True
         shown.append(mask)
-    left, top, width, height = common(*places)
+    first, second = (Box.at(*place) for place in places)
+    left, top, width, height = first.intersect(second).place
     both = np.zeros((80, 80), bool)
     both[top : top + height, left : left + width] = True
     assert np.array_equal(both, shown[0] & shown[1])
-    assert common(*places[::-1])[2:] == (width, height)
+    assert second.intersect(first).place[2:] == (width, height)
+    assert np.array_equal(both[first.slices], shown[1][first.slices])
 
 
 @given(data=st.data(), width=st.integers(1, 60), height=st.integers(1, 60))
@@ -46,7 +48,7 @@ def test_cells_under_a_place_are_those_that_have_a_pixel_of_it(
     cells = grid.resized(data.draw(st.integers(1, 70)), data.draw(st.integers(1, 70)))
     left, top = data.draw(st.integers(0, width - 1)), data.draw(st.integers(0, height - 1))
     place = left, top, data.draw(st.integers(0, width - left)), data.draw(st.integers(0, height - top))
-    found = cells_under(place, grid, cells)
+    found = cells_under(Box.at(*place), grid, cells).place
     for first, count, start, length, of, to in zip(
         found[:2], found[2:], place[:2], place[2:], (width, height), (cells.width, cells.height), strict=True
     ):
@@ -84,7 +86,7 @@ def test_cells_beside_are_as_if_compared(device: Device, name: str, monkeypatch:
     for everything in (False, True):
         if everything:
             for module in (colour, seam):
-                monkeypatch.setattr(module, "cells_under", lambda _, __, cells: (0, 0, *cells.border[:2]))
+                monkeypatch.setattr(module, "shared_cells", lambda *given: Box(0, 0, *given[-1].border[:2]))
         measured = colour.measure(device, layers, fields, pairs, grid, covered)
         of_all = [difference.mixing.shape == measured.grid.shape for difference in measured.differences]
         assert all(of_all) == everything
@@ -113,7 +115,7 @@ def test_differences_count_in_their_rows_and_columns() -> None:
         one[..., 3] = np.abs(one[..., 3]) if one is few[0] else np.round(one[..., 3])
         same[1:5, 13:20] = one
     differences = (
-        colour.Difference(0, 1, *few, np.ones((4, 7)), (13, 1)),
+        colour.Difference(0, 1, *few, np.ones((4, 7)), np.s_[1:5, 13:20]),
         colour.Difference(0, 1, *wide, np.ones(cells.shape)),
     )
     for beyond_alone in (False, True):
@@ -122,21 +124,6 @@ def test_differences_count_in_their_rows_and_columns() -> None:
         gains = [colour.solve(colour.Measured(cells, inside, 1.0, (one,))) for one in differences]
         assert np.array_equal(*gains)
         assert (np.abs(gains[0]) > 0.01).any()
-
-
-def test_residuals_are_smoothed_across_the_border(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Of a canvas that wraps, by what is compared all along it; the same at each column."""
-    found = np.random.default_rng(4).random((9, 12, 5))
-    layers = [SimpleNamespace(layer=SimpleNamespace(dtype=np.dtype(np.uint8)), white=(1.0, 1.0, 1.0))] * 2
-    means = []
-    for wraps in (True, False):
-        for shift in (0, 5):
-            turned = np.roll(found, shift, 1)
-            monkeypatch.setattr(seam, "_differences", lambda *_, its=turned: [(np.s_[0:9, 0:12], its)])
-            residual = seam.residuals(None, layers, [], [Pair(0, 1)], None, plane(96, 72, wraps))
-            means.append(np.roll(residual.mean, -shift, 1))
-    assert np.array_equal(means[0], means[1])
-    assert not np.array_equal(means[2], means[3]) and not np.array_equal(means[0], means[2])
 
 
 def test_overlaps_are_what_both_layers_cover() -> None:

@@ -224,6 +224,8 @@ def test_a_border_is_priced_by_all_frequencies() -> None:
 
 # Residuals
 
+LAYERS = [SimpleNamespace(layer=SimpleNamespace(dtype=np.dtype(np.uint8)), white=(1.0, 1.0, 1.0))] * 2
+
 
 def test_a_cell_of_which_little_is_seen_tells_as_much_less(monkeypatch: pytest.MonkeyPatch) -> None:
     found = np.zeros((9, 12, 5))
@@ -231,14 +233,27 @@ def test_a_cell_of_which_little_is_seen_tells_as_much_less(monkeypatch: pytest.M
     found[4, 6] = 0.5, -0.6, 0.1, 0.4, 0.1
     found[4, 7] = 0
     monkeypatch.setattr(seam, "_differences", lambda *_: [(np.s_[0:9, 0:12], found)])
-    layers = [SimpleNamespace(layer=SimpleNamespace(dtype=np.dtype(np.uint8)), white=(1.0, 1.0, 1.0))] * 2
-    residual = seam.residuals(None, layers, [], [seam.Pair(0, 1)], None, plane(96, 72))
+    residual = seam.residuals(None, LAYERS, [], [seam.Pair(0, 1)], None, plane(96, 72))
     y, x = np.mgrid[0:9, 0:12]
     weight = np.exp(-0.5 * ((y - 4) ** 2 + (x - 6) ** 2)) * found[..., 4]
     assert np.isclose(residual.mean[4, 6], 0.6 * 0.1 / weight.sum(), rtol=0.01)
     assert np.isclose(residual.rms[4, 6], np.sqrt(0.4 * 0.1 / weight.sum()), rtol=0.01)
     assert residual.mean[4, 7] == residual.rms[4, 7] == 0
     assert residual.told is not None and residual.told.sum() == 107 and not residual.told[4, 7]
+
+
+def test_residuals_are_smoothed_across_the_border(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of a canvas that wraps, by what is compared all along it; the same at each column."""
+    found = np.random.default_rng(4).random((9, 12, 5))
+    means = []
+    for wraps in (True, False):
+        for shift in (0, 5):
+            turned = np.roll(found, shift, 1)
+            monkeypatch.setattr(seam, "_differences", lambda *_, its=turned: [(np.s_[0:9, 0:12], its)])
+            residual = seam.residuals(None, LAYERS, [], [seam.Pair(0, 1)], None, plane(96, 72, wraps))
+            means.append(np.roll(residual.mean, -shift, 1))
+    assert np.array_equal(means[0], means[1])
+    assert not np.array_equal(means[2], means[3]) and not np.array_equal(means[0], means[2])
 
 
 def test_a_cell_is_told_of_by_any_pair(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -248,8 +263,7 @@ def test_a_cell_is_told_of_by_any_pair(monkeypatch: pytest.MonkeyPatch) -> None:
     asked = []
     everywhere = [(np.s_[0:9, 0:12], one) for one in found]
     monkeypatch.setattr(seam, "_differences", lambda *given: asked.append(given[-1]) or iter(everywhere))
-    layers = [SimpleNamespace(layer=SimpleNamespace(dtype=np.dtype(np.uint8)), white=(1.0, 1.0, 1.0))] * 2
-    residual = seam.residuals(None, layers, [], [seam.Pair(0, 1)] * 2, None, plane(96, 72))
+    residual = seam.residuals(None, LAYERS, [], [seam.Pair(0, 1)] * 2, None, plane(96, 72))
     assert np.array_equal(residual.told, (found[..., 4] > 0).any(0)) and asked == [
         [(0.98, 0.98, 0.98, 1.0)] * 2
     ]

@@ -76,7 +76,7 @@ def _crop(request: Request, value: str) -> Request:
     width, height, left, top = (int(number or 0) for number in found.groups()) if found else (0, 0, 0, 0)
     if not width or not height:
         raise CommandLineError(f"-f {value}: give WIDTHxHEIGHT or WIDTHxHEIGHT+X+Y in pixels")
-    return replace(request, crop=Box(left, top, left + width, top + height))
+    return replace(request, crop=Box.at(left, top, width, height))
 
 
 def _wrap(request: Request, value: str) -> Request:
