@@ -20,7 +20,7 @@ from hugin_abflow import flow
 from hugin_abflow.cells import Flows, pixels_at
 from hugin_abflow.chart import Chart
 from hugin_abflow.flow import Board, FlowParameters, Start
-from hugin_abflow.guides import Guide, Points, doubts
+from hugin_abflow.guides import Guide, Points, distances, doubts
 from hugin_abflow.opencl import Buffer, Device
 from hugin_abflow.pyramid import Level
 from hugin_abflow.working import Grid
@@ -101,8 +101,7 @@ def lead(
     wrong = _wrong(ways, parameters.agreement)
     if not wrong.any():
         return flows
-    width, _, wraps, _ = images[0].grid
-    around = width if wraps else math.inf
+    around = _around(images[0].grid)
     reasons = doubts(guides.at_a, ways[0].moves, parameters.radius * circumference, around)
     for name, reason, counts in zip(guides.names, reasons, wrong, strict=True):
         if reason and counts:
@@ -213,7 +212,8 @@ class _Springs:
         way = way.only(np.any(way.residuals, axis=1))  # the others are not on the chart
         table = np.concatenate([way.places, way.residuals], 1)
         self._guides = device.upload(table, np.float32)
-        self._sigmas = device.upload(_sigmas(way, parameters), np.float32)
+        sigmas = _sigmas(way, _around(image.grid), parameters)
+        self._sigmas = device.upload(sigmas, np.float32)
 
     def at(self, level: int) -> tuple[Buffer, Buffer]:
         """Start (height, width, 2) and nearness (height, width) on a level."""
@@ -241,18 +241,24 @@ class _Springs:
         )  # fmt: skip
 
 
-def _sigmas(way: _Way, parameters: GuidanceParameters) -> Values:
-    """How far each guide leads, px."""
+def _sigmas(way: _Way, around: float, parameters: GuidanceParameters) -> Values:
+    """How far each guide leads, px; `around`: as of `guides.doubts`."""
     lengths = np.linalg.norm(way.residuals, axis=1)
     sigmas = lengths.copy()
     for i in range(len(lengths)):
         alike = np.linalg.norm(way.moves - way.moves[i], axis=1) < _ALIKE * lengths[i]
         alike[i] = False
-        to_next = np.linalg.norm(way.places[alike] - way.places[i], axis=1).min(initial=np.inf)
-        if np.isfinite(to_next):
-            sigmas[i] = max(sigmas[i], parameters.spacing * to_next)
+        spaced = parameters.spacing * distances(way.places, i, around)[alike].min(initial=np.inf)
+        if spaced <= parameters.most_sigma:  # one that is farther away is on something else
+            sigmas[i] = max(sigmas[i], spaced)
     clipped: Values = np.clip(sigmas, parameters.least_sigma, parameters.most_sigma)
     return clipped
+
+
+def _around(grid: tuple[int, int, int, int]) -> float:
+    """After how many px columns repeat."""
+    width, _, wraps, _ = grid
+    return width if wraps else math.inf
 
 
 @dataclass(frozen=True)

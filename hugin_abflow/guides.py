@@ -54,12 +54,12 @@ def doubts(places: Points, moves: Points, radius: float, around: float = math.in
     """
     reasons = [""] * len(places)
     for i in range(len(places)):  # row by row: a project may have ten thousand points
-        again = (_distances(places, i, around) < _SAME_PLACE) & (_distances(moves, i) < _SAME_PLACE)
+        again = (distances(places, i, around) < _SAME_PLACE) & (distances(moves, i) < _SAME_PLACE)
         for j in np.flatnonzero(again[i + 1 :]) if not reasons[i] else ():
             reasons[i + 1 + j] = "it repeats another"
     counted = np.array([not reason for reason in reasons], bool)
     for i in map(int, np.flatnonzero(counted)):
-        apart = np.where(counted, _distances(places, i, around), np.inf)
+        apart = np.where(counted, distances(places, i, around), np.inf)
         apart[i] = np.inf
         others = np.argsort(apart, kind="stable")[:_MOST_NEIGHBOURS]
         others = others[apart[others] < radius]
@@ -81,13 +81,13 @@ def by_pair(guides: Iterable[Guide]) -> dict[tuple[int, int], list[Guide]]:
     return pairs
 
 
-def _distances(points: Points, index: int, around: float = math.inf) -> npt.NDArray[np.float64]:
-    """From one of the points to each of them; `around`: as of `doubts`."""
+def distances(points: Points, index: int, around: float = math.inf) -> npt.NDArray[np.float64]:
+    """From one of the points to each of them, px; `around`: as of `doubts`."""
     apart = np.abs(points - points[index])
     columns = apart[:, 0] % around
     apart[:, 0] = np.minimum(columns, around - columns)
-    distances: npt.NDArray[np.float64] = np.linalg.norm(apart, axis=1)
-    return distances
+    found: npt.NDArray[np.float64] = np.linalg.norm(apart, axis=1)
+    return found
 
 
 def _stands_alone(move: npt.NDArray[np.float64], others: Points) -> bool:

@@ -239,6 +239,21 @@ def test_far_places_are_untouched(device: Device, pair) -> None:
         assert not changed[:, far].any()
 
 
+def test_guides_that_are_too_far_apart_lead_one_by_one(device: Device, pair) -> None:
+    """Two that send alike are on one thing, unless that were larger than any may be."""
+    images, alone, _ = pair("texture")
+
+    def led(spacing: float) -> np.ndarray:
+        found = device.copy(alone[0]), device.copy(alone[1])
+        parameters = GuidanceParameters(most_sigma=100.0, spacing=spacing)
+        return guidance.lead(device, images, found, ON_THE_THING, 2048.0, parameters)[0].get()
+
+    apart = float(np.linalg.norm(np.subtract(*ON_THE_THING.at_a)))
+    one_by_one = led(0.0)
+    assert np.array_equal(led(100.1 / apart), one_by_one)
+    assert not np.array_equal(led(99.9 / apart), one_by_one)
+
+
 def test_guides_that_agree_change_nothing(device: Device, pair) -> None:
     images, alone, _ = pair("texture")
     before = [one.get() for one in alone]
@@ -315,16 +330,17 @@ def test_one_guide_alone_is_trusted(device: Device, pair) -> None:
 
 
 def test_guides_around_the_border_of_a_cylinder(device: Device) -> None:
-    """The same scene, turned so that the thing lies across the border: the same flow, turned."""
+    """The same scene, turned so that the border lies between its guides: the same flow, turned."""
     a, b = (np.pad(thing("white", s)[0], ((0, 0), (0, 83)), mode="reflect") for s in (0, MOVE))
     results = []
-    for turn in (0, 192):
+    for turn in (0, 256):
         images = tuple(level(device, log(np.roll(i, turn, 1)), None, True) for i in (a, b))
         at_a, at_b = (
             np.add(ends, (turn, 0)) % (384, 1000) for ends in (ON_THE_THING.at_a, ON_THE_THING.at_b)
         )
         alone = flow.pair_flow(device, *images)
-        led = guidance.lead(device, images, alone, ChartGuides(at_a, at_b, ("one", "two")), 2048.0)
+        guides = ChartGuides(at_a, at_b, ("one", "two"))
+        led = guidance.lead(device, images, alone, guides, 2048.0, GuidanceParameters(spacing=2.0))
         results.append(np.roll(led[0].get(), -turn, 1))
     x, y = common.pixels(384, HEIGHT)
     inside = (np.abs(x + 0.5 - CENTRE[0]) < 34) & (np.abs(y + 0.5 - CENTRE[1]) < 60)
