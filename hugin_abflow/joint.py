@@ -66,6 +66,8 @@ _SEAM_ROUNDS = 2
 _STEP_BYTES, _FLOW_BYTES, _FOUND_BYTES, _SOLVER_BYTES = 16 + 4 + 9, 16, 32, 250
 # What libraries take that are still being loaded (`_making_ready`).
 _LIBRARY_BYTES = 50 << 20
+# A weight that nothing brings above 0 (blend.cl lets hidden layers weigh something after all).
+_NEVER = -1e30
 # Below this a working canvas is too small to be worth another attempt.
 _LEAST_WORKING_PIXELS = 20_000
 
@@ -315,8 +317,9 @@ def _redundant(index: int, layers: Sequence[WorkingLayer], masks: Masks) -> bool
 
 
 def _unblended(device: Device, layer: WorkingLayer) -> BlendLayer:
-    """A layer without weight: it shows only where no other layer is."""
-    return BlendLayer(layer.layer, (*layer.box[:2], 1, 1), device.zeros((1, 1, 4)), [0.0], None, None)
+    """A layer that weighs less than nothing: it shows only where no other layer is."""
+    field = device.upload(np.array([[[0, 0, 0, _NEVER]]], np.float32))
+    return BlendLayer(layer.layer, (*layer.box[:2], 1, 1), field, [0.0], None, None)
 
 
 def _overlapping(device: Device, layers: Sequence[WorkingLayer], masks: Masks) -> list[Pair]:

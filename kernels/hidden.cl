@@ -16,7 +16,7 @@ static inline hidden_columns hidden_within(__global float4 *fields, int8 box, in
     return (hidden_columns){fields + box.s4 + down * box.s2 - box.s0, first, end};
 }
 
-/* Weights of fields that are less than a share of their sum become negative. */
+/* Weights of fields that are less than a share of their sum become negative; those that are stay so. */
 __kernel void hidden_mark(__global float4 *fields,    /* one after the other: (box.w, box.z) each; w: weight */
                           __global const int8 *boxes, /* (count) box on the working grid; s4: begin in fields */
                           int count,
@@ -33,7 +33,7 @@ __kernel void hidden_mark(__global float4 *fields,    /* one after the other: (b
     for (int k = 0; k < count; ++k) {
         const hidden_columns its = hidden_within(fields, boxes[k], left, right, y);
         for (int x = its.first; x < its.end; ++x)
-            least[x - left] += share * its.row[x].w;
+            least[x - left] += share * GREATEST(its.row[x].w, 0.0f);
     }
     for (int k = 0; k < count; ++k) {
         const hidden_columns its = hidden_within(fields, boxes[k], left, right, y);

@@ -191,6 +191,22 @@ def test_height_of_bands_changes_nothing(canvas, working_pixels):
 
 
 @shared_device
+@pytest.mark.parametrize("seed", [1, 3, 8])
+def test_bands_do_not_tell_where_a_layer_inside_another_shows(seed):
+    """It does where samples of the others fall into their holes, or it does not: for all bands alike."""
+    random, canvas = np.random.default_rng(seed), Canvas.plane(48, 66)
+    y, x = pixel_places(66, 48)
+    first, second = random.random((2, 66, 48)) > 0.3
+    inner = first & (x >= 10) & (y >= 20) & (y < 50)
+    shifts = zip((0, 3, -2), (first, second, inner), strict=True)
+    layers = [masked(texture(y, x - shift), mask) for shift, mask in shifts]
+    settings = {"working_pixels": 48 * 66}
+    whole = merged(layers, canvas, band_rows=66, **settings)
+    for rows in (4, 13):
+        np.testing.assert_array_equal(merged(layers, canvas, band_rows=rows, **settings), whole)
+
+
+@shared_device
 def test_bands_read_only_rows_near_them():
     """Full resolution is a stream: no layer is read whole for a band, but for a band of its height."""
     canvas = CANVASES["plane"]
