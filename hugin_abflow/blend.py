@@ -232,7 +232,15 @@ def _bands(
                 offset_grid.border, (part.left, part.top, *size), (region.left, region.top), shoulder,
                 int(settings.interpolation == "nearest"), share, marks, marks.shape[-1], out, options=options,
             )  # fmt: skip
-            yield out.get().astype(first.dtype, copy=False)
+            yield _stored(out.get(), first.dtype)
+
+
+def _stored(values: npt.NDArray[Any], dtype: np.dtype[Any]) -> npt.NDArray[Any]:
+    """Samples as the layers have them; light that is more than half floats hold is all that they do."""
+    if dtype == np.float16:
+        most = np.finfo(np.float16).max
+        np.clip(values, -most, most, out=values)
+    return values.astype(dtype, copy=False)
 
 
 def _turn(device: Device, angle: float, step: float, first: int, count: int) -> Buffer:

@@ -3,6 +3,9 @@
 /* Of the cubic that layers are sampled with: Catmull-Rom's -1/2 loses a twentieth of fine texture's gradients over
    all fractions, this next to nothing; a ramp stays one to 0.03 px. */
 #define BLEND_SLOPE (-2.0f / 3.0f)
+/* Beside a step it swings back by a share of that. Beside a lamp this is more light than there is, so that floats, which
+   no range limits, stay above half of the least tap; ordinary texture does anyway. */
+#define BLEND_LIT(v, least) (INTEGER ? (v) : GREATEST(v, (least) - 0.5f * MAGNITUDE(least)))
 
 /* What is kept for PIXELS sets of four taps, or of their weights, is blend_samples too. */
 #define FIRSTS REDS
@@ -40,7 +43,7 @@ static float4 blend_rim(__global const pixel_stored *stored, __global const blen
                         int4 border) {
     const float4 wx = cubic_taps(t.x, BLEND_SLOPE), wy = cubic_taps(t.y, BLEND_SLOPE);
     const float ax[4] = {wx.x, wx.y, wx.z, wx.w}, ay[4] = {wy.x, wy.y, wy.z, wy.w};
-    float4 cubic = (float4)(0.0f), linear = (float4)(0.0f);
+    float4 cubic = (float4)(0.0f), linear = (float4)(0.0f), least = (float4)(FLT_MAX);
     int missing = 0;
     for (int j = 0; j < 4; ++j)
         for (int i = 0; i < 4; ++i) {
@@ -48,11 +51,12 @@ static float4 blend_rim(__global const pixel_stored *stored, __global const blen
             const float4 c = grid_border(&p, border) ? blend_tap(stored, layer, p) : (float4)(0.0f);
             missing += c.w == 0.0f;
             cubic += ax[i] * ay[j] * c;
+            least = LEAST(least, c);
             if (i > 0 && i < 3 && j > 0 && j < 3)
                 linear += (i == 1 ? 1.0f - t.x : t.x) * (j == 1 ? 1.0f - t.y : t.y) * c;
         }
     if (missing == 0)
-        return (float4)(cubic.xyz, 1.0f);
+        return (float4)(BLEND_LIT(cubic, least).xyz, 1.0f);
     return linear.w > 0.0f ? (float4)(linear.xyz / linear.w, linear.w) : (float4)(0.0f);
 }
 
@@ -80,7 +84,8 @@ static inline float4 blend_sample(__global const pixel_stored *stored, __global 
             const float8 right = wy.x * blend_pair(r0.hi) + wy.y * blend_pair(r1.hi) + wy.z * blend_pair(r2.hi) +
                                  wy.w * blend_pair(r3.hi);
             const float4 sum = wx.x * left.lo + wx.y * left.hi + wx.z * right.lo + wx.w * right.hi;
-            return (float4)(sum.xyz, 1.0f);
+            const float8 halves = LEAST(blend_pair(least.lo), blend_pair(least.hi));
+            return (float4)(BLEND_LIT(sum, LEAST(halves.lo, halves.hi)).xyz, 1.0f);
         }
     }
     return blend_rim(stored, layer, corner, t, border);
@@ -120,6 +125,7 @@ BLEND_INLINE void blend_sample_all(__global const pixel_stored *stored, __global
         if (!BLEND_SOME(blend_colours(least).FOURTHS < 0.5f * WHITE)) {
             blend_samples sum = BLEND_EACH(wx.FIRSTS) * c0 + BLEND_EACH(wx.SECONDS) * c1 + BLEND_EACH(wx.THIRDS) * c2 +
                                 BLEND_EACH(wx.FOURTHS) * c3;
+            sum = BLEND_LIT(sum, blend_colours(least));
             sum.FOURTHS = (blend_real)(1.0f);
             *c = BLEND_EACH(wanted) ? sum : *c;
             return;

@@ -33,6 +33,7 @@ def test_a_crop_elsewhere_takes_other_pixels_together(
     for seed in (1, 2):
         pixels = stored_pixels(seed, full.width, full.height, dtype, channels, 0.95)
         faint = patches(seed + 5, full.width, full.height, 0.2, 3) > 0
+        pixels[12:24, 20:40, :-1] = 0.02 * full_scale(dtype)  # beside this the cubic swings below it
         pixels[faint, -1] = (0.3 * full_scale(dtype) * (pixels[faint, -1] > 0)).astype(dtype)
         field = field_of(seed + 10, grid, (0, 0, 24, 15), 0.7)
         field[:, 4:9, :3] = 0
@@ -42,3 +43,25 @@ def test_a_crop_elsewhere_takes_other_pixels_together(
     for left in (1, 2, 3):
         crop = Box(region.left + left, region.top, region.right, region.bottom)
         assert np.array_equal(merged(device, layers, full, grid, crop), whole[:, left:])
+
+
+@pytest.mark.parametrize("channels", [1, 3])
+@pytest.mark.parametrize(("dtype", "lamp"), [(np.float32, 50), (np.float16, 65504)])
+@pytest.mark.parametrize("name", ["plane", "cylinder", "sphere"])
+def test_no_light_is_taken_away_beside_a_lamp(
+    device: Device, name: str, dtype: type, lamp: float, channels: int
+) -> None:
+    """A lamp may be a thousand times as bright as the wall behind it, also at a border, and as bright as half
+    floats can be.
+    """
+    full = GRIDS[name]
+    grid = full.resized(24, 15)
+    pixels = np.ones((full.height, full.width, channels + 1), np.float32)
+    pixels[..., :-1] = 0.05
+    pixels[9:12, 30:33, :-1] = pixels[25:35, :2, :-1] = pixels[:1, 50:, :-1] = lamp
+    layer = blend_layer(
+        device, pixels.astype(dtype), 0, 0, full, grid, field=field_of(3, grid, (0, 0, 24, 15), 0.7)
+    )
+    result = merged(device, [layer, layer], full, grid)
+    assert 0.0249 < result[..., :-1].min() < 0.049
+    assert 0.98 * lamp < result[..., :-1].max() < np.inf

@@ -23,6 +23,8 @@ from reference.common import (
 
 # Of the cubic that layers are sampled with.
 SLOPE = -2 / 3
+# Of the least tap, what floats keep of it.
+LIT = 0.5
 
 
 def opaque(rows: Array, white: float) -> Array:
@@ -34,7 +36,13 @@ def opaque(rows: Array, white: float) -> Array:
 
 
 def sample(
-    pixels_: Array, box: Sequence[int], x: Array, y: Array, border: Sequence[int], nearest: int
+    pixels_: Array,
+    box: Sequence[int],
+    x: Array,
+    y: Array,
+    border: Sequence[int],
+    nearest: int,
+    white: float,
 ) -> Array:
     """Colour at positions and how far it can be trusted (0..1): (..., 4)."""
     if nearest:
@@ -42,13 +50,16 @@ def sample(
         return take(pixels_, box, column, row, inside)
     left, top = np.floor(x - 0.5).astype(int), np.floor(y - 0.5).astype(int)
     across, down = cubic_taps(x - 0.5 - left, SLOPE), cubic_taps(y - 0.5 - top, SLOPE)
-    cubic, valid = 0.0, True
+    cubic, least, valid = 0.0, np.inf, True
     for j in range(4):
         for i in range(4):
             column, row, inside = grid_border(left + i - 1, top + j - 1, border)
             tap = take(pixels_, box, column, row, inside)
             cubic = cubic + (across[i] * down[j])[..., None] * tap
+            least = np.minimum(least, tap)
             valid = valid & (tap[..., 3] != 0)
+    if white == 1:
+        cubic = np.maximum(cubic, least - LIT * np.abs(least))
     linear = 0.0
     for column, row, weight in four_taps(x, y):
         column, row, inside = grid_border(column, row, border)
@@ -171,7 +182,7 @@ def blend_band(
         if offset is not None:
             raised = read(offset[1], offset[0], offset_border)[..., :3]
         own = take(opaque_, place, columns, rows)
-        colour = sample(opaque_, place, *position(x, y, f[..., :3], scale, lens), border, nearest)
+        colour = sample(opaque_, place, *position(x, y, f[..., :3], scale, lens), border, nearest, white)
         colour = np.where(f[..., :3].any(-1, keepdims=True), colour, own)
         looks = [correct(c[..., :3], exposure, raised, white, shoulder) for c in (own, colour)]
         some = ((exposure != 0) | (raised != 0)).any(-1)
