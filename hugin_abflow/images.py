@@ -88,6 +88,15 @@ def use_threads(count: int) -> None:
     oiio.attribute("threads", count)
 
 
+def image_size(path: Path) -> tuple[int, int] | None:
+    """Width and height of an image file, px; None if it is none that can be opened."""
+    source = oiio.ImageInput.open(str(path))
+    if source is None:
+        oiio.geterror()  # else it is told at the end
+        return None
+    return source.spec().width, source.spec().height
+
+
 def _open(path: Path, page: int) -> Any:
     """An ImageInput that leaves colours as they are stored."""
     if not named_in_unicode(path):

@@ -16,12 +16,15 @@ from typing import get_args
 
 from hugin_abflow import pto
 from hugin_abflow.errors import (
+    AbflowError,
     ImageReadError,
+    LayersMismatchError,
     LayersMissingError,
     NonaFailedError,
     NonaMissingError,
     OutputError,
     PhotoMissingError,
+    ProjectError,
     SettingsError,
 )
 from hugin_abflow.found import (
@@ -33,7 +36,7 @@ from hugin_abflow.found import (
     named_files,
     none_there,
 )
-from hugin_abflow.images import read_layers
+from hugin_abflow.images import image_size, read_layers
 from hugin_abflow.imagewriter import named_in_unicode
 from hugin_abflow.layer import Layer, check_layers
 from hugin_abflow.programs import move_whole, stop
@@ -90,6 +93,8 @@ def open_layers(
         else:
             files = _find_or_make(plan, folder, remap, keep_layers, progress).in_order()
         opened = [layer for file in files for layer in read_layers(file)]
+        if not layers and not prefix:
+            _check_made(plan, folder, opened)
         check_layers(plan.canvas, opened)
         yield opened
 
@@ -162,7 +167,11 @@ def _make_all(plan: Plan, folder: Path, keep: bool, progress: Progress) -> Found
     if code:
         raise _failure(plan, folder, code, lines)
     if not made:
-        raise LayersMissingError(f"{plan.file}: no active image reaches into the crop; nona made no layer")
+        raise LayersMissingError(
+            f"{plan.file}: nona made no layer: it sees no active image that shows anything in the crop; "
+            "look at crop and masks in Hugin (of a crop far smaller than the photos it sees none), and "
+            "whether the photos are RGB or grey"
+        )
     return Found(prefix, _keep(plan, prefix, made) if keep else made)
 
 
@@ -184,6 +193,19 @@ def _make_missing(plan: Plan, folder: Path, found: Found, keep: bool, progress: 
                 raise _failure(plan, folder, code, lines)
     made = _made(plan, folder)
     return _keep(plan, found.prefix, made) if keep else made
+
+
+def _check_made(plan: Plan, folder: Path, layers: Sequence[Layer]) -> None:
+    """Raise `LayersMismatchError` if nona has just made layers for another canvas than the project's."""
+    size = plan.canvas.width, plan.canvas.height
+    for layer in layers:
+        made_now = layer.file is not None and layer.file.parent == folder
+        if made_now and layer.canvas_size not in (None, size):
+            made_for, project = ("{}x{}".format(*one or ()) for one in (layer.canvas_size, size))
+            raise LayersMismatchError(
+                f"{plan.file}: the canvas is {project}, of which Hugin makes {made_for}, since this "
+                "projection shows no more; open the project in Hugin, which corrects that, and save it"
+            )
 
 
 def _require_photo(plan: Plan, image: PlannedImage) -> None:
@@ -283,8 +305,21 @@ def _made(plan: Plan, folder: Path) -> dict[int, Path]:
     return {index: path for index, path in paths.items() if path.is_file()}
 
 
-def _failure(plan: Plan, folder: Path, code: int, lines: list[str]) -> NonaFailedError:
+def _failure(plan: Plan, folder: Path, code: int, lines: list[str]) -> AbflowError:
+    """What to raise for a run of nona that failed; it does not always name the photo that is to blame."""
     said = "\n  ".join(lines) or "(nothing)"
+    sizes = [image_size(image.photo) for image in plan.images]
+    if "did not find a matching file type" in said and None in sizes:
+        photo = plan.images[sizes.index(None)].photo
+        return ImageReadError(f"{photo} is no image that can be read; copy it from the camera again")
+    if "unexpectedly changed dimensions" in said:
+        aligned = [(image.width, image.height) for image in pto.load(plan.file).images if not image.disabled]
+        for image, size, wanted in zip(plan.images, sizes, aligned, strict=True):
+            if size and size != wanted:
+                return ProjectError(
+                    f"{image.photo} has {size[0]}x{size[1]} pixels, in {plan.file} it has "
+                    f"{wanted[0]}x{wanted[1]}; put that photo back, or align this one in Hugin"
+                )
     how = f"was killed ({signal.Signals(-code).name})" if code < 0 else f"failed (exit code {code})"
     advice = f"it wrote into {folder.parent}, TMPDIR chooses another folder"
     if "bad_alloc" in said:

@@ -233,11 +233,11 @@ def test_nona_that_is_not_installed(
     assert code == ExitCode.NONA and "nona" in message
 
 
-def test_nona_that_fails(folder: Path, nona: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_photo_that_is_none(folder: Path, nona: str, capsys: pytest.CaptureFixture[str]) -> None:
     for name in ("left.png", "right.png"):
         (folder / name).write_bytes(b"no picture at all")
-    code, _ = broken(folder, [str(folder / "tiny.pto"), "--remap", "always"], capsys)
-    assert code == ExitCode.NONA
+    code, message = broken(folder, [str(folder / "tiny.pto"), "--remap", "always"], capsys)
+    assert code == ExitCode.IMAGE_READ and "left.png is no image" in message
 
 
 def test_device_that_is_none(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:

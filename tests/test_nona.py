@@ -20,7 +20,6 @@ from hugin_abflow import nona as program
 from hugin_abflow.errors import (
     ImageReadError,
     LayersMismatchError,
-    NonaFailedError,
     NonaMissingError,
     OutputError,
     PhotoMissingError,
@@ -272,30 +271,6 @@ def test_nona_missing(make_project, no_nona):
 
 def test_nona_is_probed(nona):
     assert program.probe()[0].isdigit()
-
-
-def test_nona_fails(make_project, nona):
-    plan = read_plan(make_project())
-    plan.images[2].photo.write_bytes(b"no photo")
-    with (
-        pytest.raises(NonaFailedError, match=r"nona failed \(exit code 1\) on .*pano\.pto;") as error,
-        open_layers(plan),
-    ):
-        pass
-    assert "did not find a matching file type" in str(error.value)  # nona's own words
-
-
-def test_nona_without_memory(make_project, tmp_path, monkeypatch):
-    program_file = tmp_path / "nona"
-    program_file.write_text('#!/bin/sh\necho "what():  std::bad_alloc"\nkill -6 $$\n')
-    program_file.chmod(0o755)
-    monkeypatch.setenv("PATH", str(tmp_path))
-    with (
-        pytest.raises(NonaFailedError, match=r"(?s)SIGABRT.* close other programs.*std::bad_alloc") as error,
-        open_layers(read_plan(make_project())),
-    ):
-        pass
-    assert "TMPDIR" not in str(error.value)
 
 
 SLOW_NONA = """#!/bin/sh
