@@ -45,8 +45,8 @@ _BLOCK = 64
 _LAYER = np.dtype(
     [
         *((box, np.int32, 4) for box in ("place", "way", "gain", "offset")),
-        *((number, np.int32) for number in ("ways", "gains", "offsets", "rows", "ring", "turn")),
-        ("unused", np.int32, 2),
+        *((number, np.int32) for number in ("ways", "gains", "offsets", "ring", "turn", "unused")),
+        ("rows", np.int64),
     ]
 )
 

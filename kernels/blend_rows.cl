@@ -95,8 +95,8 @@ typedef struct {
     int4 place;               /* of its stored rows: left, top, width, height */
     int4 way, gain, offset;   /* of the rows at hand of its field, gains and offsets, each on its grid */
     int ways, gains, offsets; /* where these begin; gains, offsets -1: none */
-    int rows, ring, turn;     /* where its stored rows begin, a ring of so many, the first one there */
-    int unused[2];
+    int ring, turn, unused;   /* its stored rows are a ring of so many; the first one there */
+    long rows;                /* where they begin: there may be more than 2^31 pixels */
 } blend_layer;
 
 /* How many columns and rows of one grid there are per one of another. */
@@ -139,7 +139,7 @@ static inline int blend_turned(__global const blend_layer *layer, int row) {
 /* Where it lies. */
 static inline __global const pixel_stored *blend_line(__global const pixel_stored *stored,
                                                      __global const blend_layer *layer, int row) {
-    return stored + layer->rows + blend_turned(layer, row) * layer->place.z;
+    return stored + layer->rows + (long)blend_turned(layer, row) * layer->place.z;
 }
 
 /* r, g, b in stored units and 1 for a valid pixel, else zeros. */

@@ -25,7 +25,7 @@ typedef struct {
 
 static inline blend_sample_lines blend_sample_rows(__global const pixel_stored *stored,
                                                    __global const blend_layer *layer, int2 first) {
-    const int wide = layer->place.z, all = layer->ring * wide;
+    const long wide = layer->place.z, all = layer->ring * wide;
     const int rest = layer->ring - blend_turned(layer, first.y); /* rows until they begin anew */
     __global const pixel_stored *p = blend_line(stored, layer, first.y) + first.x;
     return (blend_sample_lines){p, p + (rest > 1 ? wide : wide - all), p + (rest > 2 ? 2 * wide : 2 * wide - all),

@@ -130,8 +130,8 @@ def test_a_band_of_three_layers_equals_its_twin(
     table[:, 18] = 0, -1, 24 * 13
     # rings of as many rows as there are, or more; they begin anywhere
     rings, turns = [p[3] + spare for p, spare in zip(places, (0, 3, 1), strict=True)], (0, 30, 17)
-    table[:, 19] = np.cumsum([0, *(p[2] * ring for p, ring in zip(places, rings, strict=True))])[:3]
-    table[:, 20:22] = list(zip(rings, turns, strict=True))
+    table[:, 19:21] = list(zip(rings, turns, strict=True))
+    table[:, 22] = np.cumsum([0, *(p[2] * ring for p, ring in zip(places, rings, strict=True))])[:3]
     turned = [
         np.roll(np.pad(rows, ((0, ring - len(rows)), (0, 0), (0, 0))), turn, 0)
         for rows, ring, turn in zip(stored, rings, turns, strict=True)
