@@ -6,7 +6,8 @@ through each layer, smoothly, and fades out. It is the minimum of
 
     sum_pairs c (g_a - g_b + d_ab)^2  +  sum_k |grad g_k|^2  +  g_k^2 / fade^2
 
-with d_ab the measured difference of the aligned layers, and c how far it can be trusted and both are seen: a
+with d_ab the measured difference of the aligned layers, and c how far it can be trusted, is bright enough to
+tell, and both are seen: a
 sparse linear system, solved directly; in the first rounds, which only tell what to trust, for blocks of
 cells. Where there is no difference it is exactly zero.
 

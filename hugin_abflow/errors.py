@@ -1,4 +1,4 @@
-"""Everything that can go wrong, one class per cause, each with its own exit code.
+"""Everything that can go wrong, one class per cause; causes that are mended alike share an exit code.
 
 The library raises these; only the command line prints them and exits. A message names the file,
 says what is wrong and what to do about it.

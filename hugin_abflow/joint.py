@@ -54,7 +54,7 @@ _log = logging.getLogger(__name__)
 # Of layers that take no part; abflow-enblend shows this, and of the rest warnings alone.
 _unused_log = logging.getLogger("hugin_abflow.unused")
 
-# Overlaps of fewer working pixels than this have nothing to match.
+# Overlaps of fewer pixels of the masks' grid than this have nothing to match.
 _LEAST_OVERLAP = 64
 # Every so many rows and columns of a mask are looked at first.
 _SAMPLED = 16

@@ -1,11 +1,24 @@
 /* How two aligned layers differ in exposure and colour, per cell of a coarse colour grid. */
 
+/* The brightest channel up to which a sample of an integer image tells nothing of exposure, and from which on all that
+   it can. */
+#define COLOUR_DARK 0.05f
+#define COLOUR_BRIGHT 0.3f
+
 static inline bool colour_clips(float4 c, float4 clipped) {
     return c.x > clipped.x || c.y > clipped.y || c.z > clipped.z;
 }
 
+/* How much a sample tells of exposure, 0..1: what is nearly black may have been any darker, most of all at the rim of a
+   dark lens, and by how much is seen by nobody. Of floats it is not known what is dark. */
+static inline float colour_tells(float4 c, float shoulder) {
+    const float most = GREATEST(c.x, GREATEST(c.y, c.z));
+    const float tells = (most - COLOUR_DARK) / (COLOUR_BRIGHT - COLOUR_DARK);
+    return shoulder > 0.0f ? LIMITED(tells, 0.0f, 1.0f) : 1.0f;
+}
+
 /* Mean difference a - b on the exposure scale over the pixels of a cell (every second one in x and y) that both
-   layers show unclipped, and how far it can be trusted: less where the pixels disagree among themselves, that
+   layers show unclipped, by what they tell, and how far it can be trusted: less where the pixels disagree among themselves, that
    is, where the layers do not show the same thing. The same where one of them is clipped, if that is most of
    the cell: the other has to be raised by that much at least. And how far both are seen, by their weights. */
 __kernel void colour_difference(__global const float4 *layer_a, __global const float4 *field_a, int4 box_a,
@@ -45,9 +58,10 @@ __kernel void colour_difference(__global const float4 *layer_a, __global const f
                 less += d;
                 below += 1.0f;
             } else if (!clips_a) {
-                sum += d;
-                squares += square3(d);
-                n += 1.0f;
+                const float tells = LEAST(colour_tells(a, shoulder), colour_tells(b, shoulder));
+                sum += tells * d;
+                squares += tells * square3(d);
+                n += tells;
             }
         }
     float4 result = (float4)(0.0f);

@@ -13,6 +13,10 @@ from reference.common import EXPOSURE_FLOOR, Array, Numbers, exposure_scale, lay
 Side = tuple[Array, Array, Sequence[int]]
 
 
+# The brightest channel up to which a sample tells nothing, and from which on all.
+DARK, BRIGHT = 0.05, 0.3
+
+
 def colour_difference(
     layer_a: Array,
     field_a: Array,
@@ -28,7 +32,7 @@ def colour_difference(
     clipped_b: Numbers,
     spread: float,
 ) -> tuple[Array, Array, Array]:
-    """Mean difference a - b of every cell's pixels, every other one in x and y, and its weight; the same of
+    """Mean difference a - b of every cell's pixels, every other one in x and y, and its weight; the mean of
     those that one layer shows clipped, where these are most; and how far both layers are seen.
     """
     sides = ((layer_a, field_a, box_a), (layer_b, field_b, box_b))
@@ -38,13 +42,19 @@ def colour_difference(
     mixed = np.where(known, 4 * s * t / np.maximum((s + t) ** 2, 1e-20), 0)
     mixing = np.zeros((cells[1], cells[0]))
     difference = exposure_scale(a, shoulder) - exposure_scale(b, shoulder)
+    tells = np.ones(known.shape)
+    if shoulder:
+        tells = np.clip((np.minimum(a.max(-1), b.max(-1)) - DARK) / (BRIGHT - DARK), 0, 1)
     result, beyond = np.zeros((2, cells[1], cells[0], 4))
     for place, part in _parts(border, cells, 2):
         count = known[part].size
         mixing[place] = mixed[part].mean()
-        values = difference[part][(known & ~clips_a & ~clips_b)[part]]
-        if len(values):
-            result[place] = [*values.mean(0), len(values) / count / (1 + values.var(0).sum() / spread**2)]
+        usable = (known & ~clips_a & ~clips_b)[part]
+        told, values = tells[part][usable], difference[part][usable]
+        if told.any():
+            mean = np.average(values, 0, told)
+            variance = np.average((values - mean) ** 2, 0, told).sum()
+            result[place] = [*mean, told.sum() / count / (1 + variance / spread**2)]
         for sign, alone in ((1, clips_a & ~clips_b), (-1, clips_b & ~clips_a)):
             values = difference[part][(known & alone)[part]]
             if 2 * len(values) > count:
