@@ -294,6 +294,14 @@ def test_the_working_grid_is_bounded_and_covers_the_region(width: int, height: i
         assert grid.width % 2 == 0
 
 
+@pytest.mark.parametrize("size", [(100_000, 20), (20, 70_000), (100_000, 50_000), (300_000, 3)])
+def test_places_on_the_working_grid_are_found_in_32_bits(size: tuple[int, int]) -> None:
+    full = grid_over(Box(0, 0, *size), *size, False)
+    grid = working.working_grid(full, Settings())
+    assert grid.width * full.width < 2**31 and grid.height * full.height < 2**31
+    assert grid.height < 2**15  # rows are packed beside columns (coefficient.cl)
+
+
 def test_resizing_a_sphere_keeps_its_edges() -> None:
     full = working.full_grid(SPHERE, boxes((0, 0, 802, 401)))
     grid = full.resized(77, 53)
