@@ -30,7 +30,7 @@ EXIT_CODES = {
     ExitCode.OK: "every panorama was written",
     ExitCode.FAILED: "any other error",
     ExitCode.USAGE: "the command line is wrong",
-    ExitCode.PROJECT: "the project cannot be read, or makes no panorama",
+    ExitCode.PROJECT: "the project cannot be read, makes no panorama, or is about a photo of another size",
     ExitCode.LAYERS_MISSING: "layers or photos are missing",
     ExitCode.LAYERS_MISMATCH: "the layers do not belong together (size, depth or channels)",
     ExitCode.IMAGE_READ: "a layer or photo cannot be decoded",

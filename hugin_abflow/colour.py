@@ -6,10 +6,9 @@ through each layer, smoothly, and fades out. It is the minimum of
 
     sum_pairs c (g_a - g_b + d_ab)^2  +  sum_k |grad g_k|^2  +  g_k^2 / fade^2
 
-with d_ab the measured difference of the aligned layers, and c how far it can be trusted, is bright enough to
-tell, and both are seen: a
-sparse linear system, solved directly; in the first rounds, which only tell what to trust, for blocks of
-cells. Where there is no difference it is exactly zero.
+with d_ab the measured difference of the aligned layers, and c how far it can be trusted, how much it tells
+(dark samples little) and how far both are seen: a sparse linear system, solved directly; in the first rounds,
+which only tell what to trust, for blocks of cells. Where there is no difference it is exactly zero.
 
 Cameras' curves level off towards white, by which log odds move colours as exposure does; others run straight
 into it. The scale's shoulder, between both, is the one that leaves the least of the differences: else a

@@ -11,6 +11,7 @@ import subprocess
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from itertools import chain
 from pathlib import Path
 from typing import get_args
 
@@ -80,9 +81,9 @@ def open_layers(
     keep_layers     layers that nona made are moved beside the project, named as Hugin does.
 
     Layers are made in a folder under TMPDIR that is removed in the end. Raises `LayersMissingError`,
-    `PhotoMissingError`, `NonaMissingError`, `NonaFailedError`, `LayersMismatchError`,
-    `ImageReadError`, `OutputError` (layers cannot be kept), `SettingsError` (`remap` unknown, or
-    "always" together with named layers).
+    `PhotoMissingError`, `NonaMissingError`, `NonaFailedError`, `LayersMismatchError`, `ImageReadError`,
+    `ProjectError` (a photo has another size), `OutputError` (layers cannot be kept), `SettingsError`
+    (`remap` unknown, or "always" together with named layers).
     """
     _check_request(remap, named=bool(prefix or layers))
     with work_folder() as folder:
@@ -93,8 +94,6 @@ def open_layers(
         else:
             files = _find_or_make(plan, folder, remap, keep_layers, progress).in_order()
         opened = [layer for file in files for layer in read_layers(file)]
-        if not layers and not prefix:
-            _check_made(plan, folder, opened)
         check_layers(plan.canvas, opened)
         yield opened
 
@@ -165,13 +164,14 @@ def _make_all(plan: Plan, folder: Path, keep: bool, progress: Progress) -> Found
         code, lines = _run(plan, folder, [], advance)
     made = _made(plan, folder)
     if code:
-        raise _failure(plan, folder, code, lines)
+        raise _failure(plan, plan.images, folder, code, lines)
     if not made:
         raise LayersMissingError(
             f"{plan.file}: nona made no layer: it sees no active image that shows anything in the crop; "
             "look at crop and masks in Hugin (of a crop far smaller than the photos it sees none), and "
             "whether the photos are RGB or grey"
         )
+    _check_made(plan, made)
     return Found(prefix, _keep(plan, prefix, made) if keep else made)
 
 
@@ -190,17 +190,17 @@ def _make_missing(plan: Plan, folder: Path, found: Found, keep: bool, progress: 
                 log.info("image %d (%s) misses the crop: it has no layer", image.index, image.name)
             elif code:
                 _require_photo(plan, image)
-                raise _failure(plan, folder, code, lines)
+                raise _failure(plan, [image], folder, code, lines)
     made = _made(plan, folder)
+    _check_made(plan, made)
     return _keep(plan, found.prefix, made) if keep else made
 
 
-def _check_made(plan: Plan, folder: Path, layers: Sequence[Layer]) -> None:
-    """Raise `LayersMismatchError` if nona has just made layers for another canvas than the project's."""
+def _check_made(plan: Plan, made: dict[int, Path]) -> None:
+    """Raise `LayersMismatchError` if nona made layers for another canvas than the project's."""
     size = plan.canvas.width, plan.canvas.height
-    for layer in layers:
-        made_now = layer.file is not None and layer.file.parent == folder
-        if made_now and layer.canvas_size not in (None, size):
+    for layer in chain.from_iterable(map(read_layers, made.values())):
+        if layer.canvas_size not in (None, size):
             made_for, project = ("{}x{}".format(*one or ()) for one in (layer.canvas_size, size))
             raise LayersMismatchError(
                 f"{plan.file}: the canvas is {project}, of which Hugin makes {made_for}, since this "
@@ -305,17 +305,24 @@ def _made(plan: Plan, folder: Path) -> dict[int, Path]:
     return {index: path for index, path in paths.items() if path.is_file()}
 
 
-def _failure(plan: Plan, folder: Path, code: int, lines: list[str]) -> AbflowError:
-    """What to raise for a run of nona that failed; it does not always name the photo that is to blame."""
+def _failure(
+    plan: Plan, images: Sequence[PlannedImage], folder: Path, code: int, lines: list[str]
+) -> AbflowError:
+    """What to raise for a run of nona over `images` that failed; it does not always say which is to blame."""
     said = "\n  ".join(lines) or "(nothing)"
-    sizes = [image_size(image.photo) for image in plan.images]
-    if "did not find a matching file type" in said and None in sizes:
-        photo = plan.images[sizes.index(None)].photo
-        return ImageReadError(f"{photo} is no image that can be read; copy it from the camera again")
+    images = [image for image in images if named_in_unicode(image.photo)]  # else they cannot be opened here
+    if "did not find a matching file type" in said:
+        for image in images:
+            if image_size(image.photo) is None:
+                return ImageReadError(
+                    f"{image.photo} is no image that can be read; copy it from the camera again"
+                )
     if "unexpectedly changed dimensions" in said:
-        aligned = [(image.width, image.height) for image in pto.load(plan.file).images if not image.disabled]
-        for image, size, wanted in zip(plan.images, sizes, aligned, strict=True):
-            if size and size != wanted:
+        project = pto.load(plan.file)
+        for image in images:
+            size, aligned = image_size(image.photo), project.images[image.index]
+            wanted = aligned.width, aligned.height
+            if size and all(wanted) and size != wanted:  # nona looks for itself where it is 0
                 return ProjectError(
                     f"{image.photo} has {size[0]}x{size[1]} pixels, in {plan.file} it has "
                     f"{wanted[0]}x{wanted[1]}; put that photo back, or align this one in Hugin"

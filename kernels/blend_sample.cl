@@ -4,7 +4,7 @@
    all fractions, this next to nothing; a ramp stays one to 0.03 px. */
 #define BLEND_SLOPE (-2.0f / 3.0f)
 /* Beside a step it swings back by a share of that. Beside a lamp this is more light than there is, so that floats, which
-   no range limits, stay above half of the least tap; ordinary texture does anyway. */
+   no range limits, go no farther below the least tap than by half of it; ordinary texture does not anyway. */
 #define BLEND_LIT(v, least) (INTEGER ? (v) : GREATEST(v, (least) - 0.5f * MAGNITUDE(least)))
 
 /* What is kept for PIXELS sets of four taps, or of their weights, is blend_samples too. */

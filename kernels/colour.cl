@@ -18,9 +18,9 @@ static inline float colour_tells(float4 c, float shoulder) {
 }
 
 /* Mean difference a - b on the exposure scale over the pixels of a cell (every second one in x and y) that both
-   layers show unclipped, by what they tell, and how far it can be trusted: less where the pixels disagree among themselves, that
-   is, where the layers do not show the same thing. The same where one of them is clipped, if that is most of
-   the cell: the other has to be raised by that much at least. And how far both are seen, by their weights. */
+   layers show unclipped, by what they tell, and how far it can be trusted: less where the pixels disagree among
+   themselves, that is, where the layers do not show the same thing. The same where one of them is clipped, if that is
+   most of the cell: the other has to be raised by that much at least. And how far both are seen, by their weights. */
 __kernel void colour_difference(__global const float4 *layer_a, __global const float4 *field_a, int4 box_a,
                                 __global const float4 *layer_b, __global const float4 *field_b, int4 box_b,
                                 int4 border, float4 lens,   /* working grid */

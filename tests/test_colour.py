@@ -74,6 +74,9 @@ def test_difference_equals_its_twin(device: Device, name: str, shoulder: float, 
     grid = GRIDS[name]
     cells = grid.resized(7, 3)
     sides = two_sides(name, lamps)
+    if not lamps:  # dark ones tell less
+        sides[0][..., :3] *= 0.5
+        sides[3][..., :3] *= 0.35
     clipped = CLIPPED if shoulder else NEVER
     results = [device.empty(shape) for shape in ((2, 5, 4), (2, 5, 4), (2, 5))]
     device.run(

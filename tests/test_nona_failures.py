@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pytest
 import tifffile
+from conftest import remap
 
 from hugin_abflow.errors import ImageReadError, LayersMismatchError, NonaFailedError, ProjectError
 from hugin_abflow.nona import open_layers
@@ -28,15 +29,53 @@ def test_photo_of_another_size(make_project, nona):
         pass
 
 
-def test_canvas_that_hugin_makes_lower(make_project, nona):
-    """A general Panini of such a view is not as high as the project says."""
+def test_photo_that_is_remapped_is_blamed(make_project, nona):
+    """The first one's layer is there; so its photo need not be."""
+    plan = read_plan(make_project())
+    remap(plan, "pano")
+    (plan.folder / "pano0001.tif").unlink()
+    plan.images[0].photo.unlink()
+    plan.images[1].photo.write_bytes(b"no photo")
+    with pytest.raises(ImageReadError, match=f"{plan.images[1].photo.name} is no image"), open_layers(plan):
+        pass
+
+
+def test_photo_whose_size_the_project_leaves_to_nona(make_project, nona):
+    """It may be any; the next one may not."""
+    project = make_project()
+    project.write_text(project.read_text().replace("w203 h151", "w0 h0", 1))
+    plan = read_plan(project)
+    photo = plan.images[1].photo
+    tifffile.imwrite(photo, tifffile.imread(photo)[::2, ::2], photometric="rgb")
+    with pytest.raises(ProjectError, match=f"{photo.name} has 102x76 pixels"), open_layers(plan):
+        pass
+
+
+def test_photo_whose_name_is_no_unicode(make_project, nona):
+    """Nobody here can open it, nona can; what it says of another one is told."""
+    plan = read_plan(make_project(photo="photo{}.tif"))
+    name = "photo\udcff.tif"
+    plan.images[0].photo.rename(plan.folder / name)
+    text = plan.file.read_bytes().replace(b"photo0.tif", b"photo\xff.tif")
+    plan.file.write_bytes(text)
+    plan = read_plan(plan.file)
+    assert plan.images[0].photo.is_file()
+    plan.images[1].photo.write_bytes(b"no photo")
+    with pytest.raises(ImageReadError, match=r"photo1\.tif is no image"), open_layers(plan):
+        pass
+
+
+@pytest.mark.parametrize("keep", [False, True])
+def test_canvas_that_hugin_makes_lower(make_project, nona, keep):
+    """A general Panini of such a view is not as high as the project says; no layer is left beside it."""
     panorama = 'f19 w600 h400 v319 k0 E0 R0 P"100 0 0" n"TIFF_m c:LZW r:CROP"'
     plan = read_plan(make_project(panorama=panorama))
     with (
         pytest.raises(LayersMismatchError, match="600x400, of which Hugin makes 600x307"),
-        open_layers(plan),
+        open_layers(plan, keep_layers=keep),
     ):
         pass
+    assert not list(plan.folder.glob("pano*.tif"))
 
 
 def test_nona_without_memory(make_project, tmp_path, monkeypatch):

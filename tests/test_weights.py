@@ -57,6 +57,25 @@ def test_masks_that_were_saved_give_the_same_picture(layers: list[str]) -> None:
     assert np.abs(tifffile.imread("out.tif") - first).max() <= 1
 
 
+def test_a_layer_that_takes_no_part_gets_no_weight(
+    layers: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It lies wholly inside the first; its mask would be read at one place only."""
+    y, x = np.mgrid[:HEIGHT, :WIDTH]
+    write_layer(Path("c.tif"), texture(y, x)[20:60, 10:70], 10, 20, (WIDTH, HEIGHT))
+    for number in (1, 2, 3):
+        tifffile.imwrite(f"mask-{number}.tif", np.full((HEIGHT, WIDTH), 255, np.uint8))
+    weights, bands = [], joint.bands
+
+    def watched(device, prepared, *others):
+        weights.extend(layer.field.get()[..., 3] for layer in prepared.layers)
+        return bands(device, prepared, *others)
+
+    monkeypatch.setattr(joint, "bands", watched)
+    assert run("--load-masks", *layers, "c.tif") == 0
+    assert [bool((weight < 0).any()) for weight in weights] == [False, False, True]
+
+
 def test_what_masks_take_out_leaves_no_shadow(layers: list[str]) -> None:
     """A dark thing that only the second layer shows: bands of frequencies change over where masks do."""
     y, x = np.mgrid[:HEIGHT, :WIDTH]

@@ -157,7 +157,10 @@ def _painted(device: Device, one: BlendLayer, white: Layer) -> BlendLayer:
 
 
 def _weighted(device: Device, layer: BlendLayer, mask: Layer, prepared: Prepared) -> BlendLayer:
-    """The layer with the mask as its weight, reduced to the working grid."""
+    """The layer with the mask as its weight, reduced to the working grid, unless it never weighs anything."""
+    field = layer.field.get()
+    if (field[..., 3] < 0).all():
+        return layer
     region, crop = prepared.grid.region, mask.box
     rows = np.clip(np.arange(region.top, region.bottom) - crop.top, 0, crop.height - 1)
     columns = np.clip(np.arange(region.left, region.right) - crop.left, 0, crop.width - 1)
@@ -167,7 +170,6 @@ def _weighted(device: Device, layer: BlendLayer, mask: Layer, prepared: Prepared
     whole = Layer.from_array(mask.name, np.concatenate([grey, opaque], 2), region.left, region.top)
     reduced = working.reduce_layer(device, whole, prepared.grid, lambda units: None)
     left, top, width, height = layer.box
-    field = layer.field.get()
     field[..., 3] = reduced.pixels.get()[top : top + height, left : left + width, 0]
     return replace(layer, field=device.upload(field))
 
