@@ -33,6 +33,7 @@ __all__ = [
     "ENDINGS",
     "ImageWriter",
     "check_target",
+    "image_size",
     "read_layer",
     "read_layers",
     "use_threads",
@@ -90,11 +91,11 @@ def use_threads(count: int) -> None:
 
 def image_size(path: Path) -> tuple[int, int] | None:
     """Width and height of an image file, px; None if it is none that can be opened."""
-    source = oiio.ImageInput.open(str(path))
-    if source is None:
-        oiio.geterror()  # else it is told at the end
+    try:
+        spec = _open(path, 0).spec()
+    except ImageReadError:
         return None
-    return source.spec().width, source.spec().height
+    return spec.width, spec.height
 
 
 def _open(path: Path, page: int) -> Any:

@@ -177,6 +177,12 @@ def bounding_box(layers: Sequence[Layer]) -> Box:
     )
 
 
+def other_canvas(layer: Layer, canvas: Canvas) -> str | None:
+    """The canvas that a layer was made for, as "800x400", if its file tells it and it is another one."""
+    size = layer.canvas_size
+    return None if size is None or size == (canvas.width, canvas.height) else f"{size[0]}x{size[1]}"
+
+
 def check_layers(canvas: Canvas, layers: Sequence[Layer]) -> None:
     """Raise `LayersMismatchError` unless the layers fit the canvas and each other.
 
@@ -190,8 +196,7 @@ def check_layers(canvas: Canvas, layers: Sequence[Layer]) -> None:
             raise LayersMismatchError(
                 f"{name} has no alpha channel, so nothing says where it ends; have nona write TIFF"
             )
-        if layer.canvas_size not in (None, (canvas.width, canvas.height)):
-            made_for = "{}x{}".format(*layer.canvas_size or ())
+        if made_for := other_canvas(layer, canvas):
             raise LayersMismatchError(
                 f"{name} was made for a canvas of {made_for}, the project's is {size}; {again}"
             )

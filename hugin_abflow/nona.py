@@ -11,7 +11,6 @@ import subprocess
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from itertools import chain
 from pathlib import Path
 from typing import get_args
 
@@ -39,7 +38,7 @@ from hugin_abflow.found import (
 )
 from hugin_abflow.images import image_size, read_layers
 from hugin_abflow.imagewriter import named_in_unicode
-from hugin_abflow.layer import Layer, check_layers
+from hugin_abflow.layer import Layer, check_layers, other_canvas
 from hugin_abflow.programs import move_whole, stop
 from hugin_abflow.progress import Progress, silent
 from hugin_abflow.project import Plan, PlannedImage
@@ -198,13 +197,12 @@ def _make_missing(plan: Plan, folder: Path, found: Found, keep: bool, progress: 
 
 def _check_made(plan: Plan, made: dict[int, Path]) -> None:
     """Raise `LayersMismatchError` if nona made layers for another canvas than the project's."""
-    size = plan.canvas.width, plan.canvas.height
-    for layer in chain.from_iterable(map(read_layers, made.values())):
-        if layer.canvas_size not in (None, size):
-            made_for, project = ("{}x{}".format(*one or ()) for one in (layer.canvas_size, size))
+    for path in list(made.values())[:1]:  # all are made for one
+        if made_for := other_canvas(read_layers(path)[0], plan.canvas):
             raise LayersMismatchError(
-                f"{plan.file}: the canvas is {project}, of which Hugin makes {made_for}, since this "
-                "projection shows no more; open the project in Hugin, which corrects that, and save it"
+                f"{plan.file}: the canvas is {plan.canvas.width}x{plan.canvas.height}, of which Hugin makes "
+                f"{made_for}, since this projection shows no more; open the project in Hugin, which corrects "
+                "that, and save it"
             )
 
 

@@ -9,11 +9,11 @@ static inline bool colour_clips(float4 c, float4 clipped) {
     return c.x > clipped.x || c.y > clipped.y || c.z > clipped.z;
 }
 
-/* How much a sample tells of exposure, 0..1: what is nearly black may have been any darker, most of all at the rim of a
-   dark lens, and by how much is seen by nobody. Of floats it is not known what is dark. */
-static inline float colour_tells(float4 c, float shoulder) {
-    const float most = GREATEST(c.x, GREATEST(c.y, c.z));
-    const float tells = (most - COLOUR_DARK) / (COLOUR_BRIGHT - COLOUR_DARK);
+/* How much two samples tell of exposure, 0..1: what is nearly black in either may have been any darker, most of all at
+   the rim of a dark lens, and by how much is seen by nobody. Of floats it is not known what is dark. */
+static inline float colour_tells(float4 a, float4 b, float shoulder) {
+    const float darker = LEAST(GREATEST(a.x, GREATEST(a.y, a.z)), GREATEST(b.x, GREATEST(b.y, b.z)));
+    const float tells = (darker - COLOUR_DARK) / (COLOUR_BRIGHT - COLOUR_DARK);
     return shoulder > 0.0f ? LIMITED(tells, 0.0f, 1.0f) : 1.0f;
 }
 
@@ -35,13 +35,11 @@ __kernel void colour_difference(__global const float4 *layer_a, __global const f
     const int column = get_global_id(0), row = get_global_id(1);
     if (column >= part.z || row >= part.w)
         return;
-    const int cx = part.x + column, cy = part.y + row;
-    const int left = cx * border.x / cells.x, right = (cx + 1) * border.x / cells.x;
-    const int top = cy * border.y / cells.y, bottom = (cy + 1) * border.y / cells.y;
+    const int4 its = cell_pixels(part.x + column, part.y + row, border, cells);
     float3 sum = (float3)(0.0f), more = (float3)(0.0f), less = (float3)(0.0f);
     float squares = 0.0f, n = 0.0f, tried = 0.0f, above = 0.0f, below = 0.0f, mixed = 0.0f;
-    for (int y = top; y < bottom; y += 2)
-        for (int x = left; x < right; x += 2) {
+    for (int y = its.y; y < its.w; y += 2)
+        for (int x = its.x; x < its.z; x += 2) {
             tried += 1.0f;
             float4 a, b;
             if (!layer_pair(layer_a, field_a, box_a, layer_b, field_b, box_b, (int2)(x, y), border, lens, &a, &b))
@@ -58,7 +56,7 @@ __kernel void colour_difference(__global const float4 *layer_a, __global const f
                 less += d;
                 below += 1.0f;
             } else if (!clips_a) {
-                const float tells = LEAST(colour_tells(a, shoulder), colour_tells(b, shoulder));
+                const float tells = colour_tells(a, b, shoulder);
                 sum += tells * d;
                 squares += tells * square3(d);
                 n += tells;
@@ -93,15 +91,13 @@ __kernel void colour_misfit(__global const float4 *layer_a, __global const float
     const int column = get_global_id(0), row = get_global_id(1);
     if (column >= part.z || row >= part.w)
         return;
-    const int cx = part.x + column, cy = part.y + row;
-    const int left = cx * border.x / cells.x, right = (cx + 1) * border.x / cells.x;
-    const int top = cy * border.y / cells.y, bottom = (cy + 1) * border.y / cells.y;
+    const int4 its = cell_pixels(part.x + column, part.y + row, border, cells);
     float4 weight[3], first[3], second[3];
     for (int k = 0; k < 3; ++k)
         weight[k] = first[k] = second[k] = (float4)(0.0f);
     float tried = 0.0f;
-    for (int y = top; y < bottom; y += 4)
-        for (int x = left; x < right; x += 4) {
+    for (int y = its.y; y < its.w; y += 4)
+        for (int x = its.x; x < its.z; x += 4) {
             tried += 1.0f;
             float4 a, b;
             if (!layer_pair(layer_a, field_a, box_a, layer_b, field_b, box_b, (int2)(x, y), border, lens, &a, &b) ||

@@ -155,6 +155,13 @@ static inline void board_solve(__global float *p, int pitch, float3 data, float2
     p[BOARD_B2 * pitch] = second > 0.0f ? b.y : p[BOARD_V * pitch];
 }
 
+/* The pixels of a grid that a cell of another one, over the same region, has: from column x and row y of the result up to
+   column z and row w. */
+static inline int4 cell_pixels(int column, int row, int4 grid, int4 cells) {
+    return (int4)(column * grid.x / cells.x, row * grid.y / cells.y, (column + 1) * grid.x / cells.x,
+                  (row + 1) * grid.y / cells.y);
+}
+
 /* Index of canvas pixel p in an array that covers box (left, top, width, height); -1 outside. */
 static inline int box_index(int2 p, int4 box) {
     const int x = p.x - box.x, y = p.y - box.y;

@@ -12,10 +12,9 @@ __kernel void highlights_share(__global const float4 *layer, /* (box.w, box.z) r
     const int cx = get_global_id(0), cy = get_global_id(1);
     if (cx >= cells.x || cy >= cells.y)
         return;
-    const int left = GREATEST(cx * border.x / cells.x - box.x, 0);
-    const int right = LEAST((cx + 1) * border.x / cells.x - box.x, box.z);
-    const int top = GREATEST(cy * border.y / cells.y - box.y, 0);
-    const int bottom = LEAST((cy + 1) * border.y / cells.y - box.y, box.w);
+    const int4 its = cell_pixels(cx, cy, border, cells);
+    const int left = GREATEST(its.x - box.x, 0), right = LEAST(its.z - box.x, box.z);
+    const int top = GREATEST(its.y - box.y, 0), bottom = LEAST(its.w - box.y, box.w);
     float sum = 0.0f, n = 0.0f;
     for (int y = top; y < bottom; ++y)
         for (int x = left; x < right; ++x) {

@@ -25,14 +25,13 @@ __kernel void seam_difference(__global const float4 *layer_a, __global const flo
     if (column >= part.z || row >= part.w)
         return;
     const int cx = part.x + column, cy = part.y + row;
-    const int left = cx * border.x / cells.x, right = (cx + 1) * border.x / cells.x;
-    const int top = cy * border.y / cells.y, bottom = (cy + 1) * border.y / cells.y;
+    const int4 its = cell_pixels(cx, cy, border, cells);
     /* gains are smooth: the cell's centre will do */
     const int g = (2 * cy + 1) * colours.y / (2 * cells.y) * colours.x + (2 * cx + 1) * colours.x / (2 * cells.x);
     float3 sum = (float3)(0.0f), squares = sum;
     float n = 0.0f, tried = 0.0f;
-    for (int y = top; y < bottom; y += 2)
-        for (int x = left; x < right; x += 2) {
+    for (int y = its.y; y < its.w; y += 2)
+        for (int x = its.x; x < its.z; x += 2) {
             tried += 1.0f;
             float4 a, b;
             if (!layer_pair(layer_a, field_a, box_a, layer_b, field_b, box_b, (int2)(x, y), border, lens, &a, &b) ||
