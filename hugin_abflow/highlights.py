@@ -1,12 +1,13 @@
 """What one photo shows clipped is taken from another that does not (kernels/highlights.cl).
 
 Where a photo runs into white (saturation.py), a darker one beside it still has structure. The softmax knows
-nothing of that. So a layer's colour weight falls with how much more of its surroundings it shows clipped than
-the layer that shows least so,
+nothing of that. So a layer's colour weight falls with how much it shows clipped of what the layer that clips
+least still shows of its surroundings,
 
-    s_k <- s_k exp(-strength_k * e_k),    e_k = c_k - min_j c_j
+    s_k <- s_k exp(-strength_k * e_k),    e_k = (c_k - min_j c_j) / (1 - min_j c_j)
 
-with c_k the clipped share. As white and what is not differ by an unknown amount, the transition is as wide as
+with c_k the clipped share: of a white ceiling all photos clip most, and the darkest alone shows its specks. As
+white and what is not differ by an unknown amount, the transition is as wide as
 the overlap allows there (transition.py), and the darker layer is seen nearly up to its border, if there is
 nothing but white beyond. Where layers that clip less than k, by all that both show, reach beyond each other,
 white need not be shown at all, and the strength is twice as large; towards what layer k has to show white it
@@ -39,6 +40,8 @@ _FULL_STRENGTH = 24.0
 # What is clipped as far as this, and no layer shows that clips less, has to be shown, though white; what is
 # clipped less than that yields by no more than _STRENGTH. From so many working pixels on strength is full.
 _WHITE, _FAR = 0.5, 128.0
+# The least that a layer shows of a cell for others to lose all of it: less may be noise.
+_SHOWN = 0.03
 # A layer clips less than another if this part of what both show clipped, together, is the other one's alone.
 _LESS = 0.25
 
@@ -79,7 +82,8 @@ def measure(
         share[:] = found.get()
     inside = on_cells(masks.host, cells, np.logical_or)
     least = np.where(inside, shares, np.float32(1)).min(0)
-    return Clipped(shares, np.where(inside, shares - least, np.float32(0)))
+    excess = (shares - least) / np.maximum(1 - least, np.float32(_SHOWN))
+    return Clipped(shares, np.where(inside, excess, np.float32(0)))
 
 
 def give_way(
