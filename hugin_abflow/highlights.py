@@ -6,12 +6,11 @@ least still shows of its surroundings,
 
     s_k <- s_k exp(-strength_k * e_k),    e_k = (c_k - min_j c_j) / (1 - min_j c_j)
 
-with c_k the clipped share: of a white ceiling all photos clip most, and the darkest alone shows its specks. As
-white and what is not differ by an unknown amount, the transition is as wide as
-the overlap allows there (transition.py), and the darker layer is seen nearly up to its border, if there is
-nothing but white beyond. Where layers that clip less than k, by all that both show, reach beyond each other,
-white need not be shown at all, and the strength is twice as large; towards what layer k has to show white it
-falls.
+with c_k the clipped share: of a white ceiling all photos clip most, and the darkest alone shows its specks.
+As white and what is not differ by an unknown amount, the transition is as wide as the overlap allows there
+(transition.py), and the darker layer is seen nearly up to its border, if there is nothing but white beyond.
+Where layers that clip less than k, by all that both show, reach beyond each other, white need not be shown at
+all, and the strength is twice as large; towards what layer k has to show white it falls.
 """
 
 from __future__ import annotations

@@ -41,6 +41,7 @@ from hugin_abflow.cells import Whole
 from hugin_abflow.chart import Chart
 from hugin_abflow.coefficient import Masks
 from hugin_abflow.colour import Correction
+from hugin_abflow.content import Unlike
 from hugin_abflow.errors import DeviceError, SettingsError
 from hugin_abflow.geometry import Pair, PairFlow
 from hugin_abflow.guides import Guide, by_pair
@@ -74,7 +75,7 @@ _LEAST_WORKING_PIXELS = 20_000
 
 @dataclass(frozen=True)
 class Prepared:
-    """All that the full-resolution pass needs, on the device."""
+    """All that the full-resolution pass needs, on the device; `unlike` tells how its offsets were made."""
 
     layers: tuple[BlendLayer, ...]
     full: Grid
@@ -82,6 +83,7 @@ class Prepared:
     gain_grid: Grid
     offset_grid: Grid
     shoulder: float
+    unlike: Unlike | None
 
 
 def merge(
@@ -183,7 +185,7 @@ def prepare(
         del masks, overlaps, shared, fast  # what comes takes the most memory
         offsets, correction = multiband.none(grid, len(reduced)), aligned.correction
         if settings.exposure and overlapping:
-            offsets = multiband.offsets(device, reduced, aligned.fields, correction, grid, once)
+            offsets = multiband.offsets(device, reduced, aligned.fields, correction, grid, aligned.unlike)
         final = [
             BlendLayer(layer.layer, layer.box, field, reach, gain, offset)
             for layer, field, reach, gain, offset in zip(
@@ -192,7 +194,9 @@ def prepare(
         ]
         advance(1)
     final += [_unblended(device, everything[i]) for i in range(len(everything)) if i not in used]
-    return Prepared(tuple(final), full, grid, correction.grid, offsets.grid, correction.shoulder)
+    return Prepared(
+        tuple(final), full, grid, correction.grid, offsets.grid, correction.shoulder, aligned.unlike
+    )
 
 
 @contextmanager
@@ -227,12 +231,14 @@ class _Aligned:
 
     fields      where each is sampled, and its weight. reaches: how far from there, by rows (geometry.py).
     whole       where one layer was taken, on the seam grid; None: nowhere, or, without flow, everywhere.
+    unlike      where they show different things there; None as well.
     """
 
     fields: list[Buffer]
     reaches: list[list[float]]
     correction: Correction
     whole: seam.Cells | None
+    unlike: Unlike | None
 
 
 def _align(
@@ -273,6 +279,7 @@ def _align(
         hoped = gains(settings, None) if settings.flow and once is None and settings.cores > 1 else None
         reaches = [geometry.reach(device, *one, grid) for one in zip(layers, fields, strict=True)]
         whole: seam.Cells | None = None
+        unlike: Unlike | None = None
         for _ in range(rounds):
             strict = (first if first and whole is None else gains(exposure, whole, True)).result()
             device.give_back()
@@ -291,9 +298,10 @@ def _align(
             lost = seam.lost(device, layers, fields, pairs, strict, clipped.excess, grid)
             highlights.regain(device, layers, fields, further, whole, grid)
             seam.cut(device, layers, fields, residual, whole, masks, grid, once=once, lost=lost)
+            unlike = seam.unlike(residual, whole, once, grid)
         else:
             last = hoped or gains(settings, None)
-        return _Aligned(fields, reaches, last.result(), whole)
+        return _Aligned(fields, reaches, last.result(), whole, unlike)
 
 
 def _redundant(index: int, layers: Sequence[WorkingLayer], masks: Masks) -> bool:

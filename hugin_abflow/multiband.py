@@ -7,7 +7,8 @@ cover all, and nothing for layers that agree, however narrow their overlaps. Wha
 grid is calculated there; of finer bands the weighted mean of the full-resolution pass is the blend, and what
 is added to a layer before leaves them as they are.
 
-Gains (colour.py) come before: an offset cannot restore contrast.
+Gains (colour.py) come before: an offset cannot restore contrast. Where layers show different things, what
+they differ by is told from beside (content.py).
 """
 
 from __future__ import annotations
@@ -15,12 +16,13 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
+from hugin_abflow import content
 from hugin_abflow.colour import NEGLIGIBLE, Correction
+from hugin_abflow.content import Unlike
 from hugin_abflow.opencl import MUCH, Buffer, Device
 from hugin_abflow.working import Grid, Place, WorkingLayer
 
@@ -62,11 +64,11 @@ def offsets(
     fields: Sequence[Buffer],
     correction: Correction,
     grid: Grid,
-    once: npt.NDArray[np.bool_] | None = None,
+    unlike: Unlike | None = None,
 ) -> Offsets:
     """Those that make of the weighted mean of the layers a multi-band blend. fields: of geometry.py.
 
-    once: cells of the region, as many as there may be, of what is taken from one layer, whole.
+    unlike: where layers show different things, which are not blended; None: nowhere.
     """
     grids = levels(grid)
     if len(grids) < 2:
@@ -84,7 +86,7 @@ def offsets(
         finest.append(_finest(device, layer, field, total, correction, k, grid, grids[1], widths[1]))
         device.give_back(MUCH)  # layers are of different sizes
     del total
-    _differ(device, finest, widths[1], np.zeros((1, 1)) if once is None else once)
+    _differ(device, finest, widths[1], unlike, correction.shoulder)
     blend = _blend(device, finest, grids[1:], widths[1:])
     result = []
     while finest:  # each makes room for the next one's
@@ -131,21 +133,22 @@ def _finest(
     return level  # smoothed later: each by its own side of a border, layers that agree would differ there
 
 
-def _differ(device: Device, finest: list[_Level], widths: Widths, once: npt.NDArray[Any]) -> None:
-    """Have each entry be how it differs from the weighted mean of all; not in cells of `once`."""
+def _differ(
+    device: Device, finest: list[_Level], widths: Widths, unlike: Unlike | None, shoulder: float
+) -> None:
+    """Have each entry be how it differs from the weighted mean of all."""
     grid = finest[0].grid
-    alone, cells = device.upload(once, np.float32), (*once.shape[::-1], *grid.border[2:])
     mean = device.zeros((*grid.shape, 4))
     for level in finest:
         _add(device, level, None, mean)
     _join(device, mean, grid, None, None)
     for k, level in enumerate(finest):
-        device.run(
-            "multiband", "multiband_differ", level.box[2:], level.colours, level.box, grid.border, mean,
-            alone, cells,
-        )  # fmt: skip
+        colours, share, box = level.colours, level.share, level.box
+        device.run("multiband", "multiband_differ", box[2:], colours, box, grid.border, mean)
+        if unlike is not None:
+            content.complete(device, colours, share, box, grid, mean, unlike, shoulder)
         finest[k] = _spread(device, level, widths)
-        del level
+        del level, colours, share
         device.give_back(MUCH)
 
 

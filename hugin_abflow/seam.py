@@ -33,6 +33,7 @@ import scipy
 
 from hugin_abflow.coefficient import Masks, on_cells
 from hugin_abflow.colour import Correction, clipping
+from hugin_abflow.content import Unlike
 from hugin_abflow.geometry import Pair
 from hugin_abflow.labelling import Graph, energy, least
 from hugin_abflow.layer import Box
@@ -48,6 +49,8 @@ _SIGMA, _REACH = 1.0, 3
 # Residual of low frequencies, of full scale, that makes a region one layer's, and that of its outskirts.
 # Where that of all frequencies reaches the first there are outskirts as well.
 _STRONG, _WEAK = 0.2, 0.045
+# Residual of low frequencies up to which layers surely show the same, and from which on surely not.
+_ALIKE, _UNLIKE = 0.06, 0.15
 # Strong cells, of the equator's size, that a region has at least: fewer are an edge that is a pixel off.
 _LEAST = 6.0
 # Price of a cut, in cells: what is cut off must be favoured by the softmax over this depth, or more where t
@@ -140,6 +143,13 @@ def lost(
     row, column = _centres(cells, clipped.shape)
     prices: Prices = _CLIPPED * told * clipped[:, row[:, None], column]
     return prices
+
+
+def unlike(residual: Residuals, whole: Cells, once: Cells | None, grid: Grid) -> Unlike:
+    """How surely layers show different things, in the regions `whole`, each of one layer, and in `once`."""
+    other = whole * np.clip((residual.mean - _ALIKE) / (_UNLIKE - _ALIKE), 0, 1)
+    moved = np.zeros(whole.shape, bool) if once is None else once
+    return Unlike(seam_grid(grid), moved.astype(np.float32), other.astype(np.float32))
 
 
 def regions(residual: Residuals, grid: Grid, aligned: bool = True, once: Cells | None = None) -> Cells:

@@ -12,8 +12,7 @@ static inline bool colour_clips(float4 c, float4 clipped) {
 /* How much two samples tell of exposure, 0..1: what is nearly black in either may have been any darker, most of all at
    the rim of a dark lens, and by how much is seen by nobody. Of floats it is not known what is dark. */
 static inline float colour_tells(float4 a, float4 b, float shoulder) {
-    const float darker = LEAST(GREATEST(a.x, GREATEST(a.y, a.z)), GREATEST(b.x, GREATEST(b.y, b.z)));
-    const float tells = (darker - COLOUR_DARK) / (COLOUR_BRIGHT - COLOUR_DARK);
+    const float tells = (darker_channel(a.xyz, b.xyz) - COLOUR_DARK) / (COLOUR_BRIGHT - COLOUR_DARK);
     return shoulder > 0.0f ? LIMITED(tells, 0.0f, 1.0f) : 1.0f;
 }
 

@@ -382,6 +382,11 @@ static inline float3 exposure_scale(float3 c, float shoulder) {
     return logarithm4(odds.xyzz).xyz;
 }
 
+/* The brightest channel of the darker one of two colours. */
+static inline float darker_channel(float3 a, float3 b) {
+    return LEAST(GREATEST(a.x, GREATEST(a.y, a.z)), GREATEST(b.x, GREATEST(b.y, b.z)));
+}
+
 /* Multiply these odds by 1 + rise, floats by it themselves. Black stays, and an integer image is not raised
    beyond white; with a shoulder of 1 white stays as well. Exactly c where the rise is 0. */
 #define EXPOSURE_RAISE(n)                                                                                          \

@@ -89,21 +89,17 @@ __kernel void multiband_finest(__global const float4 *layer, __global const floa
     share[y * place.z + x] = valid ? way.w : 0.0f;
 }
 
-/* How a layer differs from the weighted mean of all; not at all in the place of what is taken from one layer, of
-   which a shade would be left beside where it is shown. */
+/* How a layer differs from the weighted mean of all. */
 __kernel void multiband_differ(__global float4 *level,      /* (box.w, box.z): colour, valid; then difference */
                                int4 box, int4 grid,         /* place, run size; its grid */
-                               __global const float4 *mean, /* (grid.y, grid.x): colour, valid */
-                               __global const float *once,  /* (cells.y, cells.x), 0..1 */
-                               int4 cells)                  /* seam grid, over the same region */
+                               __global const float4 *mean) /* (grid.y, grid.x): colour, valid */
 {
     const int x = get_global_id(0), y = get_global_id(1), at = y * box.z + x;
     if (x >= box.z || y >= box.w)
         return;
     const float4 c = mean[(y + box.y) * grid.x + x + box.x];
-    const float keep = 1.0f - bilinear_scalar(once, multiband_place(x + box.x, y + box.y, grid, cells), cells);
     if (level[at].w > 0.0f)
-        level[at] = c.w > 0.0f ? (float4)(keep * (level[at].xyz - c.xyz), 1.0f) : (float4)(0.0f);
+        level[at] = c.w > 0.0f ? (float4)(level[at].xyz - c.xyz, 1.0f) : (float4)(0.0f);
 }
 
 /* Sums over pixels of a level, each with its weight: of what is valid, of shares, of all that the grid has. */

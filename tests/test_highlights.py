@@ -185,7 +185,7 @@ def test_what_is_clipped_yields_less_near_what_has_to_be_shown_white(
 def test_what_is_clipped_yields_most_where_others_show_all(
     device: Device, third: tuple[int, int, float]
 ) -> None:
-    """Also where a layer is clipped itself, but less: half, and all of what it still shows is lost in white."""
+    """Also where a layer is clipped itself, but less: half; all of what it still shows is lost in white."""
     further, _, _ = yielding(device, *strips(device, (0, 48, 0.5), (16, 77, 1.0), third))
     assert further[1, :, [1, 2, 4]] == pytest.approx(MORE, rel=1e-5)
     assert not further[0].any()

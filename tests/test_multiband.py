@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 import pytest
@@ -10,7 +10,6 @@ from bands import field_of
 from grids import GRIDS, boxes, patches, plane, random_layer, sphere
 from reference import multiband as twin
 from reference.common import Array
-from scipy import ndimage
 from tolerances import DECISIONS, SUM, TRIGONOMETRY, assert_close
 
 from hugin_abflow import multiband
@@ -36,25 +35,6 @@ def level_of(device: Device, seed: int, grid: Grid, box: tuple[int, int, int, in
     """A random level on a box."""
     colours, share = random_layer(seed, box[2], box[3], 0.5), shares(seed + 1, box)
     return multiband._Level(grid, box, device.upload(colours), device.upload(share))
-
-
-def moving(grid: Grid) -> Iterator[tuple[Array, Grid]]:
-    """How much of each cell moved, float32 0..1, and grids of them: none, and patches of all and of some."""
-    yield np.zeros((1, 1), np.float32), grid.resized(1, 1)
-    for seed, cells in ((5, grid.resized(10, 7)), (6, grid.resized(9, 4))):
-        some = np.clip(2 * np.random.default_rng(seed).random(cells.shape), 0, 1)
-        yield (some * patches(seed, *cells.border[:2], 0.6, 2)).astype(np.float32), cells
-
-
-def test_twin_of_differences_reads_scipys_zoom() -> None:
-    """The shares of the cells that moved, between their centres."""
-    moved = np.random.default_rng(1).random((4, 6))
-    level, mean = random_layer(2, 23, 17, 2), random_layer(3, 23, 17, 2)
-    found = twin.multiband_differ(level, (0, 0, 23, 17), (23, 17, 0, 0), mean, moved, (6, 4, 0, 0))
-    y, x = np.mgrid[:17, :23] + 0.5
-    read = ndimage.map_coordinates(moved, [y * 4 / 17 - 0.5, x * 6 / 23 - 0.5], order=1, mode="nearest")
-    expected = (1 - read[..., None]) * (level.astype(float) - mean)[..., :3]
-    assert np.allclose(found[..., :3], expected) and (found[..., 3] == 1).all()
 
 
 def test_twin_of_the_spline_is_a_box_convolved_twice() -> None:
@@ -105,20 +85,14 @@ def test_weights_and_finest_levels_equal_their_twins(device: Device, name: str, 
 @pytest.mark.parametrize("name", list(GRIDS))
 @pytest.mark.parametrize("part", PARTS)
 def test_differences_equal_their_twin(device: Device, name: str, part: str) -> None:
-    """Where nothing moved, and under cells that divide nothing, some of which did, whole or in part."""
     grid = GRIDS[name]
     box = box_of(grid, part)
     level, mean = random_layer(3, box[2], box[3], 0.7), random_layer(4, grid.width, grid.height, 0.7)
-    for moved, cells in moving(grid):
-        out = device.upload(level)
-        device.run(
-            "multiband", "multiband_differ", box[2:], out, box, grid.border, device.upload(mean),
-            device.upload(moved), cells.border,
-        )  # fmt: skip
-        expected = twin.multiband_differ(level, box, grid.border, mean, moved, cells.border)
-        assert_close(out.get(), expected, SUM)
-        assert expected[..., 3].sum() < (level[..., 3] > 0).sum()
-        assert not moved.any() or (np.abs(expected[..., :3]).max(-1) == 0)[expected[..., 3] > 0].any()
+    out = device.upload(level)
+    device.run("multiband", "multiband_differ", box[2:], out, box, grid.border, device.upload(mean))
+    expected = twin.multiband_differ(level, box, mean)
+    assert_close(out.get(), expected, SUM)
+    assert expected[..., 3].sum() < (level[..., 3] > 0).sum()
 
 
 @pytest.mark.parametrize("name", list(GRIDS))

@@ -185,6 +185,7 @@ def _offset(device: Device, prepared: Prepared) -> Prepared:
     ]
     gains = Correction(prepared.gain_grid, prepared.shoulder, tuple(one.gain for one in blended))
     fields = [one.field for one in blended]
-    found = iter(multiband.offsets(device, reduced, fields, gains, prepared.grid).layers)
+    offsets = multiband.offsets(device, reduced, fields, gains, prepared.grid, prepared.unlike)
+    found = iter(offsets.layers)
     layers = [one if one.offset is None else replace(one, offset=next(found)) for one in prepared.layers]
     return replace(prepared, layers=tuple(layers))

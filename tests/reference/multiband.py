@@ -97,16 +97,11 @@ def multiband_finest(
     return _mean(colour, valid * 1.0), np.where(valid, way[..., 3], 0.0)
 
 
-def multiband_differ(
-    level: Array, box: Sequence[int], grid: Sequence[int], mean: Array, moved: Array, cells: Sequence[int]
-) -> Array:
-    """How a level on a box differs from the mean (grid), and 1; zeros where one of them is not valid, and
-    less colour the more of the cells around moved (0..1).
-    """
+def multiband_differ(level: Array, box: Sequence[int], mean: Array) -> Array:
+    """How a level on a box differs from the mean (grid), and 1; zeros where one of them is not valid."""
     known = (level[..., 3] > 0) & (mean[_part(box)][..., 3] > 0)
     there = mean[_part(box)][..., :3].astype(np.float64)
-    still, share = bilinear(1.0 - moved, cells, *place(box, grid, cells))
-    return _mean((level[..., :3] - there) * (still / share)[..., None], known * 1.0)
+    return _mean(level[..., :3] - there, known * 1.0)
 
 
 def multiband_reduce(

@@ -1,0 +1,87 @@
+"""Where aligned layers show different things, how they differ is told from beside (kernels/content.cl).
+
+Somebody whom one layer shows, in a place that is taken from another, is no difference of exposure: blended
+over wide bands he would leave his colours beside him, as a shade on what is behind. What the layers would
+differ by if both showed that is told by places around, where they do: by the nearest that tell enough.
+
+What is nearly black may be anything, at the rim of a dark lens above all, and is left as it is, unless flow
+tells that it moved.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from hugin_abflow.opencl import Buffer, Device
+from hugin_abflow.working import Grid, Place
+
+# Cells of the Gaussians that places around are averaged with, the widest first.
+_SIGMAS = (16.0, 8.0, 4.0, 2.0)
+# Places around tell all if they are this share of what is averaged; if less, the next wider ones do in part.
+_ENOUGH = 0.05
+# Sigmas to the end of a Gaussian.
+_REACH = 3
+
+Values = npt.NDArray[np.float32]
+
+
+@dataclass(frozen=True)
+class Unlike:
+    """How surely layers show different things, both float32 (height, width) on `grid`, 0..1.
+
+    moved   by flow: what is taken from one layer, whole, though it matches.
+    other   by what differs when layers are aligned.
+    """
+
+    grid: Grid
+    moved: Values
+    other: Values
+
+
+def complete(
+    device: Device,
+    difference: Buffer,
+    share: Buffer,
+    box: Place,
+    grid: Grid,
+    mean: Buffer,
+    unlike: Unlike,
+    shoulder: float,
+) -> None:
+    """Replace, in place, how a layer differs from the weighted mean of all where they show different things.
+
+    difference  float32 (height, width, 4) on a box of `grid`: colour, valid. share: its own of all weights.
+    mean        float32 (height, width, 4) on all of the grid. shoulder: of the exposure scale, 0: of floats.
+    """
+    cells, sums = unlike.grid, device.empty((*unlike.grid.shape, 4))
+    moved, other = device.upload(unlike.moved), device.upload(unlike.other)
+    device.run(
+        "content", "content_gather", cells.border[:2],
+        difference, share, box, grid.border, mean, moved, other, cells.border, shoulder, sums,
+    )  # fmt: skip
+    told = device.upload(_told(sums.get(), cells.wraps))
+    device.run(
+        "content", "content_complete", box[2:],
+        difference, share, box, grid.border, mean, moved, other, told, cells.border, shoulder,
+    )  # fmt: skip
+
+
+def _told(sums: Values, wraps: bool) -> Values:
+    """What layers differ by, (height, width, 4), everywhere, from sums of `content_gather`."""
+    result = np.zeros_like(sums)
+    for sigma in _SIGMAS:
+        by = int(_REACH * sigma)
+        columns = np.pad(sums, ((0, 0), (by, by), (0, 0)), mode="wrap" if wraps else "constant")
+        size = 2 * by + 1
+        around = cv2.GaussianBlur(columns, (size, size), sigma, borderType=cv2.BORDER_CONSTANT)
+        around = around[:, by : around.shape[1] - by]
+        weight = around[..., 3:]
+        some = weight > 0
+        nearer = np.where(some, around / np.where(some, weight, 1), 0)
+        enough = np.clip(weight / _ENOUGH, 0, 1)
+        result = np.where(some, enough * nearer + (1 - enough) * result, result)
+    return np.ascontiguousarray(result, np.float32)

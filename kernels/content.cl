@@ -1,0 +1,71 @@
+/* Where aligned layers show different things, how they differ tells nothing of exposure: it is told from beside. Layers
+   are levels of multiband.cl: arrays on a box of a grid. */
+
+/* The brightest channel, of an integer image, up to which what a layer shows may be the dark of anything, as at the rim
+   of a lens, and from which on it surely is something. */
+#define CONTENT_BLACK 0.03f
+#define CONTENT_SEEN 0.15f
+
+/* How surely layers show the same at a place of a grid, 0..1. own, mean: what one shows and the mean of all. */
+static inline float content_same(float3 own, float3 mean, float2 place, __global const float *moved,
+                                 __global const float *unlike, int4 cells, float shoulder) {
+    const float dark = (darker_channel(own, mean) - CONTENT_BLACK) / (CONTENT_SEEN - CONTENT_BLACK);
+    const float seen = shoulder > 0.0f ? LIMITED(dark, 0.0f, 1.0f) : 1.0f;
+    const float other = seen * bilinear_scalar(unlike, place, cells);
+    return 1.0f - GREATEST(other, bilinear_scalar(moved, place, cells));
+}
+
+/* Sums for a fit, over the pixels of a cell: with d = (1 - share) e the difference of a layer from the mean of all, of
+   which its own share is part, of w d (1 - share) / n and w (1 - share)^2 / n, w as surely as it shows the same. */
+__kernel void content_gather(__global const float4 *difference,  /* (box.w, box.z): colour, valid */
+                             __global const float *share,        /* (box.w, box.z), of all weights */
+                             int4 box, int4 grid,                /* place; its grid */
+                             __global const float4 *mean,        /* (grid.y, grid.x): colour, valid */
+                             __global const float *moved,        /* (cells.y, cells.x), 0..1 */
+                             __global const float *unlike,       /* the same, of what is not too dark to tell */
+                             int4 cells,                         /* run size; over the same region */
+                             float shoulder,                     /* of the exposure scale */
+                             __global float4 *sums)              /* (cells.y, cells.x): r, g, b, weight */
+{
+    const int cx = get_global_id(0), cy = get_global_id(1);
+    if (cx >= cells.x || cy >= cells.y)
+        return;
+    const int4 its = cell_pixels(cx, cy, grid, cells);
+    const float2 ratio = (float2)((float)cells.x / grid.x, (float)cells.y / grid.y);
+    float4 sum = (float4)(0.0f);
+    for (int y = its.y; y < its.w; ++y)
+        for (int x = its.x; x < its.z; ++x) {
+            const int at = box_index((int2)(x, y), box);
+            if (at < 0 || difference[at].w == 0.0f)
+                continue;
+            const float3 d = difference[at].xyz, m = mean[y * grid.x + x].xyz;
+            const float2 place = (float2)(x + 0.5f, y + 0.5f) * ratio;
+            const float rest = 1.0f - share[at];
+            const float w = rest * content_same(m + d, m, place, moved, unlike, cells, shoulder);
+            sum += w * (float4)(d, rest);
+        }
+    const int n = (its.z - its.x) * (its.w - its.y);
+    sums[cy * cells.x + cx] = sum / GREATEST(n, 1);
+}
+
+/* In place of a difference where layers show different things, that which the cells tell: e of the fit. */
+__kernel void content_complete(__global float4 *difference, __global const float *share, /* (box.w, box.z) */
+                               int4 box, int4 grid, /* place, run size; its grid */
+                               __global const float4 *mean, __global const float *moved, __global const float *unlike,
+                               __global const float4 *told, /* (cells.y, cells.x): e, unused */
+                               int4 cells, float shoulder)
+{
+    const int x = get_global_id(0), y = get_global_id(1), at = y * box.z + x;
+    if (x >= box.z || y >= box.w || difference[at].w == 0.0f)
+        return;
+    const int column = x + box.x, row = y + box.y;
+    const float2 place = (float2)((column + 0.5f) * cells.x / grid.x, (row + 0.5f) * cells.y / grid.y);
+    const float3 d = difference[at].xyz, m = mean[row * grid.x + column].xyz;
+    const float same = content_same(m + d, m, place, moved, unlike, cells, shoulder);
+    if (same == 1.0f)
+        return;
+    int4 cell;
+    const float4 w = bilinear_taps(place, cells, &cell);
+    const float4 e = w.x * told[cell.x] + w.y * told[cell.y] + w.z * told[cell.z] + w.w * told[cell.w];
+    difference[at].xyz = same * d + (1.0f - same) * (1.0f - share[at]) * e.xyz;
+}
