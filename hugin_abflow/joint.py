@@ -297,7 +297,7 @@ def _align(
             last = gains(settings, whole)
             lost = seam.lost(device, layers, fields, pairs, strict, clipped.excess, grid)
             highlights.regain(device, layers, fields, further, whole, grid)
-            seam.cut(device, layers, fields, residual, whole, masks, grid, once=once, lost=lost)
+            seam.cut(device, layers, fields, residual, whole, masks, grid, lost)
             unlike = seam.unlike(residual, whole, once, grid)
         else:
             last = hoped or gains(settings, None)

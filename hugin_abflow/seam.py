@@ -169,15 +169,14 @@ def cut(
     whole: Cells,
     masks: Masks,
     grid: Grid,
-    once: Cells | None = None,
     lost: Prices | None = None,
 ) -> None:
     """Give each cell of the regions `whole` to one layer: the others lose their colour weight there
-    (fields[...].w, in place). A region that has cells of `once` is cut in two only if that is much better.
+    (fields[...].w, in place). A region is cut in two only if that is much better.
     lost: what each layer costs in a cell besides.
     """
     cells = seam_grid(grid)
-    owner = _owners(layers, fields, residual, whole, masks, grid, cells, _CUT, once, lost)
+    owner = _owners(layers, fields, residual, whole, masks, grid, cells, _CUT, True, lost)
     yields = [_soften((whole & (owner != k)).astype(np.float32), cells.wraps) for k in range(len(layers))]
     _yield(device, layers, fields, yields, grid, cells)
 
@@ -199,7 +198,7 @@ def divide(
         told = found[..., 4] > 0
         square[its] = np.maximum(square[its], np.where(told, _SHORTER + found[..., 3], 0))
     whole = square > 0
-    owner = _owners(layers, fields, Residuals(square, square), whole, masks, grid, cells, _FINE_CUT)
+    owner = _owners(layers, fields, Residuals(square, square), whole, masks, grid, cells, _FINE_CUT, False)
     yields = [(whole & (owner != k)).astype(np.float32) for k in range(len(layers))]
     _yield(device, layers, fields, yields, grid, cells)
 
@@ -213,11 +212,11 @@ def _owners(
     grid: Grid,
     cells: Grid,
     cut_price: float,
-    once: Cells | None = None,
+    once: bool,
     lost: Prices | None = None,
 ) -> npt.NDArray[np.intp]:
     """The layer of each cell, (height, width): in the regions `whole` the one it is taken from, elsewhere the
-    one that the softmax favours, -1 where none is.
+    one that the softmax favours, -1 where none is. cut_price, once: see `label`.
     """
     cover = on_cells(masks.host, cells, np.logical_and)
     residual = _completed(residual, cover, cells.wraps)
@@ -228,9 +227,8 @@ def _owners(
     owner = np.where(cover.any(0), (shares * cover).argmax(0), -1)
     for region in _connected(whole, cells.wraps):
         rows, columns = np.nonzero(region)
-        one = once is not None and bool(once[region].any())
         owner[rows, columns] = label(
-            rows, columns, residual, shares, cover, cells.wraps, cut_price, one, lost
+            rows, columns, residual, shares, cover, cells.wraps, cut_price, once, lost
         )
     return owner
 

@@ -129,8 +129,8 @@ def test_what_is_beside_him_would_be_bent(monkeypatch: pytest.MonkeyPatch) -> No
 
 
 def test_his_place_is_known_wherever_it_matters(device: Device, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Where regions are looked for and cut, and where low frequencies are blended: the same cells, which he
-    fills in one photo or the other."""
+    """Where regions are looked for, and where low frequencies are blended: the same cells, which he fills in
+    one photo or the other."""
     one, seen = shoot(PERSON), {}
 
     def listen(module, name: str) -> None:
@@ -143,12 +143,12 @@ def test_his_place_is_known_wherever_it_matters(device: Device, monkeypatch: pyt
 
         monkeypatch.setattr(module, name, remember)
 
-    for module, name in ((seam, "regions"), (seam, "cut"), (multiband, "offsets")):
+    for module, name in ((seam, "regions"), (multiband, "offsets")):
         listen(module, name)
     joint.prepare(device, one.layers, CANVAS, Settings(), silent)
-    cells = seen["cut"]
+    cells = seen["regions"]
     assert cells.dtype == bool and all(np.array_equal(cells, its) for its in seen.values())
-    assert len(seen) == 3
+    assert len(seen) == 2
     rows, columns = np.nonzero(one.person[0] | one.person[1])
     top = min(int(layer.box.top) for layer in one.layers)
     size = (one.layers[0].box.bottom - top) / cells.shape[0]

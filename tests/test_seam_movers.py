@@ -6,11 +6,14 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from grids import plane
+from grids import on_device, plane
 from hypothesis import given
 from labels import alike, energies, many, problems
 
-from hugin_abflow import labelling, seam
+from hugin_abflow import coefficient, labelling, seam
+from hugin_abflow.colour import Correction
+from hugin_abflow.geometry import Pair
+from hugin_abflow.opencl import Device
 
 WRAPS = [False, True]
 
@@ -142,9 +145,42 @@ def owners(told: np.ndarray, residual: np.ndarray, turn: int = 0) -> np.ndarray:
         [SimpleNamespace(box=(0, 0, 240, 96))] * 2,
         [SimpleNamespace(get=lambda field=field: field) for field in fields],
         seam.Residuals(residual, residual, told), region, SimpleNamespace(host=covers), grid,
-        seam.seam_grid(grid), seam._CUT, region,
+        seam.seam_grid(grid), seam._CUT, True,
     )  # fmt: skip
     return np.roll(found, -turn, 1)
+
+
+@pytest.mark.parametrize("flow", [True, False])
+def test_a_region_comes_from_one_layer_and_an_overlap_from_both(
+    device: Device, monkeypatch: pytest.MonkeyPatch, flow: bool
+) -> None:
+    """Of layers that are aligned; without flow, where all of an overlap is a region, it is cut where it shows
+    least."""
+    monkeypatch.setattr(seam, "_ONCE", np.inf)
+    grid = plane(240, 96)
+    pictures = np.full((2, 96, 240, 4), 0.5, np.float32)
+    pictures[..., 3] = 1
+    pictures[1, 16:80, 40:200, :3] = 0.9
+    pictures[1, :, 110:130, :3] = 0.5  # where a cut costs next to nothing
+    layers = [on_device(device, one) for one in pictures]
+    left = np.where(np.arange(240) < 118, 0.95, 0.05).astype(np.float32)[None].repeat(96, 0)
+    fields = []
+    for weight in (left, 1 - left):
+        field = np.zeros((96, 240, 4), np.float32)
+        field[..., 3] = weight
+        fields.append(device.upload(field))
+    masks = coefficient.masks(device, layers, grid)
+    correction = Correction(grid.resized(4, 4), 1.0, (None, None))
+    pairs = [Pair(0, 1)]
+    if flow:
+        residual = seam.residuals(device, layers, fields, pairs, correction, grid)
+        whole = seam.regions(residual, grid) | np.pad(np.ones((8, 20), bool), ((2, 2), (5, 5)))
+        seam.cut(device, layers, fields, residual, whole, masks, grid)
+    else:
+        seam.divide(device, layers, fields, pairs, correction, masks, grid)
+    inside = [field.get()[24:72, 56:184, 3] for field in fields]
+    first = inside[0] > inside[1]
+    assert first.all() or not first.any() if flow else 0.2 < first.mean() < 0.8
 
 
 @pytest.mark.parametrize("turn", [0, 15])
