@@ -25,6 +25,7 @@ from hugin_abflow import (
     geometry,
     highlights,
     intermediate,
+    membrane,
     memory,
     multiband,
     pairflow,
@@ -297,7 +298,9 @@ def _align(
             last = gains(settings, whole)
             lost = seam.lost(device, layers, fields, pairs, strict, clipped.excess, grid)
             highlights.regain(device, layers, fields, further, whole, grid)
-            seam.cut(device, layers, fields, residual, whole, masks, grid, lost)
+            owner = seam.cut(device, layers, fields, residual, whole, masks, grid, lost)
+            membrane.stretch(device, layers, fields, owner, whole, masks, grid, seam.seam_grid(grid))
+            reaches = [geometry.reach(device, *one, grid) for one in zip(layers, fields, strict=True)]
             unlike = seam.unlike(residual, whole, once, grid)
         else:
             last = hoped or gains(settings, None)

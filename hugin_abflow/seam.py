@@ -170,15 +170,18 @@ def cut(
     masks: Masks,
     grid: Grid,
     lost: Prices | None = None,
-) -> None:
+) -> npt.NDArray[np.intp]:
     """Give each cell of the regions `whole` to one layer: the others lose their colour weight there
     (fields[...].w, in place). A region is cut in two only if that is much better.
     lost: what each layer costs in a cell besides.
+
+    Returns the layer of each cell, (height, width) on the seam grid, elsewhere that which weighs most.
     """
     cells = seam_grid(grid)
     owner = _owners(layers, fields, residual, whole, masks, grid, cells, _CUT, True, lost)
     yields = [_soften((whole & (owner != k)).astype(np.float32), cells.wraps) for k in range(len(layers))]
     _yield(device, layers, fields, yields, grid, cells)
+    return owner
 
 
 def divide(

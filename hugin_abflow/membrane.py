@@ -1,0 +1,110 @@
+"""What is taken from one layer, whole, is moved smoothly (kernels/membrane.cl).
+
+Flow has nothing to match there, and what it found would bend people, and the floor beside them. In such a
+region a layer's displacements are those of a membrane that is held where the layer goes on beside the region,
+and along cuts, where layers meet that flow has brought together: harmonic ones, no larger than those around
+(of least slopes, as in Perez, Gangnet, Blake, "Poisson image editing", 2003).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import numpy.typing as npt
+import scipy
+
+from hugin_abflow.coefficient import Masks, on_cells
+from hugin_abflow.opencl import Buffer, Device
+from hugin_abflow.working import Grid, WorkingLayer
+
+# Cells along a cut in which layers stay as flow has brought them together.
+_HELD = 2
+# So little holds every cell where it is: what nothing else holds is as its photo shows it.
+_LOOSE = 1e-9
+
+Cells = npt.NDArray[np.bool_]  # (height, width)
+Values = npt.NDArray[np.float64]  # (height, width, 3)
+
+
+def stretch(
+    device: Device,
+    layers: Sequence[WorkingLayer],
+    fields: Sequence[Buffer],
+    owner: npt.NDArray[np.intp],
+    whole: Cells,
+    masks: Masks,
+    grid: Grid,
+    cells: Grid,
+) -> None:
+    """Make displacements (fields[...].xyz, in place) smooth in regions of cells.
+
+    owner   (height, width) on `cells`: the layer that each cell is taken from.
+    whole   the regions in which layers differ.
+    """
+    cover = on_cells(masks.host, cells, np.logical_or)
+    for k, (layer, field) in enumerate(zip(layers, fields, strict=True)):
+        others = whole & (owner != k) & cover[k]
+        inner = whole & (owner == k) & ~_grown(others, _HELD, cells.wraps)
+        if not inner.any():
+            continue
+        found = device.empty((*cells.shape, 4))
+        device.run(
+            "membrane", "membrane_mean", cells.border[:2],
+            layer.pixels, field, layer.box, grid.border, cells.border, found,
+        )  # fmt: skip
+        means = found.get().astype(np.float64)
+        known = means[..., 3] > 0
+        free = inner & known
+        if not free.any():
+            continue
+        modes = ("nearest", "wrap" if cells.wraps else "nearest")
+        around, its = (scipy.ndimage.uniform_filter(one * 1.0, 3, mode=modes) for one in (free, known))
+        far = free * np.clip(
+            2 * around / np.maximum(its, 0.1) - 1, 0, 1
+        )  # nothing at outlines, all a cell away
+        smooth = _harmonic(means[..., :3], free, known, cells)
+        told = np.concatenate([far[..., None] * smooth, far[..., None]], -1)
+        device.run(
+            "membrane", "membrane_stretch", layer.box[2:], field, layer.box, grid.border,
+            device.upload(np.ascontiguousarray(told, np.float32)), cells.border,
+        )  # fmt: skip
+
+
+def _grown(mask: Cells, by: int, wraps: bool) -> Cells:
+    """A mask, and the cells around."""
+    padded = np.pad(mask, ((0, 0), (by, by)), mode="wrap" if wraps else "constant")
+    wider = scipy.ndimage.binary_dilation(padded, np.ones((3, 3)), by)
+    return np.asarray(wider[:, by : wider.shape[1] - by])
+
+
+def _harmonic(values: Values, free: Cells, known: Cells, cells: Grid) -> Values:
+    """Values with those of `free` cells such that each is the mean of its neighbours; cells that are not
+    `known` have no part.
+    """
+    rows, columns = np.nonzero(free)
+    number = np.full(free.shape, -1)
+    number[rows, columns] = np.arange(rows.size)
+    diagonal, held = np.full(rows.size, _LOOSE), np.zeros((rows.size, 3))
+    links = []
+    for down, right in ((0, 1), (0, -1), (1, 0), (-1, 0)):
+        row, column = rows + down, columns + right
+        there = (row >= 0) & (row < cells.height)
+        if cells.wraps:
+            column %= cells.width
+        else:
+            there &= (column >= 0) & (column < cells.width)
+        row, column = np.clip(row, 0, cells.height - 1), np.clip(column, 0, cells.width - 1)
+        there &= known[row, column]
+        diagonal += there
+        linked = there & free[row, column]
+        held += (there & ~linked)[:, None] * values[row, column]
+        links.append(np.stack([np.flatnonzero(linked), number[row, column][linked]]))
+    every = np.arange(rows.size)
+    first, second = np.concatenate([*links, np.stack([every, every])], 1)
+    weights = np.concatenate([np.full(first.size - rows.size, -1.0), diagonal])
+    size = rows.size, rows.size
+    matrix = scipy.sparse.csc_array((weights, (first, second)), shape=size)
+    result = values.copy()
+    result[rows, columns] = scipy.sparse.linalg.spsolve(matrix, held).reshape(-1, 3)
+    return result

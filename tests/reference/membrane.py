@@ -1,0 +1,38 @@
+"""Twins of kernels/membrane.cl."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from reference.common import Array, bilinear, pixels
+
+
+def membrane_mean(
+    layer: Array, field: Array, box: Sequence[int], border: Sequence[int], cells: Sequence[int]
+) -> Array:
+    """Mean displacement of the valid pixels of each cell, and 1; zeros where there are none."""
+    valid = np.zeros((border[1], border[0], 4))
+    part = np.s_[box[1] : box[1] + box[3], box[0] : box[0] + box[2]]
+    known = layer[..., 3:] > 0
+    valid[part] = np.concatenate([field[..., :3], np.ones(known.shape)], -1) * known
+    result = np.zeros((cells[1], cells[0], 4))
+    rows, columns = (np.arange(n + 1) * m // n for n, m in zip(cells[1::-1], border[1::-1], strict=True))
+    for y in range(cells[1]):
+        for x in range(cells[0]):
+            total = valid[rows[y] : rows[y + 1], columns[x] : columns[x + 1]].sum((0, 1))
+            result[y, x] = total / total[3] if total[3] else 0
+    return result
+
+
+def membrane_stretch(
+    field: Array, box: Sequence[int], border: Sequence[int], told: Array, cells: Sequence[int]
+) -> Array:
+    """The field with other displacements, as far as cells tell them."""
+    x, y = pixels(box[2], box[3], box[0], box[1])
+    value, weight = bilinear(told, cells, (x + 0.5) * cells[0] / border[0], (y + 0.5) * cells[1] / border[1])
+    other = value / weight[..., None]
+    result = field.astype(np.float64)
+    result[..., :3] = (1 - other[..., 3:]) * result[..., :3] + other[..., :3]
+    return result

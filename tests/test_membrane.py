@@ -1,0 +1,175 @@
+"""What is taken from one layer, whole, is moved smoothly: kernels against twins, and by how much."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import test_movers_panoramas as movers
+from grids import GRIDS, boxes, on_device, patches, plane, random_layer
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from reference import membrane as twin
+from reference.common import Array
+from scipy import ndimage
+from tolerances import SUM, assert_close
+
+from hugin_abflow import coefficient, geometry, joint, membrane, working
+from hugin_abflow.opencl import Device
+from hugin_abflow.progress import silent
+from hugin_abflow.settings import Settings
+from hugin_abflow.working import Grid
+
+# The kernels
+
+
+@pytest.mark.parametrize("name", list(GRIDS))
+@pytest.mark.parametrize("part", [0, 1, 2])
+def test_kernels_equal_their_twins(device: Device, name: str, part: int) -> None:
+    """On cells that divide nothing."""
+    grid, box, cells = GRIDS[name], boxes(GRIDS[name])[part], GRIDS[name].resized(10, 7)
+    layer = random_layer(1, box[2], box[3], 0.4)
+    field = np.random.default_rng(2).normal(size=layer.shape).astype(np.float32)
+    out, mean = device.upload(field), device.empty((7, 10, 4))
+    device.run(
+        "membrane", "membrane_mean", (10, 7), device.upload(layer), out, box, grid.border, cells.border, mean
+    )
+    expected = twin.membrane_mean(layer, field, box, grid.border, cells.border)
+    assert_close(mean.get(), expected, 10 * SUM)
+    assert expected[..., 3].any()
+    assert part == 0 or not expected[..., 3].all()
+    told = np.random.default_rng(3).random((7, 10, 4)).astype(np.float32)
+    told *= patches(4, 10, 7, 0.5, 3)[..., None]
+    device.run(
+        "membrane", "membrane_stretch", box[2:], out, box, grid.border, device.upload(told), cells.border
+    )
+    expected = twin.membrane_stretch(field, box, grid.border, told, cells.border)
+    assert_close(out.get(), expected, 10 * SUM)
+    assert np.array_equal(out.get()[..., 3], field[..., 3])
+    same = (out.get() == field).all(-1)
+    assert 0.02 < same.mean() < 0.9
+
+
+# Harmonic values
+
+
+@settings(max_examples=30, deadline=None)
+@given(seed=st.integers(0, 10**6), wraps=st.booleans())
+def test_values_are_between_those_around_and_their_neighbours_mean(seed: int, wraps: bool) -> None:
+    """Of a random shape; what is not known plays no part, whatever it is."""
+    cells = plane(17, 11, wraps)
+    random = np.random.default_rng(seed)
+    values = random.normal(size=(11, 17, 3))
+    free, known = random.random((11, 17)) < 0.6, random.random((11, 17)) < 0.9
+    free &= known
+    if not free.any():
+        return
+    values[~known] = np.nan
+    found = membrane._harmonic(np.where(known[..., None], values, 1e9), free, known, cells)
+    assert np.array_equal(found[known & ~free], values[known & ~free])
+    held = found[known & ~free]
+    low, high = np.minimum(held.min(0), 0) - 1e-6, np.maximum(held.max(0), 0) + 1e-6
+    assert (found[free] >= low).all() and (found[free] <= high).all()
+    around, count = np.zeros(values.shape), np.zeros(free.shape)
+    for axis, step in ((0, 1), (0, -1), (1, 1), (1, -1)):
+        its, there = np.roll(found, step, axis), np.roll(known, step, axis)
+        if axis == 0 or not wraps:
+            edge = [slice(None)] * 2
+            edge[axis] = 0 if step > 0 else -1
+            there = there.copy()
+            there[tuple(edge)] = False
+        around += np.where(there[..., None], its, 0)
+        count += there
+    expected = around / np.maximum(count, 1)[..., None]
+    assert np.allclose(found[free], expected[free], atol=1e-6)
+
+
+# Fields
+
+WIDTH, HEIGHT = 240, 96
+CELLS = (12, 30)
+
+
+def stretched(
+    device: Device, field: Array, owner: Array, whole: Array, covers: list[Array], wraps: bool = False
+) -> list[Array]:
+    """Displacements (height, width) along x of layers that cover some cells, all by the same field before."""
+    grid: Grid = plane(WIDTH, HEIGHT, wraps)
+    layers, fields = [], []
+    for cover in covers:
+        pixels = np.ones((HEIGHT, WIDTH, 4), np.float32) * np.kron(cover, np.ones((8, 8)))[..., None]
+        layers.append(on_device(device, pixels.astype(np.float32)))
+        values = np.zeros((HEIGHT, WIDTH, 4), np.float32)
+        values[..., 0], values[..., 3] = field, 0.5
+        fields.append(device.upload(values))
+    masks = coefficient.masks(device, layers, grid)
+    membrane.stretch(device, layers, fields, owner, whole, masks, grid, grid.coarser(8))
+    assert all((its.get()[..., 3] == 0.5).all() for its in fields)
+    return [its.get()[..., 0] for its in fields]
+
+
+def test_what_is_torn_is_straightened_and_nothing_else(device: Device) -> None:
+    """A slope with noise on it, in a region that comes from the first of two layers."""
+    slope = np.broadcast_to(0.02 * np.arange(WIDTH), (HEIGHT, WIDTH))
+    whole = np.zeros(CELLS, bool)
+    whole[3:9, 8:22] = True
+    pixels = np.kron(whole, np.ones((8, 8), bool))
+    noise = (
+        3 * np.random.default_rng(1).normal(size=slope.shape) * ndimage.binary_erosion(pixels, iterations=2)
+    )
+    first, second = stretched(device, slope + noise, np.zeros(CELLS, int), whole, [np.ones(CELLS, bool)] * 2)
+    inside = ndimage.binary_erosion(pixels, iterations=12)
+    assert np.abs(first - slope)[inside].max() < 0.1
+    assert np.abs(noise[inside]).max() > 8
+    beside = ~ndimage.binary_dilation(pixels, iterations=4)  # between cells, half of one
+    assert np.array_equal(first[beside], (slope + noise).astype(np.float32)[beside])
+    assert np.array_equal(second, (slope + noise).astype(np.float32))  # nothing is taken from it
+
+
+@pytest.mark.parametrize("turn", [0, 15])
+def test_along_cuts_layers_stay_where_they_meet(device: Device, turn: int) -> None:
+    """Where both are; where the other one is not there is no such place. Across the border as elsewhere."""
+    whole, owner = np.zeros(CELLS, bool), np.zeros(CELLS, int)
+    whole[:, 4:26] = True
+    owner[:, 15:] = 1
+    covers = [np.ones(CELLS, bool), np.ones(CELLS, bool)]
+    covers[1][6:, :15] = covers[0][6:, 15:] = False
+    field = np.random.default_rng(2).normal(size=(HEIGHT, WIDTH)).astype(np.float32)
+    turned = [np.roll(one, turn, 1) for one in (whole, owner, *covers)]
+    found = stretched(device, np.roll(field, 8 * turn, 1), turned[1], turned[0], turned[2:], wraps=True)
+    for k, one in enumerate(found):
+        one = np.roll(one, -8 * turn, 1)
+        meet = np.s_[:40, 108:120] if k == 0 else np.s_[:40, 120:132]
+        assert np.array_equal(one[meet], field[meet])
+        alone = np.s_[80:, 108:116] if k == 0 else np.s_[80:, 124:132]
+        assert np.abs(one[alone]).max() < 0.5 < np.abs(field[alone]).max()
+
+
+def test_nothing_is_held_and_nothing_known(device: Device) -> None:
+    """A layer that is all in one region is not moved; one that has no pixel in it is left alone."""
+    everywhere = np.ones(CELLS, bool)
+    field = np.ones((HEIGHT, WIDTH), np.float32)
+    first, second = stretched(device, field, np.zeros(CELLS, int), everywhere, [everywhere, ~everywhere])
+    assert np.abs(first).max() < 1e-3
+    assert np.array_equal(second, field)
+
+
+def test_rows_that_are_read_are_those_that_are_then_shown(
+    device: Device, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """`reach` tells them, of displacements as they are at last."""
+    shoot, kept, seen = movers.shoot(movers.PERSON), [], []
+    read, stretch = joint.reading.read, membrane.stretch
+
+    def watched(device, layers, fields, *others):
+        before = [field.get() for field in fields]
+        stretch(device, layers, fields, *others)
+        seen.append(any((field.get() != one).any() for field, one in zip(fields, before, strict=True)))
+
+    monkeypatch.setattr(membrane, "stretch", watched)
+    monkeypatch.setattr(joint.reading, "read", lambda *given: kept.append(read(*given)) or kept[0])
+    found = joint.prepare(device, shoot.layers, movers.CANVAS, Settings(), silent)
+    assert seen == [True]
+    by_layer = {id(one.layer): one for one in kept[0]}
+    for one in found.layers:
+        its: working.WorkingLayer = by_layer[id(one.layer)]
+        assert one.reach == geometry.reach(device, its, one.field, found.grid)
