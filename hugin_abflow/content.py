@@ -19,6 +19,8 @@ import numpy.typing as npt
 from hugin_abflow.opencl import Buffer, Device
 from hugin_abflow.working import Grid, Place
 
+# Residuals up to which layers surely show the same, and from which on surely not.
+_ALIKE, _UNLIKE = 0.06, 0.15
 # Cells of the Gaussians that places around are averaged with, the widest first.
 _SIGMAS = (16.0, 8.0, 4.0, 2.0)
 # Places around tell all if they are this share of what is averaged; if less, the next wider ones do in part.
@@ -40,6 +42,21 @@ class Unlike:
     grid: Grid
     moved: Values
     other: Values
+
+    @classmethod
+    def of(
+        cls,
+        grid: Grid,
+        residual: npt.NDArray[np.float64],
+        whole: npt.NDArray[np.bool_],
+        moved: npt.NDArray[np.bool_] | None,
+    ) -> Unlike:
+        """By what low frequencies of aligned layers differ, of full scale, in regions that are each taken from
+        one layer, `whole`; all (height, width) on `grid`.
+        """
+        other = whole * np.clip((residual - _ALIKE) / (_UNLIKE - _ALIKE), 0, 1)
+        told = np.zeros(whole.shape, bool) if moved is None else moved
+        return cls(grid, told.astype(np.float32), other.astype(np.float32))
 
 
 def complete(

@@ -298,10 +298,10 @@ def _align(
             last = gains(settings, whole)
             lost = seam.lost(device, layers, fields, pairs, strict, clipped.excess, grid)
             highlights.regain(device, layers, fields, further, whole, grid)
-            owner = seam.cut(device, layers, fields, residual, whole, masks, grid, lost)
+            owner = seam.cut(device, layers, fields, residual, whole, masks, grid, once, lost)
             membrane.stretch(device, layers, fields, owner, whole, masks, grid, seam.seam_grid(grid))
             reaches = [geometry.reach(device, *one, grid) for one in zip(layers, fields, strict=True)]
-            unlike = seam.unlike(residual, whole, once, grid)
+            unlike = Unlike.of(seam.seam_grid(grid), residual.mean, whole, once)
         else:
             last = hoped or gains(settings, None)
         return _Aligned(fields, reaches, last.result(), whole, unlike)

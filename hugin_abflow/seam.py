@@ -33,7 +33,6 @@ import scipy
 
 from hugin_abflow.coefficient import Masks, on_cells
 from hugin_abflow.colour import Correction, clipping
-from hugin_abflow.content import Unlike
 from hugin_abflow.geometry import Pair
 from hugin_abflow.labelling import Graph, energy, least
 from hugin_abflow.layer import Box
@@ -49,8 +48,6 @@ _SIGMA, _REACH = 1.0, 3
 # Residual of low frequencies, of full scale, that makes a region one layer's, and that of its outskirts.
 # Where that of all frequencies reaches the first there are outskirts as well.
 _STRONG, _WEAK = 0.2, 0.045
-# Residual of low frequencies up to which layers surely show the same, and from which on surely not.
-_ALIKE, _UNLIKE = 0.06, 0.15
 # Strong cells, of the equator's size, that a region has at least: fewer are an edge that is a pixel off.
 _LEAST = 6.0
 # Price of a cut, in cells: what is cut off must be favoured by the softmax over this depth, or more where t
@@ -65,8 +62,9 @@ _FORBIDDEN = 1e4
 # Price of a cell that is clipped, and is not in another layer, as of a residual that nothing favours; and by
 # how much, of full scale, that may be darker: what is white here and darker there is something else.
 _CLIPPED, _DARKER = 0.5, 0.05
-# How much more a region may cost if that shows things once and whole, from a layer that has most of it.
-_ONCE, _MOSTLY = 2.0, 0.5
+# How much more a region may cost if that shows things once and whole, from a layer that has most of it: where
+# flow tells that something moved, and anywhere.
+_ONCE, _WHOLE, _MOSTLY = 2.0, 1.5, 0.5
 
 
 Cells = npt.NDArray[np.bool_]  # (height, width) on the seam grid
@@ -145,13 +143,6 @@ def lost(
     return prices
 
 
-def unlike(residual: Residuals, whole: Cells, once: Cells | None, grid: Grid) -> Unlike:
-    """How surely layers show different things, in the regions `whole`, each of one layer, and in `once`."""
-    other = whole * np.clip((residual.mean - _ALIKE) / (_UNLIKE - _ALIKE), 0, 1)
-    moved = np.zeros(whole.shape, bool) if once is None else once
-    return Unlike(seam_grid(grid), moved.astype(np.float32), other.astype(np.float32))
-
-
 def regions(residual: Residuals, grid: Grid, aligned: bool = True, once: Cells | None = None) -> Cells:
     """Where layers differ too much to be blended, of the same shape; unless they are aligned, texture differs
     everywhere and tells nothing. once: cells that belong to a region whatever the layers show there.
@@ -169,16 +160,18 @@ def cut(
     whole: Cells,
     masks: Masks,
     grid: Grid,
+    once: Cells | None = None,
     lost: Prices | None = None,
 ) -> npt.NDArray[np.intp]:
     """Give each cell of the regions `whole` to one layer: the others lose their colour weight there
-    (fields[...].w, in place). A region is cut in two only if that is much better.
-    lost: what each layer costs in a cell besides.
+    (fields[...].w, in place). A region is cut in two only if that is clearly better, one that has cells of
+    `once` if it is much better. lost: what each layer costs in a cell besides.
 
     Returns the layer of each cell, (height, width) on the seam grid, elsewhere that which weighs most.
     """
     cells = seam_grid(grid)
-    owner = _owners(layers, fields, residual, whole, masks, grid, cells, _CUT, True, lost)
+    dearer = np.full(whole.shape, _WHOLE) if once is None else np.where(once, _ONCE, _WHOLE)
+    owner = _owners(layers, fields, residual, whole, masks, grid, cells, _CUT, dearer, lost)
     yields = [_soften((whole & (owner != k)).astype(np.float32), cells.wraps) for k in range(len(layers))]
     _yield(device, layers, fields, yields, grid, cells)
     return owner
@@ -201,7 +194,7 @@ def divide(
         told = found[..., 4] > 0
         square[its] = np.maximum(square[its], np.where(told, _SHORTER + found[..., 3], 0))
     whole = square > 0
-    owner = _owners(layers, fields, Residuals(square, square), whole, masks, grid, cells, _FINE_CUT, False)
+    owner = _owners(layers, fields, Residuals(square, square), whole, masks, grid, cells, _FINE_CUT)
     yields = [(whole & (owner != k)).astype(np.float32) for k in range(len(layers))]
     _yield(device, layers, fields, yields, grid, cells)
 
@@ -215,11 +208,11 @@ def _owners(
     grid: Grid,
     cells: Grid,
     cut_price: float,
-    once: bool,
+    dearer: npt.NDArray[np.float64] | None = None,
     lost: Prices | None = None,
 ) -> npt.NDArray[np.intp]:
     """The layer of each cell, (height, width): in the regions `whole` the one it is taken from, elsewhere the
-    one that the softmax favours, -1 where none is. cut_price, once: see `label`.
+    one that the softmax favours, -1 where none is. dearer: see `label`, of a region the most.
     """
     cover = on_cells(masks.host, cells, np.logical_and)
     residual = _completed(residual, cover, cells.wraps)
@@ -230,8 +223,9 @@ def _owners(
     owner = np.where(cover.any(0), (shares * cover).argmax(0), -1)
     for region in _connected(whole, cells.wraps):
         rows, columns = np.nonzero(region)
+        more = 0.0 if dearer is None else float(dearer[region].max())
         owner[rows, columns] = label(
-            rows, columns, residual, shares, cover, cells.wraps, cut_price, once, lost
+            rows, columns, residual, shares, cover, cells.wraps, cut_price, more, lost
         )
     return owner
 
@@ -370,7 +364,7 @@ def label(
     cover: npt.NDArray[np.bool_],
     wraps: bool,
     cut_price: float = _CUT,
-    once: bool = False,
+    dearer: float = 0.0,
     lost: Prices | None = None,
 ) -> npt.NDArray[np.intp]:
     """Which layer each cell (rows, columns) of a region is taken from: the least energy found.
@@ -378,8 +372,9 @@ def label(
     shares, cover: shares of the softmax and coverage (layers, height, width).
     cut_price: of a cut, in cells.
     lost: what each layer costs in a cell besides (layers, height, width).
-    once: one layer is taken, as far as it goes, if that is not much worse. Somebody may stand there twice,
-    and a cut between his two places, or where these overlap, is as cheap as one beside him.
+    dearer: one layer is taken, as far as it goes, if that costs no more than so many times as much. Somebody
+    may stand there twice, and a cut between his two places, or where these overlap, is as cheap as one
+    beside him.
     """
     candidates = np.flatnonzero(cover[:, rows, columns].any(1))
     if candidates.size < 2:
@@ -403,11 +398,11 @@ def label(
     cuts = cut_price * (rough[first] + rough[second]) / 2
     graph = Graph(rows, columns, price, present, first, second, cuts)
     labels = least(graph)
-    if once:
+    if dearer:
         somewhere = replace(graph, price=np.where(present.any(0), price, 0.0))
         alone = [np.where(one, k, labels) for k, one in enumerate(present) if one.mean() > _MOSTLY]
         energies = [energy(somewhere, one) for one in (labels, *alone)]
-        if alone and min(energies[1:]) <= _ONCE * energies[0]:
+        if alone and min(energies[1:]) <= dearer * energies[0]:
             labels = alone[int(np.argmin(energies[1:]))]
     return candidates[labels]
 

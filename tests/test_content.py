@@ -73,6 +73,21 @@ def test_kernels_equal_their_twins(device: Device, name: str, part: int, shoulde
 
 # What is told
 
+
+def test_what_surely_differs_in_a_region_is_unlike() -> None:
+    """And what moved, anywhere."""
+    grid = plane(4, 2)
+    residual = np.array([[0.05, 0.105, 0.3, 0.3], [0.0, 0.0, 0.0, 0.0]])
+    whole = np.array([[True, True, True, False], [True] * 4])
+    moved = np.zeros((2, 4), bool)
+    moved[:, 3] = True
+    found = Unlike.of(grid, residual, whole, moved)
+    assert found.grid == grid
+    assert found.other == pytest.approx(np.array([[0, 0.5, 1, 0], [0] * 4]))
+    assert np.array_equal(found.moved, moved)
+    assert not Unlike.of(grid, residual, whole, None).moved.any()
+
+
 WIDTH, HEIGHT = 160, 64
 
 
@@ -180,7 +195,7 @@ def test_where_nothing_tells_layers_do_not_differ(device: Device) -> None:
 def test_somebody_who_is_cut_out_leaves_less_of_a_shade(monkeypatch: pytest.MonkeyPatch) -> None:
     """Red, before a green wall; he walked, is cut between his places, and the photos have different light.
     There the wall is nearly as it would be without him."""
-    monkeypatch.setattr(seam, "_ONCE", 1.0)  # else he would be taken from one photo
+    monkeypatch.setattr(seam, "_WHOLE", 1.0)  # else he would be taken from one photo
     width, height = 401, 151
     noise = ndimage.gaussian_filter(np.random.default_rng(5).normal(size=(height, width, 1)), (2, 2, 0))
     wall = np.clip((0.3, 0.5, 0.4) + 0.05 * noise / noise.std(), 0, 1)
@@ -203,6 +218,6 @@ def test_somebody_who_is_cut_out_leaves_less_of_a_shade(monkeypatch: pytest.Monk
         return float(np.abs(panorama(120, 190) - clean)[60:140, 155:185].mean())
 
     found = shade()
-    monkeypatch.setattr(seam, "unlike", lambda *given: None)
+    monkeypatch.setattr(Unlike, "of", lambda *given: None)
     assert found < 0.5 * shade()
     assert found < 3

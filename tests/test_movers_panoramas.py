@@ -129,26 +129,26 @@ def test_what_is_beside_him_would_be_bent(monkeypatch: pytest.MonkeyPatch) -> No
 
 
 def test_his_place_is_known_wherever_it_matters(device: Device, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Where regions are looked for, and where low frequencies are blended: the same cells, which he fills in
-    one photo or the other."""
+    """Where regions are looked for and cut, and where low frequencies are blended: the same cells, which he
+    fills in one photo or the other."""
     one, seen = shoot(PERSON), {}
 
     def listen(module, name: str) -> None:
         original = getattr(module, name)
 
         def remember(*given, **named):
-            last = named.get("once", given[-1])
+            last = given[-2] if name == "cut" else named.get("once", given[-1])
             seen[name] = last.moved > 0 if isinstance(last, Unlike) else last
             return original(*given, **named)
 
         monkeypatch.setattr(module, name, remember)
 
-    for module, name in ((seam, "regions"), (multiband, "offsets")):
+    for module, name in ((seam, "regions"), (seam, "cut"), (multiband, "offsets")):
         listen(module, name)
     joint.prepare(device, one.layers, CANVAS, Settings(), silent)
-    cells = seen["regions"]
+    cells = seen["cut"]
     assert cells.dtype == bool and all(np.array_equal(cells, its) for its in seen.values())
-    assert len(seen) == 2
+    assert len(seen) == 3
     rows, columns = np.nonzero(one.person[0] | one.person[1])
     top = min(int(layer.box.top) for layer in one.layers)
     size = (one.layers[0].box.bottom - top) / cells.shape[0]

@@ -41,7 +41,7 @@ def test_what_moved_is_shown_once() -> None:
             problem = (*everywhere(), residual, shares[turned], cover, wraps)
             found = seam.label(*problem).reshape(12, 30)
             assert (found[:, 4:13] == 1 - best).all() and (found[:, 17:26] == best).all()
-            assert (seam.label(*problem, once=True) == best).all()
+            assert (seam.label(*problem, dearer=seam._ONCE) == best).all()
 
 
 def test_a_cut_that_is_much_better_is_kept() -> None:
@@ -49,7 +49,7 @@ def test_a_cut_that_is_much_better_is_kept() -> None:
     residual, shares = twice(0.45)
     cover = np.ones((2, 12, 30), bool)
     cut = seam.label(*everywhere(), residual, shares, cover, False)
-    once = seam.label(*everywhere(), residual, shares, cover, False, once=True)
+    once = seam.label(*everywhere(), residual, shares, cover, False, dearer=seam._ONCE)
     problem = (*everywhere(), residual, shares, cover, False)
     least, *alone = energies(np.stack([cut, 0 * cut, 0 * cut + 1]), *problem)
     assert min(alone) > seam._ONCE * least
@@ -61,7 +61,7 @@ def test_a_cut_that_is_much_better_is_kept() -> None:
 def test_one_layer_of_two_is_taken_if_it_costs_no_more_than_twice_as_much(problem) -> None:
     """One that has more than half of the region, as far as it goes; the other one where it does not."""
     rows, columns, cover = problem[0], problem[1], problem[4]
-    found, cut = seam.label(*problem, once=True), seam.label(*problem)
+    found, cut = seam.label(*problem, dearer=seam._ONCE), seam.label(*problem)
     assert cover[found, rows, columns].all()
     there = cover[:, rows, columns]
     if not there.any(1).all():
@@ -85,7 +85,9 @@ def test_cells_that_no_layer_covers_cost_nothing() -> None:
     residual, shares = twice(0.45)
     cover = np.ones((2, 12, 30), bool)
     cover[:, 11, 20:] = False
-    cut, once = (seam.label(*everywhere(), residual, shares, cover, False, once=o) for o in (False, True))
+    cut, once = (
+        seam.label(*everywhere(), residual, shares, cover, False, dearer=more) for more in (0, seam._ONCE)
+    )
     shown = cover.any(0).ravel()
     assert np.array_equal(cut[shown], once[shown]) and 0 < cut[shown].mean() < 1
 
@@ -98,7 +100,7 @@ def test_where_the_one_layer_ends_another_goes_on() -> None:
     cover = np.ones((3, 12, 30), bool)
     cover[1, :, :3] = False
     problem = (*everywhere(), residual, shares, cover, False)
-    cut, found = (seam.label(*problem, once=once).reshape(12, 30) for once in (False, True))
+    cut, found = (seam.label(*problem, dearer=more).reshape(12, 30) for more in (0, seam._ONCE))
     assert np.array_equal(found[:, :3], cut[:, :3]) and (found[:, 3:] == 1).all()
     assert (cut[:, 4:13] == 0).all()
 
@@ -109,7 +111,7 @@ def test_a_third_layer_in_a_corner_does_not_show_what_moved_twice() -> None:
     shares = np.concatenate([shares, 0.1 * shares[:1]])
     cover = np.ones((3, 12, 30), bool)
     cover[2, :, 2:] = False
-    found = seam.label(*everywhere(), residual, shares, cover, False, once=True).reshape(12, 30)
+    found = seam.label(*everywhere(), residual, shares, cover, False, dearer=seam._ONCE).reshape(12, 30)
     assert (found[:, 4:13] == 1).all() and (found[:, 17:26] == 1).all()
 
 
@@ -145,7 +147,7 @@ def owners(told: np.ndarray, residual: np.ndarray, turn: int = 0) -> np.ndarray:
         [SimpleNamespace(box=(0, 0, 240, 96))] * 2,
         [SimpleNamespace(get=lambda field=field: field) for field in fields],
         seam.Residuals(residual, residual, told), region, SimpleNamespace(host=covers), grid,
-        seam.seam_grid(grid), seam._CUT, True,
+        seam.seam_grid(grid), seam._CUT, seam._ONCE * region,
     )  # fmt: skip
     return np.roll(found, -turn, 1)
 
@@ -156,7 +158,7 @@ def test_a_region_comes_from_one_layer_and_an_overlap_from_both(
 ) -> None:
     """Of layers that are aligned; without flow, where all of an overlap is a region, it is cut where it shows
     least."""
-    monkeypatch.setattr(seam, "_ONCE", np.inf)
+    monkeypatch.setattr(seam, "_WHOLE", np.inf)
     grid = plane(240, 96)
     pictures = np.full((2, 96, 240, 4), 0.5, np.float32)
     pictures[..., 3] = 1
