@@ -51,8 +51,8 @@ class Unlike:
         whole: npt.NDArray[np.bool_],
         moved: npt.NDArray[np.bool_] | None,
     ) -> Unlike:
-        """By what low frequencies of aligned layers differ, of full scale, in regions that are each taken from
-        one layer, `whole`; all (height, width) on `grid`.
+        """By what low frequencies of aligned layers differ, of full scale, in regions `whole`, each of which is
+        taken from one layer; all (height, width) on `grid`.
         """
         other = whole * np.clip((residual - _ALIKE) / (_UNLIKE - _ALIKE), 0, 1)
         told = np.zeros(whole.shape, bool) if moved is None else moved
