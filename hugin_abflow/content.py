@@ -51,7 +51,7 @@ class Unlike:
         whole: npt.NDArray[np.bool_],
         moved: npt.NDArray[np.bool_] | None,
     ) -> Unlike:
-        """By what low frequencies of aligned layers differ, of full scale, in regions `whole`, each of which is
+        """By what low frequencies of aligned layers differ, of full scale, in regions `whole`, each of them
         taken from one layer; all (height, width) on `grid`.
         """
         other = whole * np.clip((residual - _ALIKE) / (_UNLIKE - _ALIKE), 0, 1)
