@@ -4,6 +4,8 @@ Somebody whom one layer shows, in a place that is taken from another, is no diff
 over wide bands he would leave his colours beside him, as a shade on what is behind. What the layers would
 differ by if both showed that is told by places around, where they do: by the nearest that tell enough.
 
+Differences that are completed so need not sum to nothing by their weights, as others do.
+
 What is nearly black may be anything, at the rim of a dark lens above all, and is left as it is, unless flow
 tells that it moved.
 """
@@ -16,8 +18,9 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
+from hugin_abflow.layer import Box
 from hugin_abflow.opencl import Buffer, Device
-from hugin_abflow.working import Grid, Place
+from hugin_abflow.working import Grid, Place, cells_under
 
 # Residuals up to which layers surely show the same, and from which on surely not.
 _ALIKE, _UNLIKE = 0.06, 0.15
@@ -35,8 +38,8 @@ Values = npt.NDArray[np.float32]
 class Unlike:
     """How surely layers show different things, both float32 (height, width) on `grid`, 0..1.
 
-    moved   by flow: what is taken from one layer, whole, though it matches.
-    other   by what differs when layers are aligned.
+    moved   what flow tells of, whatever the layers show.
+    other   what differs though layers are aligned, unless it is nearly black.
     """
 
     grid: Grid
@@ -74,6 +77,8 @@ def complete(
     difference  float32 (height, width, 4) on a box of `grid`: colour, valid. share: its own of all weights.
     mean        float32 (height, width, 4) on all of the grid. shoulder: of the exposure scale, 0: of floats.
     """
+    if not _any(unlike, box, grid):  # of many layers nearly all
+        return
     cells, sums = unlike.grid, device.empty((*unlike.grid.shape, 4))
     moved, other = device.upload(unlike.moved), device.upload(unlike.other)
     device.run(
@@ -87,8 +92,19 @@ def complete(
     )  # fmt: skip
 
 
+def _any(unlike: Unlike, box: Place, grid: Grid) -> bool:
+    """Whether anything is unlike on a box, or in the cells beside, which are read between cells."""
+    left, top, width, height = box
+    cells = unlike.grid
+    its = cells_under(Box(left, top, left + width, top + height), grid, cells)
+    rows, columns = np.arange(its.top - 1, its.bottom + 1), np.arange(its.left - 1, its.right + 1)
+    columns = columns % cells.width if cells.wraps else columns.clip(0, cells.width - 1)
+    there = np.ix_(rows.clip(0, cells.height - 1), columns)
+    return bool(unlike.moved[there].any() or unlike.other[there].any())
+
+
 def _told(sums: Values, wraps: bool) -> Values:
-    """What layers differ by, (height, width, 4), everywhere, from sums of `content_gather`."""
+    """What layers differ by, (height, width, 4), everywhere: from sums of `content_gather`."""
     result = np.zeros_like(sums)
     for sigma in _SIGMAS:
         by = int(_REACH * sigma)

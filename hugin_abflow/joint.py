@@ -299,9 +299,11 @@ def _align(
             lost = seam.lost(device, layers, fields, pairs, strict, clipped.excess, grid)
             highlights.regain(device, layers, fields, further, whole, grid)
             owner = seam.cut(device, layers, fields, residual, whole, masks, grid, once, lost)
-            membrane.stretch(device, layers, fields, owner, whole, masks, grid, seam.seam_grid(grid))
-            reaches = [geometry.reach(device, *one, grid) for one in zip(layers, fields, strict=True)]
-            unlike = Unlike.of(seam.seam_grid(grid), residual.mean, whole, once)
+            cells = seam.seam_grid(grid)
+            moved = membrane.stretch(device, layers, fields, owner, whole, masks, grid, cells)
+            for k in (k for k, one in enumerate(moved) if one):
+                reaches[k] = geometry.reach(device, layers[k], fields[k], grid)
+            unlike = Unlike.of(cells, residual.mean, whole, once)
         else:
             last = hoped or gains(settings, None)
         return _Aligned(fields, reaches, last.result(), whole, unlike)

@@ -20,11 +20,11 @@ from hugin_abflow.working import Grid, WorkingLayer
 
 # Cells along a cut in which layers stay as flow has brought them together.
 _HELD = 2
-# So little holds every cell where it is: what nothing else holds is as its photo shows it.
+# So little holds every cell where its photo shows it: there it is where nothing else holds it.
 _LOOSE = 1e-9
 
 Cells = npt.NDArray[np.bool_]  # (height, width)
-Values = npt.NDArray[np.float64]  # (height, width, 3)
+Values = npt.NDArray[np.float64]  # (height, width, ...)
 
 
 def stretch(
@@ -36,39 +36,60 @@ def stretch(
     masks: Masks,
     grid: Grid,
     cells: Grid,
-) -> None:
-    """Make displacements (fields[...].xyz, in place) smooth in regions of cells.
+) -> list[bool]:
+    """Make displacements (fields[...].xyz, in place) smooth in regions of cells; what nothing holds is not
+    displaced at all. Returns which layers have changed.
 
     owner   (height, width) on `cells`: the layer that each cell is taken from.
     whole   the regions in which layers differ.
     """
     cover = on_cells(masks.host, cells, np.logical_or)
+    changed = []
     for k, (layer, field) in enumerate(zip(layers, fields, strict=True)):
-        others = whole & (owner != k) & cover[k]
-        inner = whole & (owner == k) & ~_grown(others, _HELD, cells.wraps)
-        if not inner.any():
-            continue
-        found = device.empty((*cells.shape, 4))
-        device.run(
-            "membrane", "membrane_mean", cells.border[:2],
-            layer.pixels, field, layer.box, grid.border, cells.border, found,
-        )  # fmt: skip
-        means = found.get().astype(np.float64)
-        known = means[..., 3] > 0
-        free = inner & known
-        if not free.any():
-            continue
-        modes = ("nearest", "wrap" if cells.wraps else "nearest")
-        around, its = (scipy.ndimage.uniform_filter(one * 1.0, 3, mode=modes) for one in (free, known))
-        far = free * np.clip(
-            2 * around / np.maximum(its, 0.1) - 1, 0, 1
-        )  # nothing at outlines, all a cell away
-        smooth = _harmonic(means[..., :3], free, known, cells)
-        told = np.concatenate([far[..., None] * smooth, far[..., None]], -1)
-        device.run(
-            "membrane", "membrane_stretch", layer.box[2:], field, layer.box, grid.border,
-            device.upload(np.ascontiguousarray(told, np.float32)), cells.border,
-        )  # fmt: skip
+        its = whole & (owner == k)
+        inner = its & ~_held(k, owner, whole, cover, cells.wraps) if its.any() else its
+        changed.append(bool(inner.any()) and _stretch(device, layer, field, inner, grid, cells))
+    return changed
+
+
+def _stretch(
+    device: Device, layer: WorkingLayer, field: Buffer, inner: Cells, grid: Grid, cells: Grid
+) -> bool:
+    """The same of one layer, in the cells `inner`; whether it shows anything there."""
+    found = device.empty((*cells.shape, 4))
+    device.run(
+        "membrane", "membrane_mean", cells.border[:2],
+        layer.pixels, field, layer.box, grid.border, cells.border, found,
+    )  # fmt: skip
+    means = found.get().astype(np.float64)
+    known = means[..., 3] > 0
+    free = inner & known
+    if not free.any():
+        return False
+    around, all_of_it = (_smoothed(one * 1.0, cells.wraps) for one in (free, known))
+    # a third at a straight outline, all a cell from there; what is beyond the layer is no outline
+    far = (free * np.clip(2 * around / np.maximum(all_of_it, 0.1) - 1, 0, 1))[..., None]
+    told = np.concatenate([far * _harmonic(means[..., :3], free, known, cells), far], -1)
+    # beside the layer as in it: its last pixels are read between
+    beside = _smoothed(told, cells.wraps) / np.maximum(around, 0.1)[..., None]
+    told = np.where(known[..., None], told, beside)
+    device.run(
+        "membrane", "membrane_stretch", layer.box[2:], field, layer.box, grid.border,
+        device.upload(np.ascontiguousarray(told, np.float32)), cells.border,
+    )  # fmt: skip
+    return True
+
+
+def _held(k: int, owner: npt.NDArray[np.intp], whole: Cells, cover: Cells, wraps: bool) -> Cells:
+    """Cells along cuts of layer k, in or beside what it and others show. cover: (layers, height, width)."""
+    both = cover[k] & (np.delete(cover, k, 0).any(0))
+    return _grown(whole & (owner != k) & _grown(both, 1, wraps), _HELD, wraps)
+
+
+def _smoothed(values: npt.NDArray[np.floating], wraps: bool) -> Values:
+    """The means of 3 x 3 cells."""
+    modes = ("nearest", "wrap" if wraps else "nearest")
+    return np.asarray(scipy.ndimage.uniform_filter(values, 3, mode=modes, axes=(0, 1)))
 
 
 def _grown(mask: Cells, by: int, wraps: bool) -> Cells:

@@ -68,7 +68,7 @@ def offsets(
 ) -> Offsets:
     """Those that make of the weighted mean of the layers a multi-band blend. fields: of geometry.py.
 
-    unlike: where layers show different things, which are not blended; None: nowhere.
+    unlike: where layers show different things: what they differ by is told from beside; None: nowhere.
     """
     grids = levels(grid)
     if len(grids) < 2:

@@ -8,7 +8,7 @@ borders, where they show least. This is a labelling of least energy,
     sum_cells (r (1 - s_k) + h e_k)  +  sum_neighbours c (t + t') / 2 [k != k']  +  sum_borders c t
 
 with r the residual of low frequencies, t that of all, s_k the share of the softmax, c the price of a cut
-(labelling.py), and h that of what layer k shows clipped and another one not, though as bright, e_k. A cut
+(labelling.py), and h that of what layer k clips of what another one, as bright, still shows, e_k. A cut
 through somebody who is as bright as what is behind shows in t alone. Regions keep to themselves: elsewhere
 the softmax stays as it is, and the transition lies where the layers agree. What is clipped in one photo only
 is no such difference: it is brighter in the other by an unknown amount, and changes over best where it does
@@ -126,7 +126,7 @@ def lost(
     """What it costs to take what one layer shows clipped, and another one as bright, but not clipped; None:
     nothing anywhere.
 
-    clipped     by how much more each layer is clipped than another (`highlights.Clipped`).
+    clipped     how much each layer clips of what another one shows (`highlights.Clipped`).
     """
     if not clipped.any():
         return None
@@ -167,7 +167,8 @@ def cut(
     (fields[...].w, in place). A region is cut in two only if that is clearly better, one that has cells of
     `once` if it is much better. lost: what each layer costs in a cell besides.
 
-    Returns the layer of each cell, (height, width) on the seam grid, elsewhere that which weighs most.
+    Returns the layer of each cell, (height, width) on the seam grid, elsewhere that which weighs most, -1
+    where none covers it.
     """
     cells = seam_grid(grid)
     dearer = np.full(whole.shape, _WHOLE) if once is None else np.where(once, _ONCE, _WHOLE)
@@ -223,7 +224,7 @@ def _owners(
     owner = np.where(cover.any(0), (shares * cover).argmax(0), -1)
     for region in _connected(whole, cells.wraps):
         rows, columns = np.nonzero(region)
-        more = 0.0 if dearer is None else float(dearer[region].max())
+        more = None if dearer is None else float(dearer[region].max())
         owner[rows, columns] = label(
             rows, columns, residual, shares, cover, cells.wraps, cut_price, more, lost
         )
@@ -364,7 +365,7 @@ def label(
     cover: npt.NDArray[np.bool_],
     wraps: bool,
     cut_price: float = _CUT,
-    dearer: float = 0.0,
+    dearer: float | None = None,
     lost: Prices | None = None,
 ) -> npt.NDArray[np.intp]:
     """Which layer each cell (rows, columns) of a region is taken from: the least energy found.
@@ -372,9 +373,9 @@ def label(
     shares, cover: shares of the softmax and coverage (layers, height, width).
     cut_price: of a cut, in cells.
     lost: what each layer costs in a cell besides (layers, height, width).
-    dearer: one layer is taken, as far as it goes, if that costs no more than so many times as much. Somebody
-    may stand there twice, and a cut between his two places, or where these overlap, is as cheap as one
-    beside him.
+    dearer: one layer is taken, as far as it goes, if that costs no more than so many times as much (None: it
+    is not asked). Somebody may stand there twice, and a cut between his two places, or where these overlap,
+    is as cheap as one beside him.
     """
     candidates = np.flatnonzero(cover[:, rows, columns].any(1))
     if candidates.size < 2:
@@ -398,7 +399,7 @@ def label(
     cuts = cut_price * (rough[first] + rough[second]) / 2
     graph = Graph(rows, columns, price, present, first, second, cuts)
     labels = least(graph)
-    if dearer:
+    if dearer is not None:
         somewhere = replace(graph, price=np.where(present.any(0), price, 0.0))
         alone = [np.where(one, k, labels) for k, one in enumerate(present) if one.mean() > _MOSTLY]
         energies = [energy(somewhere, one) for one in (labels, *alone)]

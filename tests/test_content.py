@@ -88,6 +88,18 @@ def test_what_surely_differs_in_a_region_is_unlike() -> None:
     assert not Unlike.of(grid, residual, whole, None).moved.any()
 
 
+@pytest.mark.parametrize("wraps", [False, True])
+def test_nothing_is_done_where_nothing_is_unlike(wraps: bool) -> None:
+    """Nor in the cells beside, across the border too."""
+    grid = plane(80, 40, wraps)
+    for column, seen in ((0, True), (4, True), (5, False), (19, wraps), (18, False)):
+        one = np.zeros((10, 20), np.float32)
+        one[9, column] = 0.1
+        for unlike in (Unlike(grid.coarser(4), one, 0 * one), Unlike(grid.coarser(4), 0 * one, one)):
+            assert content._any(unlike, (0, 20, 13, 20), grid) == seen
+            assert not content._any(unlike, (0, 0, 13, 30), grid)
+
+
 WIDTH, HEIGHT = 160, 64
 
 

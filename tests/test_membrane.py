@@ -91,38 +91,69 @@ CELLS = (12, 30)
 
 def stretched(
     device: Device, field: Array, owner: Array, whole: Array, covers: list[Array], wraps: bool = False
-) -> list[Array]:
-    """Displacements (height, width) along x of layers that cover some cells, all by the same field before."""
+) -> tuple[list[bool], Array, Array]:
+    """Which of two layers have changed, and displacements (height, width) along x of both, by the same field
+    before. covers: of cells or of pixels."""
     grid: Grid = plane(WIDTH, HEIGHT, wraps)
     layers, fields = [], []
     for cover in covers:
-        pixels = np.ones((HEIGHT, WIDTH, 4), np.float32) * np.kron(cover, np.ones((8, 8)))[..., None]
-        layers.append(on_device(device, pixels.astype(np.float32)))
+        mask = cover if cover.shape == (HEIGHT, WIDTH) else np.kron(cover, np.ones((8, 8), bool))
+        layers.append(on_device(device, np.ones((HEIGHT, WIDTH, 4), np.float32) * mask[..., None]))
         values = np.zeros((HEIGHT, WIDTH, 4), np.float32)
         values[..., 0], values[..., 3] = field, 0.5
         fields.append(device.upload(values))
     masks = coefficient.masks(device, layers, grid)
-    membrane.stretch(device, layers, fields, owner, whole, masks, grid, grid.coarser(8))
+    changed = membrane.stretch(device, layers, fields, owner, whole, masks, grid, grid.coarser(8))
     assert all((its.get()[..., 3] == 0.5).all() for its in fields)
-    return [its.get()[..., 0] for its in fields]
+    first, second = (its.get()[..., 0] for its in fields)
+    return changed, first, second
 
 
-def test_what_is_torn_is_straightened_and_nothing_else(device: Device) -> None:
-    """A slope with noise on it, in a region that comes from the first of two layers."""
-    slope = np.broadcast_to(0.02 * np.arange(WIDTH), (HEIGHT, WIDTH))
-    whole = np.zeros(CELLS, bool)
+@pytest.mark.parametrize("turn", [0, 15, 22])
+def test_what_is_torn_is_straightened_and_nothing_else(device: Device, turn: int) -> None:
+    """A wave with noise on it, in a region that comes from the first of two layers; it has a hole, and lies
+    across the border as elsewhere."""
+    wave = np.broadcast_to(2 * np.sin(np.arange(WIDTH) * 2 * np.pi / WIDTH), (HEIGHT, WIDTH))
+    whole, cover = np.zeros(CELLS, bool), np.ones(CELLS, bool)
     whole[3:9, 8:22] = True
+    cover[5, 14] = False
     pixels = np.kron(whole, np.ones((8, 8), bool))
-    noise = (
-        3 * np.random.default_rng(1).normal(size=slope.shape) * ndimage.binary_erosion(pixels, iterations=2)
+    noise = np.random.default_rng(1).normal(size=wave.shape)
+    before = (wave + 3 * noise * ndimage.binary_erosion(pixels, iterations=2)).astype(np.float32)
+    turned = [np.roll(one, turn, 1) for one in (whole, cover)]
+    moved, first, second = stretched(
+        device, np.roll(before, 8 * turn, 1), np.zeros(CELLS, int), turned[0],
+        [turned[1], np.ones(CELLS, bool)], wraps=True,
+    )  # fmt: skip
+    assert moved == [True, False]
+    first, second = (np.roll(one, -8 * turn, 1) for one in (first, second))
+    _, straight, _ = stretched(
+        device, before, np.zeros(CELLS, int), whole, [cover, np.ones(CELLS, bool)], wraps=True
     )
-    first, second = stretched(device, slope + noise, np.zeros(CELLS, int), whole, [np.ones(CELLS, bool)] * 2)
-    inside = ndimage.binary_erosion(pixels, iterations=12)
-    assert np.abs(first - slope)[inside].max() < 0.1
-    assert np.abs(noise[inside]).max() > 8
+    assert_close(first, straight, 10 * SUM)
+    inside = ndimage.binary_erosion(pixels, iterations=12) & np.kron(cover, np.ones((8, 8), bool))
+    assert np.abs(first - wave)[inside].max() < 0.5
+    assert np.abs(before - wave)[inside].max() > 8
     beside = ~ndimage.binary_dilation(pixels, iterations=4)  # between cells, half of one
-    assert np.array_equal(first[beside], (slope + noise).astype(np.float32)[beside])
-    assert np.array_equal(second, (slope + noise).astype(np.float32))  # nothing is taken from it
+    assert np.array_equal(first[beside], before[beside])
+    assert np.array_equal(second, before)  # nothing is taken from it
+
+
+def test_a_layers_border_is_a_cut_wherever_it_lies_among_cells(device: Device) -> None:
+    """The first layer ends inside the region, and another goes on."""
+    whole = np.zeros(CELLS, bool)
+    whole[:, 4:26] = True
+    owner = np.broadcast_to(np.where(np.arange(30) >= 15, 1, 0), CELLS)
+    field = np.random.default_rng(3).normal(size=(HEIGHT, WIDTH)).astype(np.float32)
+    found = []
+    for end in range(120, 128):
+        covers = [np.ones((HEIGHT, WIDTH), bool), np.ones((HEIGHT, WIDTH), bool)]
+        covers[0][:, end:] = False
+        _, first, _ = stretched(device, field, owner, whole, covers)
+        assert np.array_equal(first[:, 108:120], field[:, 108:120])
+        found.append(first[:, :100])
+    assert np.abs(found[0][:, 60:84]).max() < 0.5
+    assert all(np.array_equal(one, found[0]) for one in found)
 
 
 @pytest.mark.parametrize("turn", [0, 15])
@@ -135,7 +166,10 @@ def test_along_cuts_layers_stay_where_they_meet(device: Device, turn: int) -> No
     covers[1][6:, :15] = covers[0][6:, 15:] = False
     field = np.random.default_rng(2).normal(size=(HEIGHT, WIDTH)).astype(np.float32)
     turned = [np.roll(one, turn, 1) for one in (whole, owner, *covers)]
-    found = stretched(device, np.roll(field, 8 * turn, 1), turned[1], turned[0], turned[2:], wraps=True)
+    changed, *found = stretched(
+        device, np.roll(field, 8 * turn, 1), turned[1], turned[0], turned[2:], wraps=True
+    )
+    assert changed == [True, True]
     for k, one in enumerate(found):
         one = np.roll(one, -8 * turn, 1)
         meet = np.s_[:40, 108:120] if k == 0 else np.s_[:40, 120:132]
@@ -148,7 +182,9 @@ def test_nothing_is_held_and_nothing_known(device: Device) -> None:
     """A layer that is all in one region is not moved; one that has no pixel in it is left alone."""
     everywhere = np.ones(CELLS, bool)
     field = np.ones((HEIGHT, WIDTH), np.float32)
-    first, second = stretched(device, field, np.zeros(CELLS, int), everywhere, [everywhere, ~everywhere])
+    covers = [everywhere, ~everywhere]
+    changed, first, second = stretched(device, field, np.zeros(CELLS, int), everywhere, covers)
+    assert changed == [True, False]
     assert np.abs(first).max() < 1e-3
     assert np.array_equal(second, field)
 
@@ -156,19 +192,21 @@ def test_nothing_is_held_and_nothing_known(device: Device) -> None:
 def test_rows_that_are_read_are_those_that_are_then_shown(
     device: Device, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """`reach` tells them, of displacements as they are at last."""
-    shoot, kept, seen = movers.shoot(movers.PERSON), [], []
+    """`reach` tells them, of displacements as they are at last: here of more than they would be."""
+    shoot, kept, told = movers.shoot(movers.PERSON), [], []
     read, stretch = joint.reading.read, membrane.stretch
 
     def watched(device, layers, fields, *others):
-        before = [field.get() for field in fields]
-        stretch(device, layers, fields, *others)
-        seen.append(any((field.get() != one).any() for field, one in zip(fields, before, strict=True)))
+        told.append(stretch(device, layers, fields, *others))
+        for field, changed in zip(fields, told[0], strict=True):
+            field.set(field.get() * np.float32([3, 3, 3, 1] if changed else [1] * 4))
+        return told[0]
 
     monkeypatch.setattr(membrane, "stretch", watched)
     monkeypatch.setattr(joint.reading, "read", lambda *given: kept.append(read(*given)) or kept[0])
     found = joint.prepare(device, shoot.layers, movers.CANVAS, Settings(), silent)
-    assert seen == [True]
+    assert len(told) == 1
+    assert any(told[0])
     by_layer = {id(one.layer): one for one in kept[0]}
     for one in found.layers:
         its: working.WorkingLayer = by_layer[id(one.layer)]

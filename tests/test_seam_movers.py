@@ -86,7 +86,7 @@ def test_cells_that_no_layer_covers_cost_nothing() -> None:
     cover = np.ones((2, 12, 30), bool)
     cover[:, 11, 20:] = False
     cut, once = (
-        seam.label(*everywhere(), residual, shares, cover, False, dearer=more) for more in (0, seam._ONCE)
+        seam.label(*everywhere(), residual, shares, cover, False, dearer=more) for more in (None, seam._ONCE)
     )
     shown = cover.any(0).ravel()
     assert np.array_equal(cut[shown], once[shown]) and 0 < cut[shown].mean() < 1
@@ -100,7 +100,7 @@ def test_where_the_one_layer_ends_another_goes_on() -> None:
     cover = np.ones((3, 12, 30), bool)
     cover[1, :, :3] = False
     problem = (*everywhere(), residual, shares, cover, False)
-    cut, found = (seam.label(*problem, dearer=more).reshape(12, 30) for more in (0, seam._ONCE))
+    cut, found = (seam.label(*problem, dearer=more).reshape(12, 30) for more in (None, seam._ONCE))
     assert np.array_equal(found[:, :3], cut[:, :3]) and (found[:, 3:] == 1).all()
     assert (cut[:, 4:13] == 0).all()
 
@@ -183,6 +183,34 @@ def test_a_region_comes_from_one_layer_and_an_overlap_from_both(
     inside = [field.get()[24:72, 56:184, 3] for field in fields]
     first = inside[0] > inside[1]
     assert first.all() or not first.any() if flow else 0.2 < first.mean() < 0.8
+
+
+@pytest.mark.parametrize(("cost", "moved", "cut"), [
+    (1.3, False, False), (1.7, False, True), (1.7, True, False), (2.3, True, True),
+])  # fmt: skip
+def test_one_layer_may_cost_more_where_something_moved(
+    monkeypatch: pytest.MonkeyPatch, cost: float, moved: bool, cut: bool
+) -> None:
+    """So many times as much as cut in two; a single cell that moved is enough."""
+    grid = plane(240, 96)
+    region = np.zeros((12, 30), bool)
+    region[2:10, 4:26] = True
+    energies = iter([1.0, cost, 9.0])
+    monkeypatch.setattr(seam, "energy", lambda *graph: next(energies))
+    seen = []
+    monkeypatch.setattr(seam, "_yield", lambda *given: seen.append(given[3]))
+    once = np.zeros(region.shape, bool)
+    once[5, 5] = moved
+    share = np.where(np.arange(240) < 120, 0.9, 0.1) * np.ones((96, 1))
+    fields = [SimpleNamespace(get=lambda s=s: np.stack([0 * s] * 3 + [s], -1)) for s in (share, 1 - share)]
+    residual = np.where(region, 0.3, 0.0)
+    residual[:, 14:16] = 0
+    found = seam.cut(
+        None, [SimpleNamespace(box=(0, 0, 240, 96))] * 2, fields, seam.Residuals(residual, residual), region,
+        SimpleNamespace(host=np.ones((2, 12, 30), bool)), grid, once,
+    )  # fmt: skip
+    assert len(seen) == 1
+    assert (len(np.unique(found[region])) == 2) == cut
 
 
 @pytest.mark.parametrize("turn", [0, 15])
