@@ -25,6 +25,8 @@ from hugin_abflow.progress import Progress, silent
 from hugin_abflow.settings import Settings
 
 _WHITE = np.uint16(65535)
+# What is left of a weight, as `seam.cut` leaves it: a pixel that no other layer can fill stays opaque.
+_TRACE = 1e-12
 
 
 @dataclass(frozen=True)
@@ -170,7 +172,8 @@ def _weighted(device: Device, layer: BlendLayer, mask: Layer, prepared: Prepared
     whole = Layer.from_array(mask.name, np.concatenate([grey, opaque], 2), region.left, region.top)
     reduced = working.reduce_layer(device, whole, prepared.grid, lambda units: None)
     left, top, width, height = layer.box
-    field[..., 3] = reduced.pixels.get()[top : top + height, left : left + width, 0]
+    weights = reduced.pixels.get()[top : top + height, left : left + width, 0]
+    field[..., 3] = np.maximum(weights, _TRACE)
     return replace(layer, field=device.upload(field))
 
 
