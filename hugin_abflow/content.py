@@ -46,6 +46,11 @@ class Unlike:
     moved: Values
     other: Values
 
+    @property
+    def anywhere(self) -> npt.NDArray[np.bool_]:
+        """The cells in which they do, for whatever reason."""
+        return (self.moved > 0) | (self.other > 0)
+
     @classmethod
     def of(
         cls,

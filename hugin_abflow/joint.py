@@ -300,10 +300,11 @@ def _align(
             highlights.regain(device, layers, fields, further, whole, grid)
             owner = seam.cut(device, layers, fields, residual, whole, masks, grid, once, lost)
             cells = seam.seam_grid(grid)
-            moved = membrane.stretch(device, layers, fields, owner, whole, masks, grid, cells)
+            unlike = Unlike.of(cells, residual.mean, whole, once)
+            there = whole, unlike.anywhere
+            moved = membrane.stretch(device, layers, fields, owner, *there, masks, grid, cells)
             for k in (k for k, one in enumerate(moved) if one):
                 reaches[k] = geometry.reach(device, layers[k], fields[k], grid)
-            unlike = Unlike.of(cells, residual.mean, whole, once)
         else:
             last = hoped or gains(settings, None)
         return _Aligned(fields, reaches, last.result(), whole, unlike)

@@ -1,8 +1,8 @@
 """What is taken from one layer, whole, is moved smoothly (kernels/membrane.cl).
 
-Flow has nothing to match there, and what it found would bend people, and the floor beside them. In such a
-region a layer's displacements are those of a membrane that is held where the layer goes on beside the region,
-and along cuts, where layers meet that flow has brought together: harmonic ones, no larger than those around
+Flow has nothing to match there, and what it found would bend people, and the floor beside them. Where layers
+show different things, the displacements of the one that is taken are those of a membrane that is held where
+they agree, and along cuts, where flow has brought them together: harmonic ones, no larger than those around
 (of least slopes, as in Perez, Gangnet, Blake, "Poisson image editing", 2003).
 """
 
@@ -33,6 +33,7 @@ def stretch(
     fields: Sequence[Buffer],
     owner: npt.NDArray[np.intp],
     whole: Cells,
+    unlike: Cells,
     masks: Masks,
     grid: Grid,
     cells: Grid,
@@ -42,11 +43,12 @@ def stretch(
 
     owner   (height, width) on `cells`: the layer that each cell is taken from.
     whole   the regions in which layers differ.
+    unlike  where they show different things; what they agree in holds them.
     """
     cover = on_cells(masks.host, cells, np.logical_or)
     changed = []
     for k, (layer, field) in enumerate(zip(layers, fields, strict=True)):
-        its = whole & (owner == k)
+        its = whole & unlike & (owner == k)
         inner = its & ~_held(k, owner, whole, cover, cells.wraps) if its.any() else its
         changed.append(bool(inner.any()) and _stretch(device, layer, field, inner, grid, cells))
     return changed

@@ -85,6 +85,7 @@ def test_what_surely_differs_in_a_region_is_unlike() -> None:
     assert found.grid == grid
     assert found.other == pytest.approx(np.array([[0, 0.5, 1, 0], [0] * 4]))
     assert np.array_equal(found.moved, moved)
+    assert found.anywhere.tolist() == [[False, True, True, True], [False] * 3 + [True]]
     assert not Unlike.of(grid, residual, whole, None).moved.any()
 
 
@@ -230,6 +231,6 @@ def test_somebody_who_is_cut_out_leaves_less_of_a_shade(monkeypatch: pytest.Monk
         return float(np.abs(panorama(120, 190) - clean)[60:140, 155:185].mean())
 
     found = shade()
-    monkeypatch.setattr(Unlike, "of", lambda *given: None)
+    monkeypatch.setattr(content, "complete", lambda *given: None)
     assert found < 0.5 * shade()
     assert found < 3

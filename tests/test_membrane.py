@@ -90,10 +90,16 @@ CELLS = (12, 30)
 
 
 def stretched(
-    device: Device, field: Array, owner: Array, whole: Array, covers: list[Array], wraps: bool = False
+    device: Device,
+    field: Array,
+    owner: Array,
+    whole: Array,
+    covers: list[Array],
+    wraps: bool = False,
+    unlike: Array | None = None,
 ) -> tuple[list[bool], Array, Array]:
     """Which of two layers have changed, and displacements (height, width) along x of both, by the same field
-    before. covers: of cells or of pixels."""
+    before. covers: of cells or of pixels. unlike: default: all cells."""
     grid: Grid = plane(WIDTH, HEIGHT, wraps)
     layers, fields = [], []
     for cover in covers:
@@ -103,7 +109,9 @@ def stretched(
         values[..., 0], values[..., 3] = field, 0.5
         fields.append(device.upload(values))
     masks = coefficient.masks(device, layers, grid)
-    changed = membrane.stretch(device, layers, fields, owner, whole, masks, grid, grid.coarser(8))
+    unlike = np.ones(CELLS, bool) if unlike is None else unlike
+    cells = grid.coarser(8)
+    changed = membrane.stretch(device, layers, fields, owner, whole, unlike, masks, grid, cells)
     assert all((its.get()[..., 3] == 0.5).all() for its in fields)
     first, second = (its.get()[..., 0] for its in fields)
     return changed, first, second
@@ -137,6 +145,19 @@ def test_what_is_torn_is_straightened_and_nothing_else(device: Device, turn: int
     beside = ~ndimage.binary_dilation(pixels, iterations=4)  # between cells, half of one
     assert np.array_equal(first[beside], before[beside])
     assert np.array_equal(second, before)  # nothing is taken from it
+
+
+def test_layers_are_held_where_they_agree(device: Device) -> None:
+    """In a region as beside it."""
+    whole, unlike = np.zeros(CELLS, bool), np.zeros(CELLS, bool)
+    whole[2:10, 4:26] = True
+    unlike[:, 10:20] = True
+    field = np.random.default_rng(4).normal(size=(HEIGHT, WIDTH)).astype(np.float32)
+    covers = [np.ones(CELLS, bool)] * 2
+    _, first, _ = stretched(device, field, np.zeros(CELLS, int), whole, covers, unlike=unlike)
+    changed = np.argwhere(first != field)
+    assert changed.min(0).tolist() == [12, 76]  # half a cell beside
+    assert changed.max(0).tolist() == [83, 163]
 
 
 def test_a_layers_border_is_a_cut_wherever_it_lies_among_cells(device: Device) -> None:
