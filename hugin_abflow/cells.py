@@ -1,4 +1,6 @@
-"""A pair's flow by cells of its chart, on the host: for what is taken from one photo, whole (single.py)."""
+"""Cells of a grid on the host, and a pair's flow by those of its chart: for what is taken from one photo, as
+a whole (single.py, seam.py).
+"""
 
 from __future__ import annotations
 
@@ -179,6 +181,22 @@ def grown(mask: Mask, by: int, wraps: bool) -> Mask:
     modes = "constant", "wrap" if wraps else "constant"
     found: Mask = scipy.ndimage.maximum_filter(mask, 2 * by + 1, mode=modes)
     return found
+
+
+def averaged(values: npt.NDArray[np.floating], wraps: bool) -> npt.NDArray[np.floating]:
+    """The means of 3 x 3 cells, (height, width, ...); beyond an edge, as a pole, lies what lies at it."""
+    modes = "nearest", "wrap" if wraps else "nearest"
+    return np.asarray(scipy.ndimage.uniform_filter(values, 3, mode=modes, axes=(0, 1)))
+
+
+def neighbours(
+    rows: npt.NDArray[np.intp], columns: npt.NDArray[np.intp], shape: tuple[int, ...], wraps: bool
+) -> tuple[npt.NDArray[np.bool_], tuple[npt.NDArray[np.intp], npt.NDArray[np.intp]]]:
+    """Which places lie on the grid, and rows and columns that can be read for all of them."""
+    inside = (rows >= 0) & (rows < shape[0])
+    if not wraps:
+        inside &= (columns >= 0) & (columns < shape[1])
+    return inside, (np.clip(rows, 0, shape[0] - 1), columns % shape[1])
 
 
 def cells_at(

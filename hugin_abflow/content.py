@@ -105,7 +105,7 @@ def _any(unlike: Unlike, box: Place, grid: Grid) -> bool:
     rows, columns = np.arange(its.top - 1, its.bottom + 1), np.arange(its.left - 1, its.right + 1)
     columns = columns % cells.width if cells.wraps else columns.clip(0, cells.width - 1)
     there = np.ix_(rows.clip(0, cells.height - 1), columns)
-    return bool(unlike.moved[there].any() or unlike.other[there].any())
+    return bool(unlike.anywhere[there].any())
 
 
 def _told(sums: Values, wraps: bool) -> Values:

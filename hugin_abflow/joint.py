@@ -301,9 +301,9 @@ def _align(
             owner = seam.cut(device, layers, fields, residual, whole, masks, grid, once, lost)
             cells = seam.seam_grid(grid)
             unlike = Unlike.of(cells, residual.mean, whole, once)
-            there = whole, unlike.anywhere
-            moved = membrane.stretch(device, layers, fields, owner, *there, masks, grid, cells)
-            for k in (k for k, one in enumerate(moved) if one):
+            for k in membrane.stretch(
+                device, layers, fields, owner, whole, unlike.anywhere, masks, grid, cells
+            ):
                 reaches[k] = geometry.reach(device, layers[k], fields[k], grid)
         else:
             last = hoped or gains(settings, None)

@@ -14,6 +14,7 @@ import numpy as np
 import numpy.typing as npt
 import scipy
 
+from hugin_abflow.cells import averaged, grown, neighbours
 from hugin_abflow.coefficient import Masks, on_cells
 from hugin_abflow.opencl import Buffer, Device
 from hugin_abflow.working import Grid, WorkingLayer
@@ -37,7 +38,7 @@ def stretch(
     masks: Masks,
     grid: Grid,
     cells: Grid,
-) -> list[bool]:
+) -> list[int]:
     """Make displacements (fields[...].xyz, in place) smooth in regions of cells; what nothing holds is not
     displaced at all. Returns which layers have changed.
 
@@ -49,8 +50,11 @@ def stretch(
     changed = []
     for k, (layer, field) in enumerate(zip(layers, fields, strict=True)):
         its = whole & unlike & (owner == k)
-        inner = its & ~_held(k, owner, whole, cover, cells.wraps) if its.any() else its
-        changed.append(bool(inner.any()) and _stretch(device, layer, field, inner, grid, cells))
+        if not its.any():  # of many layers nearly all
+            continue
+        inner = its & ~_held(k, owner, whole, cover, cells.wraps)
+        if inner.any() and _stretch(device, layer, field, inner, grid, cells):
+            changed.append(k)
     return changed
 
 
@@ -68,12 +72,12 @@ def _stretch(
     free = inner & known
     if not free.any():
         return False
-    around, all_of_it = (_smoothed(one * 1.0, cells.wraps) for one in (free, known))
+    around, all_of_it = (averaged(one * 1.0, cells.wraps) for one in (free, known))
     # a third at a straight outline, all a cell from there; what is beyond the layer is no outline
     far = (free * np.clip(2 * around / np.maximum(all_of_it, 0.1) - 1, 0, 1))[..., None]
     told = np.concatenate([far * _harmonic(means[..., :3], free, known, cells), far], -1)
     # beside the layer as in it: its last pixels are read between
-    beside = _smoothed(told, cells.wraps) / np.maximum(around, 0.1)[..., None]
+    beside = averaged(told, cells.wraps) / np.maximum(around, 0.1)[..., None]
     told = np.where(known[..., None], told, beside)
     device.run(
         "membrane", "membrane_stretch", layer.box[2:], field, layer.box, grid.border,
@@ -85,20 +89,7 @@ def _stretch(
 def _held(k: int, owner: npt.NDArray[np.intp], whole: Cells, cover: Cells, wraps: bool) -> Cells:
     """Cells along cuts of layer k, in or beside what it and others show. cover: (layers, height, width)."""
     both = cover[k] & (np.delete(cover, k, 0).any(0))
-    return _grown(whole & (owner != k) & _grown(both, 1, wraps), _HELD, wraps)
-
-
-def _smoothed(values: npt.NDArray[np.floating], wraps: bool) -> Values:
-    """The means of 3 x 3 cells."""
-    modes = ("nearest", "wrap" if wraps else "nearest")
-    return np.asarray(scipy.ndimage.uniform_filter(values, 3, mode=modes, axes=(0, 1)))
-
-
-def _grown(mask: Cells, by: int, wraps: bool) -> Cells:
-    """A mask, and the cells around."""
-    padded = np.pad(mask, ((0, 0), (by, by)), mode="wrap" if wraps else "constant")
-    wider = scipy.ndimage.binary_dilation(padded, np.ones((3, 3)), by)
-    return np.asarray(wider[:, by : wider.shape[1] - by])
+    return grown(whole & (owner != k) & grown(both, 1, wraps), _HELD, wraps)
 
 
 def _harmonic(values: Values, free: Cells, known: Cells, cells: Grid) -> Values:
@@ -111,18 +102,12 @@ def _harmonic(values: Values, free: Cells, known: Cells, cells: Grid) -> Values:
     diagonal, held = np.full(rows.size, _LOOSE), np.zeros((rows.size, 3))
     links = []
     for down, right in ((0, 1), (0, -1), (1, 0), (-1, 0)):
-        row, column = rows + down, columns + right
-        there = (row >= 0) & (row < cells.height)
-        if cells.wraps:
-            column %= cells.width
-        else:
-            there &= (column >= 0) & (column < cells.width)
-        row, column = np.clip(row, 0, cells.height - 1), np.clip(column, 0, cells.width - 1)
-        there &= known[row, column]
+        there, at = neighbours(rows + down, columns + right, cells.shape, cells.wraps)
+        there &= known[at]
         diagonal += there
-        linked = there & free[row, column]
-        held += (there & ~linked)[:, None] * values[row, column]
-        links.append(np.stack([np.flatnonzero(linked), number[row, column][linked]]))
+        linked = there & free[at]
+        held += (there & ~linked)[:, None] * values[at]
+        links.append(np.stack([np.flatnonzero(linked), number[at][linked]]))
     every = np.arange(rows.size)
     first, second = np.concatenate([*links, np.stack([every, every])], 1)
     weights = np.concatenate([np.full(first.size - rows.size, -1.0), diagonal])

@@ -143,12 +143,13 @@ def _differ(
         _add(device, level, None, mean)
     _join(device, mean, grid, None, None)
     for k, level in enumerate(finest):
-        colours, share, box = level.colours, level.share, level.box
-        device.run("multiband", "multiband_differ", box[2:], colours, box, grid.border, mean)
+        device.run(
+            "multiband", "multiband_differ", level.box[2:], level.colours, level.box, grid.border, mean
+        )
         if unlike is not None:
-            content.complete(device, colours, share, box, grid, mean, unlike, shoulder)
+            content.complete(device, level.colours, level.share, level.box, grid, mean, unlike, shoulder)
         finest[k] = _spread(device, level, widths)
-        del level, colours, share
+        del level
         device.give_back(MUCH)
 
 

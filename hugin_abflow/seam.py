@@ -31,6 +31,7 @@ import numpy as np
 import numpy.typing as npt
 import scipy
 
+from hugin_abflow.cells import averaged, neighbours
 from hugin_abflow.coefficient import Masks, on_cells
 from hugin_abflow.colour import Correction, clipping
 from hugin_abflow.geometry import Pair
@@ -62,6 +63,8 @@ _FORBIDDEN = 1e4
 # Price of a cell that is clipped, and is not in another layer, as of a residual that nothing favours; and by
 # how much, of full scale, that may be darker: what is white here and darker there is something else.
 _CLIPPED, _DARKER = 0.5, 0.05
+# What is left of a layer's weight where it yields: a pixel that no other layer can fill stays opaque.
+TRACE = 1e-12
 # How much more a region may cost if that shows things once and whole, from a layer that has most of it: where
 # flow tells that something moved, and anywhere.
 _ONCE, _WHOLE, _MOSTLY = 2.0, 1.5, 0.5
@@ -173,7 +176,11 @@ def cut(
     cells = seam_grid(grid)
     dearer = np.full(whole.shape, _WHOLE) if once is None else np.where(once, _ONCE, _WHOLE)
     owner = _owners(layers, fields, residual, whole, masks, grid, cells, _CUT, dearer, lost)
-    yields = [_soften((whole & (owner != k)).astype(np.float32), cells.wraps) for k in range(len(layers))]
+    # outlines are softened over a cell to each side
+    yields = [
+        np.ascontiguousarray(averaged((whole & (owner != k)).astype(np.float32), cells.wraps))
+        for k in range(len(layers))
+    ]
     _yield(device, layers, fields, yields, grid, cells)
     return owner
 
@@ -269,7 +276,15 @@ def _yield(
         if one.any():
             there = device.upload(one)
             device.run(
-                "seam", "seam_yield", layer.box[2:], field, layer.box, grid.border, there, cells.border
+                "seam",
+                "seam_yield",
+                layer.box[2:],
+                field,
+                layer.box,
+                grid.border,
+                there,
+                cells.border,
+                TRACE,
             )
 
 
@@ -389,7 +404,7 @@ def label(
     number[rows, columns] = np.arange(rows.size)
     links = []
     for down, right in ((0, 1), (1, 0), (0, -1), (-1, 0)):
-        inside, there = _neighbours(rows + down, columns + right, residual.mean.shape, wraps)
+        inside, there = neighbours(rows + down, columns + right, residual.mean.shape, wraps)
         # a layer's own border is a cut as well, where the union goes on
         price += cut_price * rough * (inside & cover[:, *there].any(0) & ~cover[candidates][:, *there])
         if down + right > 0:
@@ -406,16 +421,6 @@ def label(
         if alone and min(energies[1:]) <= dearer * energies[0]:
             labels = alone[int(np.argmin(energies[1:]))]
     return candidates[labels]
-
-
-def _neighbours(
-    rows: npt.NDArray[np.intp], columns: npt.NDArray[np.intp], shape: tuple[int, int], wraps: bool
-) -> tuple[npt.NDArray[np.bool_], tuple[npt.NDArray[np.intp], npt.NDArray[np.intp]]]:
-    """Which places lie on the grid, and rows and columns that can be read for all of them."""
-    inside = (rows >= 0) & (rows < shape[0])
-    if not wraps:
-        inside &= (columns >= 0) & (columns < shape[1])
-    return inside, (np.clip(rows, 0, shape[0] - 1), columns % shape[1])
 
 
 def _centres(cells: Grid, shape: Sequence[int]) -> tuple[npt.NDArray[np.intp], npt.NDArray[np.intp]]:
@@ -438,9 +443,3 @@ def _at_centres(
     result = np.zeros(cells.shape)
     result[np.ix_(row_inside, column_inside)] = weights[np.ix_(rows[row_inside], columns[column_inside])]
     return result
-
-
-def _soften(mask: npt.NDArray[np.float32], wraps: bool) -> npt.NDArray[np.float32]:
-    """Blur a mask's outline over a cell to each side."""
-    modes = ("nearest", "wrap" if wraps else "nearest")  # "nearest": nothing yields less at a pole
-    return np.ascontiguousarray(scipy.ndimage.uniform_filter(mask, 3, mode=modes))

@@ -302,8 +302,19 @@ static inline float4 bilinear_taps(float2 q, int4 grid, int4 *at) {
     return weights * (sum > 1e-6f ? 1.0f / sum : 0.0f);
 }
 
+/* Where a pixel lies on another grid over the same region. */
+static inline float2 grid_place(int x, int y, int4 from, int4 to) {
+    return (float2)((x + 0.5f) * to.x / from.x, (y + 0.5f) * to.y / from.y);
+}
+
 /* Bilinear reading of a grid at position q, over the taps that lie on it; 0 where none does. */
 static inline float bilinear_scalar(__global const float *values, float2 q, int4 grid) {
+    int4 at;
+    const float4 w = bilinear_taps(q, grid, &at);
+    return w.x * values[at.x] + w.y * values[at.y] + w.z * values[at.z] + w.w * values[at.w];
+}
+
+static inline float4 bilinear_colour(__global const float4 *values, float2 q, int4 grid) {
     int4 at;
     const float4 w = bilinear_taps(q, grid, &at);
     return w.x * values[at.x] + w.y * values[at.y] + w.z * values[at.z] + w.w * values[at.w];

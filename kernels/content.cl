@@ -31,7 +31,6 @@ __kernel void content_gather(__global const float4 *difference,  /* (box.w, box.
     if (cx >= cells.x || cy >= cells.y)
         return;
     const int4 its = cell_pixels(cx, cy, grid, cells);
-    const float2 ratio = (float2)((float)cells.x / grid.x, (float)cells.y / grid.y);
     float4 sum = (float4)(0.0f);
     for (int y = its.y; y < its.w; ++y)
         for (int x = its.x; x < its.z; ++x) {
@@ -39,7 +38,7 @@ __kernel void content_gather(__global const float4 *difference,  /* (box.w, box.
             if (at < 0 || difference[at].w == 0.0f)
                 continue;
             const float3 d = difference[at].xyz, m = mean[y * grid.x + x].xyz;
-            const float2 place = (float2)(x + 0.5f, y + 0.5f) * ratio;
+            const float2 place = grid_place(x, y, grid, cells);
             const float rest = 1.0f - share[at];
             const float w = rest * content_same(m + d, m, place, moved, unlike, cells, shoulder);
             sum += w * (float4)(d, rest);
@@ -58,14 +57,11 @@ __kernel void content_complete(__global float4 *difference, __global const float
     const int x = get_global_id(0), y = get_global_id(1), at = y * box.z + x;
     if (x >= box.z || y >= box.w || difference[at].w == 0.0f)
         return;
-    const int column = x + box.x, row = y + box.y;
-    const float2 place = (float2)((column + 0.5f) * cells.x / grid.x, (row + 0.5f) * cells.y / grid.y);
-    const float3 d = difference[at].xyz, m = mean[row * grid.x + column].xyz;
+    const float2 place = grid_place(x + box.x, y + box.y, grid, cells);
+    const float3 d = difference[at].xyz, m = mean[(y + box.y) * grid.x + x + box.x].xyz;
     const float same = content_same(m + d, m, place, moved, unlike, cells, shoulder);
     if (same == 1.0f)
         return;
-    int4 cell;
-    const float4 w = bilinear_taps(place, cells, &cell);
-    const float4 e = w.x * told[cell.x] + w.y * told[cell.y] + w.z * told[cell.z] + w.w * told[cell.w];
+    const float4 e = bilinear_colour(told, place, cells);
     difference[at].xyz = same * d + (1.0f - same) * (1.0f - share[at]) * e.xyz;
 }

@@ -30,10 +30,7 @@ __kernel void membrane_stretch(__global float4 *field,        /* (box.w, box.z) 
     const int x = get_global_id(0), y = get_global_id(1);
     if (x >= box.z || y >= box.w)
         return;
-    const float2 ratio = (float2)((float)cells.x / border.x, (float)cells.y / border.y);
-    int4 at;
-    const float4 w = bilinear_taps((float2)(x + box.x + 0.5f, y + box.y + 0.5f) * ratio, cells, &at);
-    const float4 other = w.x * told[at.x] + w.y * told[at.y] + w.z * told[at.z] + w.w * told[at.w];
+    const float4 other = bilinear_colour(told, grid_place(x + box.x, y + box.y, border, cells), cells);
     if (other.w > 0.0f) {
         const float4 own = field[y * box.z + x];
         field[y * box.z + x] = (float4)((1.0f - other.w) * own.xyz + other.xyz, own.w);

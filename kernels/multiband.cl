@@ -16,11 +16,6 @@ static inline float multiband_spline(float t) {
    the ends. */
 #define MULTIBAND_TAPS 8
 
-/* Where a pixel lies on another grid. */
-static inline float2 multiband_place(int x, int y, int4 from, int4 to) {
-    return (float2)((x + 0.5f) * to.x / from.x, (y + 0.5f) * to.y / from.y);
-}
-
 /* A level at position q of its grid, over the valid pixels around: colour and 1, or zeros. */
 static inline float4 multiband_expand(__global const float4 *level, int4 box, float2 q, int4 grid) {
     const int2 middle = floor_int2(q);
@@ -63,7 +58,7 @@ __kernel void multiband_finest(__global const float4 *layer, __global const floa
     const int x = get_global_id(0), y = get_global_id(1);
     if (x >= place.z || y >= place.w)
         return;
-    const float2 q = multiband_place(x + place.x, y + place.y, grid, border);
+    const float2 q = grid_place(x + place.x, y + place.y, grid, border);
     const int2 corner = floor_int2(q - 0.5f);
     const float2 t = q - 0.5f - convert_float2(corner);
     float4 way = (float4)(0.0f);
@@ -78,9 +73,7 @@ __kernel void multiband_finest(__global const float4 *layer, __global const floa
     float4 seen = layer_sample(layer, box, layer_position(q, way.xyz, lens), border);
     const bool valid = seen.w > 0.0f;
     if (valid && colours.x > 0) {
-        int4 cell;
-        const float4 w = bilinear_taps(multiband_place(x + place.x, y + place.y, grid, colours), colours, &cell);
-        const float4 g = w.x * gain[cell.x] + w.y * gain[cell.y] + w.z * gain[cell.z] + w.w * gain[cell.w];
+        const float4 g = bilinear_colour(gain, grid_place(x + place.x, y + place.y, grid, colours), colours);
         seen.xyz = exposure_shift(seen.xyz, g.xyz, shoulder);
     }
     if (shoulder == 0.0f)
@@ -146,7 +139,7 @@ __kernel void multiband_reduce(__global const float4 *level, __global const floa
     if (x >= smaller_box.z || y >= smaller_box.w)
         return;
     const float2 ratio = (float2)((float)fine.x / coarse.x, (float)fine.y / coarse.y);
-    const float2 q = multiband_place(x + smaller_box.x, y + smaller_box.y, coarse, fine);
+    const float2 q = grid_place(x + smaller_box.x, y + smaller_box.y, coarse, fine);
     const int2 first = floor_int2(q - 1.5f * ratio), last = floor_int2(q + 1.5f * ratio);
     float across[MULTIBAND_TAPS];
     for (int i = 0; i < MULTIBAND_TAPS; ++i)
@@ -204,7 +197,7 @@ __kernel void multiband_add(__global const float4 *level, __global const float *
     const int2 p = (int2)(x + box.x, y + box.y);
     float4 detail = (float4)(level[at].xyz, 1.0f);
     if (coarse.x > 0)
-        detail.xyz -= multiband_expand(smaller, smaller_box, multiband_place(p.x, p.y, grid, coarse), coarse).xyz;
+        detail.xyz -= multiband_expand(smaller, smaller_box, grid_place(p.x, p.y, grid, coarse), coarse).xyz;
     sum[p.y * grid.x + p.x] += share[at] * detail;
 }
 
@@ -220,7 +213,7 @@ __kernel void multiband_join(__global float4 *sum,           /* (grid.y, grid.x)
     const float4 s = sum[at];
     float4 v = s.w > 0.0f ? (float4)(s.xyz / s.w, 1.0f) : (float4)(0.0f);
     if (coarse.x > 0 && v.w > 0.0f)
-        v.xyz += multiband_expand(smaller, (int4)(0, 0, coarse.xy), multiband_place(x, y, grid, coarse), coarse).xyz;
+        v.xyz += multiband_expand(smaller, (int4)(0, 0, coarse.xy), grid_place(x, y, grid, coarse), coarse).xyz;
     sum[at] = v;
 }
 

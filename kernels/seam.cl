@@ -47,12 +47,12 @@ __kernel void seam_difference(__global const float4 *layer_a, __global const flo
     square[at] = n > 0.0f ? GREATEST(squares.x, GREATEST(squares.y, squares.z)) / n : 0.0f;
 }
 
-/* Take a layer's colour weight away where it yields: bilinear from the seam grid. A trace is left, so that a
-   pixel that no other layer can fill stays opaque. */
+/* Take a layer's colour weight away where it yields: bilinear from the seam grid, but for a trace. */
 __kernel void seam_yield(__global float4 *field,        /* (box.w, box.z) of the working grid; w is scaled */
                          int4 box, int4 border,         /* place on the working grid, run size; working grid */
                          __global const float *yields,  /* (cells.y, cells.x), 0..1 */
-                         int4 cells)                    /* seam grid, over the same region */
+                         int4 cells,                    /* seam grid, over the same region */
+                         float trace)                   /* the least that is left, of the weight */
 {
     const int x = get_global_id(0), y = get_global_id(1);
     if (x >= box.z || y >= box.w)
@@ -61,5 +61,5 @@ __kernel void seam_yield(__global float4 *field,        /* (box.w, box.z) of the
     const float keep = 1.0f - bilinear_scalar(yields, (float2)(x + box.x + 0.5f, y + box.y + 0.5f) * ratio, cells);
     /* to the fourth power: the softmax's own weights span many powers of ten */
     const float left = keep * keep * keep * keep;
-    field[y * box.z + x].w *= GREATEST(left, 1e-12f);
+    field[y * box.z + x].w *= GREATEST(left, trace);
 }

@@ -57,18 +57,20 @@ def test_kernels_equal_their_twins(device: Device, name: str, part: int, shoulde
         "content", "content_gather", cells.border[:2], out, its_share, box, grid.border, its_mean, moved,
         other, cells.border, shoulder, sums,
     )  # fmt: skip
-    given = (share, box, grid.border, mean, unlike.moved, unlike.other)
-    expected = twin.content_gather(difference, *given, cells.border, shoulder)
+    same = twin.content_same(
+        difference, box, grid.border, mean, unlike.moved, unlike.other, cells.border, shoulder
+    )
+    expected = twin.content_gather(difference, share, same, box, grid.border, cells.border)
     assert (expected[..., 3] > 0).any()
     assert_close(sums.get(), expected, 10 * SUM)
     device.run(
         "content", "content_complete", box[2:], out, its_share, box, grid.border, its_mean, moved, other,
         device.upload(told), cells.border, shoulder,
     )  # fmt: skip
-    expected = twin.content_complete(difference, *given, told, cells.border, shoulder)
+    expected = twin.content_complete(difference, share, same, box, grid.border, told, cells.border)
     assert_close(out.get(), expected, 10 * SUM)
-    same = (out.get() == difference).all(-1)[difference[..., 3] > 0]
-    assert 0.02 < same.mean() < 0.9  # where nothing is unlike, exactly
+    left = (out.get() == difference).all(-1)[difference[..., 3] > 0]
+    assert 0.02 < left.mean() < 0.9  # where nothing is unlike, exactly
 
 
 # What is told

@@ -2,12 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from typing import Any
+from collections.abc import Sequence
 
 import numpy as np
 
-from reference.common import EXPOSURE_FLOOR, Array, Numbers, exposure_scale, layer_seen, pixels, take
+from reference.common import (
+    EXPOSURE_FLOOR,
+    Array,
+    Numbers,
+    cell_parts,
+    exposure_scale,
+    layer_seen,
+    pixels,
+    take,
+)
 
 # A layer's pixels, its field, and their box.
 Side = tuple[Array, Array, Sequence[int]]
@@ -46,7 +54,7 @@ def colour_difference(
     if shoulder:
         tells = np.clip((np.minimum(a.max(-1), b.max(-1)) - DARK) / (BRIGHT - DARK), 0, 1)
     result, beyond = np.zeros((2, cells[1], cells[0], 4))
-    for place, part in _parts(border, cells, 2):
+    for place, part in cell_parts(border, cells, 2):
         count = known[part].size
         mixing[place] = mixed[part].mean()
         usable = (known & ~clips_a & ~clips_b)[part]
@@ -81,7 +89,7 @@ def colour_misfit(
     a, b, clips_a, clips_b, known = _seen(*sides, border, lens, clipped_a, clipped_b)
     a, b = np.maximum(a, EXPOSURE_FLOOR), np.maximum(b, EXPOSURE_FLOOR)
     result = np.zeros((cells[1], cells[0], len(shoulders)))
-    for place, part in _parts(border, cells, 4):
+    for place, part in cell_parts(border, cells, 4):
         usable = (known & ~clips_a & ~clips_b)[part]
         u, v = a[part][usable], b[part][usable]
         for k, shoulder in enumerate(shoulders):
@@ -110,11 +118,3 @@ def _seen(
         (one[..., :3] > np.float32(limit)[:3]).any(-1) for one, limit in ((a, clipped_a), (b, clipped_b))
     )
     return a[..., :3], b[..., :3], *clips, (a[..., 3] > 0) & (b[..., 3] > 0)
-
-
-def _parts(border: Sequence[int], cells: Sequence[int], every: int) -> Iterator[tuple[tuple[int, int], Any]]:
-    """Each cell's place, and which pixels are read for it."""
-    for j, i in np.ndindex(cells[1], cells[0]):
-        left, right = (k * border[0] // cells[0] for k in (i, i + 1))
-        top, bottom = (k * border[1] // cells[1] for k in (j, j + 1))
-        yield (j, i), np.s_[top:bottom:every, left:right:every]

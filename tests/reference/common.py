@@ -6,6 +6,7 @@ Everything is float64; positions are arrays (x right, y down), points arrays (..
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from typing import Any
 
 import numpy as np
 
@@ -143,6 +144,16 @@ def exposure_shift(c: Array, gain: Array, shoulder: float) -> Array:
     if shoulder:
         moved = np.minimum(moved, np.maximum(c, 1))
     return np.where(gain == 0, c, moved)
+
+
+def cell_parts(
+    border: Sequence[int], cells: Sequence[int], every: int = 1
+) -> Iterator[tuple[tuple[int, int], Any]]:
+    """The place of each cell of a grid, and which pixels of another one are read for it."""
+    for j, i in np.ndindex(cells[1], cells[0]):
+        left, right = (k * border[0] // cells[0] for k in (i, i + 1))
+        top, bottom = (k * border[1] // cells[1] for k in (j, j + 1))
+        yield (j, i), np.s_[top:bottom:every, left:right:every]
 
 
 def pixels(width: int, height: int, left: int = 0, top: int = 0) -> tuple[Array, Array]:

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from reference.common import Array, bilinear
+from reference.common import Array, bilinear, cell_parts
 from reference.multiband import place
 
 # The brightest channel of what may be anything, as dark as it is, and of what surely is something.
@@ -24,7 +24,8 @@ def content_same(
     shoulder: float,
 ) -> Array:
     """How surely a layer on a box shows the same as all, (height, width)."""
-    there = _there(mean, box).astype(np.float64)
+    left, top, width, height = box
+    there = mean[top : top + height, left : left + width, :3].astype(np.float64)
     darker = np.minimum(there.max(-1), (there + difference[..., :3]).max(-1))
     seen = np.clip((darker - BLACK) / (SEEN - BLACK), 0, 1) if shoulder else np.ones(darker.shape)
     read = []
@@ -37,51 +38,38 @@ def content_same(
 def content_gather(
     difference: Array,
     share: Array,
+    same: Array,
     box: Sequence[int],
     grid: Sequence[int],
-    mean: Array,
-    moved: Array,
-    unlike: Array,
     cells: Sequence[int],
-    shoulder: float,
 ) -> Array:
-    """Means over all pixels of each cell of w d (1 - share) and w (1 - share)^2; 0 beside the layer."""
-    same = content_same(difference, box, grid, mean, moved, unlike, cells, shoulder)
+    """Means over all pixels of each cell of w d (1 - share) and w (1 - share)^2; 0 beside the layer.
+
+    same: w, of `content_same`.
+    """
     rest = 1 - share.astype(np.float64)
     part = np.concatenate([difference[..., :3], rest[..., None]], -1) * (same * rest)[..., None]
     sums = np.zeros((grid[1], grid[0], 4))
     sums[box[1] : box[1] + box[3], box[0] : box[0] + box[2]] = part * (difference[..., 3:] > 0)
     result = np.zeros((cells[1], cells[0], 4))
-    for row in range(cells[1]):
-        for column in range(cells[0]):
-            top, bottom = row * grid[1] // cells[1], (row + 1) * grid[1] // cells[1]
-            left, right = column * grid[0] // cells[0], (column + 1) * grid[0] // cells[0]
-            if top < bottom and left < right:
-                result[row, column] = sums[top:bottom, left:right].mean((0, 1))
+    for its, pixels in cell_parts(grid, cells):
+        if sums[pixels].size:
+            result[its] = sums[pixels].mean((0, 1))
     return result
 
 
 def content_complete(
     difference: Array,
     share: Array,
+    same: Array,
     box: Sequence[int],
     grid: Sequence[int],
-    mean: Array,
-    moved: Array,
-    unlike: Array,
     told: Array,
     cells: Sequence[int],
-    shoulder: float,
 ) -> Array:
-    """What the cells tell, in place of a difference, where layers do not show the same."""
-    same = content_same(difference, box, grid, mean, moved, unlike, cells, shoulder)[..., None]
+    """What the cells tell, in place of a difference, where layers do not show the same (`content_same`)."""
     value, weight = bilinear(told, cells, *place(box, grid, cells))
     e = (value / weight[..., None])[..., :3]
-    result = difference.astype(np.float64)
+    result, same = difference.astype(np.float64), same[..., None]
     result[..., :3] = same * result[..., :3] + (1 - same) * (1 - share[..., None]) * e
     return np.where(difference[..., 3:] > 0, result, difference)
-
-
-def _there(mean: Array, box: Sequence[int]) -> Array:
-    left, top, width, height = box
-    return mean[top : top + height, left : left + width, :3]

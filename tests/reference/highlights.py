@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from reference.common import Array, bilinear, pixels
+from reference.common import Array, bilinear, cell_parts, pixels
 
 
 def highlights_share(
@@ -23,13 +23,10 @@ def highlights_share(
     whole[box[1] : box[1] + box[3], box[0] : box[0] + box[2]] = layer
     sure = np.clip(((whole / white)[..., :3].max(-1) - nearly) / (surely - nearly), 0, 1)
     result = np.zeros((cells[1], cells[0]))
-    for y in range(cells[1]):
-        for x in range(cells[0]):
-            rows = slice(y * border[1] // cells[1], (y + 1) * border[1] // cells[1])
-            columns = slice(x * border[0] // cells[0], (x + 1) * border[0] // cells[0])
-            valid = whole[rows, columns, 3] > 0
-            if valid.any():
-                result[y, x] = sure[rows, columns][valid].mean()
+    for place, part in cell_parts(border, cells):
+        valid = whole[part][..., 3] > 0
+        if valid.any():
+            result[place] = sure[part][valid].mean()
     return result
 
 

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from reference.common import Array, bilinear, pixels
+from reference.common import Array, bilinear, cell_parts, pixels
 
 
 def membrane_mean(
@@ -18,11 +18,9 @@ def membrane_mean(
     known = layer[..., 3:] > 0
     valid[part] = np.concatenate([field[..., :3], np.ones(known.shape)], -1) * known
     result = np.zeros((cells[1], cells[0], 4))
-    rows, columns = (np.arange(n + 1) * m // n for n, m in zip(cells[1::-1], border[1::-1], strict=True))
-    for y in range(cells[1]):
-        for x in range(cells[0]):
-            total = valid[rows[y] : rows[y + 1], columns[x] : columns[x + 1]].sum((0, 1))
-            result[y, x] = total / total[3] if total[3] else 0
+    for place, part in cell_parts(border, cells):
+        total = valid[part].sum((0, 1))
+        result[place] = total / total[3] if total[3] else 0
     return result
 
 

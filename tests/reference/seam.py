@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from reference.common import Array, Numbers, bilinear, exposure_shift, layer_seen, pixels
+from reference.common import Array, Numbers, bilinear, cell_parts, exposure_shift, layer_seen, pixels
 
 
 def seam_difference(
@@ -45,24 +45,27 @@ def seam_difference(
         shifted = exposure_shift(seen[..., :3], here, shoulder)
         looks.append(shifted if shoulder else np.sqrt(np.maximum(shifted, 0)))
     result, square = np.zeros((cells[1], cells[0], 4)), np.zeros((cells[1], cells[0]))
-    for j, i in np.ndindex(cells[1], cells[0]):
-        left, right = (k * border[0] // cells[0] for k in (i, i + 1))
-        top, bottom = (k * border[1] // cells[1] for k in (j, j + 1))
-        part = np.s_[top:bottom:2, left:right:2]
+    for place, part in cell_parts(border, cells, 2):
         values = (looks[0] - looks[1])[part][usable[part]]
         if len(values):
-            result[j, i] = [*values.mean(0), len(values) / usable[part].size]
-            square[j, i] = (values**2).mean(0).max()
+            result[place] = [*values.mean(0), len(values) / usable[part].size]
+            square[place] = (values**2).mean(0).max()
     return result, square
 
 
 def seam_yield(
-    field: Array, box: Sequence[int], border: Sequence[int], yields: Array, cells: Sequence[int]
+    field: Array,
+    box: Sequence[int],
+    border: Sequence[int],
+    yields: Array,
+    cells: Sequence[int],
+    trace: float,
 ) -> Array:
-    """The field (height, width, 4) with the weight of a layer that yields; `yields` is on the cells."""
+    """The field (height, width, 4) with the weight of a layer that yields, all but a trace; `yields` is on
+    the cells."""
     columns, rows = pixels(box[2], box[3], box[0], box[1])
     x, y = (columns + 0.5) * cells[0] / border[0], (rows + 0.5) * cells[1] / border[1]
     given, share = bilinear(yields, cells, x, y)
     result = field.astype(np.float64)
-    result[..., 3] *= np.maximum((1 - given / share) ** 4, 1e-12)
+    result[..., 3] *= np.maximum((1 - given / share) ** 4, trace)
     return result
