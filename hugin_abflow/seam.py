@@ -31,7 +31,7 @@ import numpy as np
 import numpy.typing as npt
 import scipy
 
-from hugin_abflow.cells import averaged, neighbours
+from hugin_abflow.cells import averaged, grown, neighbours
 from hugin_abflow.coefficient import Masks, on_cells
 from hugin_abflow.colour import Correction, clipping
 from hugin_abflow.geometry import Pair
@@ -176,13 +176,18 @@ def cut(
     cells = seam_grid(grid)
     dearer = np.full(whole.shape, _WHOLE) if once is None else np.where(once, _ONCE, _WHOLE)
     owner = _owners(layers, fields, residual, whole, masks, grid, cells, _CUT, dearer, lost)
-    # outlines are softened over a cell to each side
-    yields = [
-        np.ascontiguousarray(averaged((whole & (owner != k)).astype(np.float32), cells.wraps))
-        for k in range(len(layers))
-    ]
+    yields = [yielded(whole, owner, k, cells.wraps) for k in range(len(layers))]
     _yield(device, layers, fields, yields, grid, cells)
     return owner
+
+
+def yielded(whole: Cells, owner: npt.NDArray[np.intp], k: int, wraps: bool) -> npt.NDArray[np.float32]:
+    """How much layer k yields in each cell, 0..1: outlines are softened over a cell to each side, those of
+    regions a cell beyond, since what ends there may have nearly all of the softmax's weight.
+    """
+    others = whole & (owner != k)
+    beyond = grown(others, 1, wraps) & ~whole
+    return np.ascontiguousarray(averaged((others | beyond).astype(np.float32), wraps))
 
 
 def divide(
@@ -276,15 +281,7 @@ def _yield(
         if one.any():
             there = device.upload(one)
             device.run(
-                "seam",
-                "seam_yield",
-                layer.box[2:],
-                field,
-                layer.box,
-                grid.border,
-                there,
-                cells.border,
-                TRACE,
+                "seam", "seam_yield", layer.box[2:], field, layer.box, grid.border, there, cells.border, TRACE
             )
 
 

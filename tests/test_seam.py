@@ -361,6 +361,22 @@ def test_outlines_are_blurred_over_a_cell(wraps: bool) -> None:
     assert np.allclose(averaged(mask, wraps), expected, atol=1e-6)
 
 
+@pytest.mark.parametrize("columns", [0, 9])
+def test_a_layer_yields_all_of_a_region_that_is_not_its_own(columns: int) -> None:
+    whole, owner = np.zeros((13, 19), bool), np.zeros((13, 19), int)
+    whole[4:9, 5:15] = True
+    owner[:, :10] = 1
+    whole, owner = (np.roll(one, columns, 1) for one in (whole, owner))  # also across the border
+    first, second = (np.roll(seam.yielded(whole, owner, k, columns > 0), -columns, 1) for k in (0, 1))
+    assert first.dtype == second.dtype == np.float32
+    # from a cell beyond the region, less and less, as far as the next; at the cut half in each layer
+    third = 1 / 3
+    assert np.allclose(first[6, 2:12], [0, third, 2 * third, 1, 1, 1, 1, 2 * third, third, 0])
+    assert np.allclose(second[6, 8:18], [0, third, 2 * third, 1, 1, 1, 1, 2 * third, third, 0])
+    assert np.allclose(first[:7, 7], [0, 0, third, 2 * third, 1, 1, 1])
+    assert not first[:, 13:].any() and not second[:, :7].any()
+
+
 def test_cells_that_a_layer_covers_whole() -> None:
     covered = np.ones((2, 53, 77), bool)
     covered[0, 12, 20] = covered[1, 52, 76] = False
