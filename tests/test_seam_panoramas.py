@@ -271,7 +271,7 @@ def test_identical_layers_have_no_regions(device: Device, monkeypatch: pytest.Mo
 
 
 def test_weights_outside_the_regions_stay(device: Device, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The cut takes weight away only where its cells, blurred by one, reach; a trace is left."""
+    """The cut takes weight away only where its cells, grown and blurred by one, reach; a trace is left."""
     seen = {}
 
     def remember(device, layers, fields, *rest, original=seam.cut, **named):
@@ -282,7 +282,7 @@ def test_weights_outside_the_regions_stay(device: Device, monkeypatch: pytest.Mo
     monkeypatch.setattr(seam, "cut", remember)
     layers, canvas, *_ = scene("across the border", 0)
     found = prepared(device, layers, canvas)
-    reach = ndimage.binary_dilation(np.tile(seen["regions"], 3), np.ones((3, 3)), 2)[:, 60:120]
+    reach = ndimage.binary_dilation(np.tile(seen["regions"], 3), np.ones((3, 3)), 3)[:, 60:120]
     reach = np.kron(reach, np.ones((8, 8), bool))
     changed = 0
     for layer, before, after in zip(found.layers, seen["before"], seen["after"], strict=True):
