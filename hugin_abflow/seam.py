@@ -64,7 +64,7 @@ _FORBIDDEN = 1e4
 # how much, of full scale, that may be darker: what is white here and darker there is something else.
 _CLIPPED, _DARKER = 0.5, 0.05
 # What is left of a layer's weight where it yields: a pixel that no other layer can fill stays opaque.
-TRACE = 1e-12
+_TRACE = 1e-12
 # How much more a region may cost if that shows things once and whole, from a layer that has most of it: where
 # flow tells that something moved, and anywhere.
 _ONCE, _WHOLE, _MOSTLY = 2.0, 1.5, 0.5
@@ -281,7 +281,7 @@ def _yield(
         if one.any():
             there = device.upload(one)
             device.run(
-                "seam", "seam_yield", layer.box[2:], field, layer.box, grid.border, there, cells.border, TRACE
+                "seam", "seam_yield", layer.box[2:], field, layer.box, grid.border, there, cells.border, _TRACE
             )
 
 

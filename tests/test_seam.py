@@ -32,7 +32,7 @@ def test_twin_of_yield_reads_scipys_zoom() -> None:
     field = np.random.default_rng(1).random((40, 60, 4))
     for wraps in WRAPS:
         result = seam_yield(
-            field, (11, 7, 60, 40), (77, 53, int(wraps), 0), yields, (13, 9, int(wraps), 0), seam.TRACE
+            field, (11, 7, 60, 40), (77, 53, int(wraps), 0), yields, (13, 9, int(wraps), 0), seam._TRACE
         )
         around = np.pad(
             np.pad(yields, ((1, 1), (0, 0)), "edge"), ((0, 0), (1, 1)), "wrap" if wraps else "edge"

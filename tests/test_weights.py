@@ -51,14 +51,10 @@ def test_masks_are_the_weights(layers: list[str]) -> None:
 
 
 def test_masks_that_were_saved_give_the_same_picture(layers: list[str]) -> None:
-    """But for a pixel or two at the edge that only a layer shows whose weight is below a mask's steps."""
     assert run("--save-masks=m%n.tif", *layers) == 0
     first = tifffile.imread("out.tif").astype(int)
     assert run("--load-masks=m%n.tif", *layers) == 0
-    off = np.abs(tifffile.imread("out.tif") - first).max(-1)
-    assert off[2:-2].max() <= 1
-    assert (off > 1).sum() <= 2
-    assert off.max() < 10
+    assert np.abs(tifffile.imread("out.tif") - first).max() <= 1
 
 
 def test_a_layer_that_takes_no_part_gets_no_weight(

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from hugin_abflow import joint, multiband, seam, working
+from hugin_abflow import joint, multiband, working
 from hugin_abflow.blend import BlendLayer
 from hugin_abflow.colour import Correction
 from hugin_abflow.errors import CommandLineError, LayersMismatchError, LayersMissingError
@@ -25,6 +25,9 @@ from hugin_abflow.progress import Progress, silent
 from hugin_abflow.settings import Settings
 
 _WHITE = np.uint16(65535)
+# What is left of a weight that a mask takes away, far below a step of 16 bits: a pixel that no other layer
+# can fill stays opaque, and one that another's sample just reaches, from outside, is this layer's, as it was.
+_TRACE = 1e-7
 
 
 @dataclass(frozen=True)
@@ -171,7 +174,7 @@ def _weighted(device: Device, layer: BlendLayer, mask: Layer, prepared: Prepared
     reduced = working.reduce_layer(device, whole, prepared.grid, lambda units: None)
     left, top, width, height = layer.box
     weights = reduced.pixels.get()[top : top + height, left : left + width, 0]
-    field[..., 3] = np.maximum(weights, seam.TRACE)
+    field[..., 3] = np.maximum(weights, _TRACE)
     return replace(layer, field=device.upload(field))
 
 
