@@ -26,7 +26,6 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
-import cv2
 import numpy as np
 import numpy.typing as npt
 import scipy
@@ -281,8 +280,9 @@ def _yield(
         if one.any():
             there = device.upload(one)
             device.run(
-                "seam", "seam_yield", layer.box[2:], field, layer.box, grid.border, there, cells.border, _TRACE
-            )
+                "seam", "seam_yield", layer.box[2:],
+                field, layer.box, grid.border, there, cells.border, _TRACE,
+            )  # fmt: skip
 
 
 def _differences(
@@ -343,22 +343,13 @@ def _smooth(values: npt.NDArray[np.float64], cells: Grid) -> npt.NDArray[np.floa
     return np.asarray(smooth[:, :columns])
 
 
-def _padded(values: npt.NDArray[Any], by: int, wraps: bool) -> npt.NDArray[Any]:
-    """Cells around: 0, or from the other side where columns wrap."""
-    beyond = [(0, 0)] * (values.ndim - 2)
-    values = np.pad(values, ((by, by), (0, 0), *beyond))
-    return np.pad(values, ((0, 0), (by, by), *beyond), mode="wrap" if wraps else "constant")
-
-
 def _regions(residual: Residuals, cells: Grid, once: Cells) -> list[Cells]:
     """Connected outskirts that hold enough of strong residual, or anything of `once`, grown by a cell."""
     weak = (residual.mean > _WEAK) | (residual.rms > _STRONG) | once
-    weak = _padded(weak.astype(np.uint8), 1, cells.wraps)
-    grown = np.asarray(cv2.dilate(weak, np.ones((3, 3), np.uint8)))[1:-1, 1:-1] > 0
     strong = (residual.mean > _STRONG) * cells.row_widths[:, None]
     return [
         region
-        for region in _connected(grown, cells.wraps)
+        for region in _connected(grown(weak, 1, cells.wraps), cells.wraps)
         if strong[region].sum() >= _LEAST or once[region].any()
     ]
 
