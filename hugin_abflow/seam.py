@@ -48,10 +48,12 @@ _SIGMA, _REACH = 1.0, 3
 # Residual of low frequencies, of full scale, that makes a region one layer's, and that of its outskirts.
 # Where that of all frequencies reaches the first there are outskirts as well.
 _STRONG, _WEAK = 0.2, 0.045
+# By how much less, or more, of the first a cell counts not at all, or wholly.
+_DOUBT = 0.05
 # Strong cells, of the equator's size, that a region has at least: fewer are an edge that is a pixel off.
 _LEAST = 6.0
-# Price of a cut, in cells: what is cut off must be favoured by the softmax over this depth, or more where t
-# exceeds r.
+# Price of a cut, in cells: what is cut off must be favoured by the softmax over this depth, or more where what
+# is crossed exceeds r.
 _CUT = 10.0
 # The same without flow, where the softmax has little to say: overlaps are some hundred cells wide.
 _FINE_CUT = 120.0
@@ -80,6 +82,8 @@ class Residuals:
 
     mean    r: of their low frequencies.
     rms     t: of all. In `divide` both are the mean square, on finer cells.
+    crossed what a cut crosses: t of each cell by itself. What is strong, averaged, fills a gap beside it, and a
+            cut through somebody's chin is as cheap as one below. None: it is t.
     told    where any pair has pixels to compare: none are where layers are clipped, or sampled beyond their
             borders. None: everywhere.
     """
@@ -87,6 +91,12 @@ class Residuals:
     mean: npt.NDArray[np.float64]
     rms: npt.NDArray[np.float64]
     told: Cells | None = None
+    crossed: npt.NDArray[np.float64] | None = None
+
+    @property
+    def crossing(self) -> npt.NDArray[np.float64]:
+        """`crossed`, or t."""
+        return self.rms if self.crossed is None else self.crossed
 
 
 def seam_grid(grid: Grid) -> Grid:
@@ -104,7 +114,8 @@ def residuals(
 ) -> Residuals:
     """What flow and exposure do not explain."""
     cells = seam_grid(grid)
-    mean, square, told = np.zeros(cells.shape), np.zeros(cells.shape), np.zeros(cells.shape, bool)
+    mean, square, crossed = (np.zeros(cells.shape) for _ in range(3))
+    told = np.zeros(cells.shape, bool)
     clipped = [clipping(layer) for layer in layers]
     for its, found in _differences(device, layers, fields, pairs, correction, grid, cells, clipped):
         share = found[..., 4:]
@@ -112,8 +123,9 @@ def residuals(
         smooth = (share > 0) * smooth[..., :4] / np.where(share > 0, smooth[..., 4:], 1)
         mean[its] = np.maximum(mean[its], np.abs(smooth[..., :3]).max(-1))
         square[its] = np.maximum(square[its], smooth[..., 3])
+        crossed[its] = np.maximum(crossed[its], found[..., 3])
         told[its] |= share[..., 0] > 0
-    return Residuals(mean, np.sqrt(square), told)
+    return Residuals(mean, np.sqrt(square), told, np.sqrt(crossed))
 
 
 def lost(
@@ -264,7 +276,8 @@ def _completed(residual: Residuals, cover: npt.NDArray[np.bool_], wraps: bool) -
         whole = np.where(missing, values[tuple(nearest)], values)
         return whole[:, by : whole.shape[1] - by]
 
-    return Residuals(completed(residual.mean), completed(residual.rms))
+    mean, rms, crossed = map(completed, (residual.mean, residual.rms, residual.crossing))
+    return Residuals(mean, rms, crossed=crossed)
 
 
 def _yield(
@@ -346,7 +359,7 @@ def _smooth(values: npt.NDArray[np.float64], cells: Grid) -> npt.NDArray[np.floa
 def _regions(residual: Residuals, cells: Grid, once: Cells) -> list[Cells]:
     """Connected outskirts that hold enough of strong residual, or anything of `once`, grown by a cell."""
     weak = (residual.mean > _WEAK) | (residual.rms > _STRONG) | once
-    strong = (residual.mean > _STRONG) * cells.row_widths[:, None]
+    strong = np.clip((residual.mean - _STRONG) / (2 * _DOUBT) + 0.5, 0, 1) * cells.row_widths[:, None]
     return [
         region
         for region in _connected(grown(weak, 1, cells.wraps), cells.wraps)
@@ -383,7 +396,7 @@ def label(
     candidates = np.flatnonzero(cover[:, rows, columns].any(1))
     if candidates.size < 2:
         return np.full(rows.size, candidates[0] if candidates.size else 0)
-    weight, rough = residual.mean[rows, columns], residual.rms[rows, columns]
+    weight, rough = residual.mean[rows, columns], residual.crossing[rows, columns]
     present = cover[candidates][:, rows, columns]
     price = np.where(present, weight * (1 - shares[candidates][:, rows, columns]), _FORBIDDEN)
     if lost is not None:

@@ -242,7 +242,30 @@ def test_a_cell_of_which_little_is_seen_tells_as_much_less(monkeypatch: pytest.M
     assert np.isclose(residual.mean[4, 6], 0.6 * 0.1 / weight.sum(), rtol=0.01)
     assert np.isclose(residual.rms[4, 6], np.sqrt(0.4 * 0.1 / weight.sum()), rtol=0.01)
     assert residual.mean[4, 7] == residual.rms[4, 7] == 0
+    assert residual.crossing[4, 6] == residual.crossing.sum() == np.sqrt(0.4)
     assert residual.told is not None and residual.told.sum() == 107 and not residual.told[4, 7]
+
+
+def test_a_cut_goes_through_a_gap_of_one_cell(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Between somebody's head, which one layer shows whole, and his body, which it cuts off: also where the head
+    is as bright as what is behind.
+    """
+    found = np.zeros((14, 12, 5))
+    found[..., 4] = 1
+    found[:7, 2:10, :3], found[:7, 2:10, 3] = 0.1, 0.02
+    found[7, 2:10, :3], found[7, 2:10, 3] = 0.01, 0.001
+    found[8:, 2:10, :3], found[8:, 2:10, 3] = 0.5, 0.3
+    monkeypatch.setattr(seam, "_differences", lambda *_: [(np.s_[0:14, 0:12], found)])
+    residual = seam.residuals(None, LAYERS, [], [seam.Pair(0, 1)], None, plane(96, 112))
+    cover = np.ones((2, 16, 12), bool)
+    cover[0, 14:] = cover[1, 0] = False
+    rows, columns = np.nonzero(np.ones((14, 12)))
+    mean, rms, crossed = (
+        np.pad(one, [(0, 2), (0, 0)]) for one in (residual.mean, residual.rms, residual.crossing)
+    )
+    padded = seam.Residuals(mean, rms, crossed=crossed)
+    owner = seam.label(rows, columns, padded, np.full((2, 16, 12), 0.5), cover, False).reshape(14, 12)
+    assert (owner[1:7, 2:10] == 0).all() and (owner[8:, 2:10] == 1).all()
 
 
 def test_residuals_are_smoothed_across_the_border(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -311,6 +334,10 @@ def test_a_region_is_strong_and_takes_its_outskirts() -> None:
     assert regions(alike(residual), cells) == []  # 4 cells here, 5 there: edges
     residual[8, 7:10] = 2.0
     (region,) = regions(alike(residual), cells)
+    residual[6:8, 7:9] = residual[8, 7:10] = seam._STRONG  # as strong as not: each cell counts by half
+    assert regions(alike(residual), cells) == []
+    residual[6:8, 7:13] = seam._STRONG
+    assert len(regions(alike(residual), cells)) == 1
     expected = np.zeros((40, 60), bool)
     expected[4:13, 4:21] = True
     assert np.array_equal(region, expected)
