@@ -52,8 +52,8 @@ _STRONG, _WEAK = 0.2, 0.045
 _DOUBT = 0.05
 # Strong cells, of the equator's size, that a region has at least: fewer are an edge that is a pixel off.
 _LEAST = 6.0
-# Price of a cut, in cells: what is cut off must be favoured by the softmax over this depth, or more where what
-# is crossed exceeds r.
+# Price of a cut, in cells: what is cut off must be favoured by the softmax over this depth, or more where
+# what is crossed exceeds r.
 _CUT = 10.0
 # The same without flow, where the softmax has little to say: overlaps are some hundred cells wide.
 _FINE_CUT = 120.0
@@ -82,8 +82,8 @@ class Residuals:
 
     mean    r: of their low frequencies.
     rms     t: of all. In `divide` both are the mean square, on finer cells.
-    crossed what a cut crosses: t of each cell by itself. What is strong, averaged, fills a gap beside it, and a
-            cut through somebody's chin is as cheap as one below. None: it is t.
+    crossed what a cut crosses: t of each cell by itself. What is strong, averaged, fills a gap beside it, and
+            a cut through somebody's chin is as cheap as one below. None: it is t.
     told    where any pair has pixels to compare: none are where layers are clipped, or sampled beyond their
             borders. None: everywhere.
     """

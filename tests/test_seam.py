@@ -247,8 +247,8 @@ def test_a_cell_of_which_little_is_seen_tells_as_much_less(monkeypatch: pytest.M
 
 
 def test_a_cut_goes_through_a_gap_of_one_cell(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Between somebody's head, which one layer shows whole, and his body, which it cuts off: also where the head
-    is as bright as what is behind.
+    """Between somebody's head, which one layer shows whole, and his body, which it cuts off: also where the
+    head is as bright as what is behind.
     """
     found = np.zeros((14, 12, 5))
     found[..., 4] = 1
