@@ -186,7 +186,7 @@ def test_a_region_comes_from_one_layer_and_an_overlap_from_both(
 
 
 @pytest.mark.parametrize(("cost", "moved", "cut"), [
-    (1.3, False, False), (1.7, False, True), (1.7, True, False), (2.3, True, True),
+    (1.6, False, False), (1.8, False, True), (1.8, True, False), (2.1, True, True),
 ])  # fmt: skip
 def test_one_layer_may_cost_more_where_something_moved(
     monkeypatch: pytest.MonkeyPatch, cost: float, moved: bool, cut: bool
