@@ -34,6 +34,12 @@ def grid_of(layers: list[Layer]) -> Grid:
     return working.full_grid(CANVAS, layers).resized(41, 97)
 
 
+def rows_at_a_time(monkeypatch: pytest.MonkeyPatch, rows: int) -> None:
+    """On processors and cards alike."""
+    for name in ("_ROWS", "_ROWS_FOR_CARD"):
+        monkeypatch.setattr(working, name, rows)
+
+
 def read(device: Device, layers: list[Layer], **settings: int) -> list[WorkingLayer]:
     return reading.read(device, layers, grid_of(layers), silent, Settings(**settings))
 
@@ -61,13 +67,13 @@ def test_checksums_do_not_depend_on_how_many_rows_are_read_at_a_time(
     """A graphics card's layers have the same order."""
     layers, found = [stripped(1), stripped(2)], []
     for rows in (7, 64, 1000):
-        monkeypatch.setattr(working, "_ROWS", rows)
+        rows_at_a_time(monkeypatch, rows)
         found.append([one.checksum for one in read(device, layers)])
     assert found[0] == found[1] == found[2]
 
 
 def test_no_more_threads_than_memory_holds_rows_for(device: Device, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(working, "_ROWS", 16)
+    rows_at_a_time(monkeypatch, 16)
     layers, row = [stripped(1), stripped(2)], 77 * 4
     for strip, rows in ((8, 24), (32, 48)):
         several = [replace(one, strip=strip) for one in layers]
@@ -107,7 +113,8 @@ def test_where_layers_are_as_many_as_cores_each_is_one_part(
     assert asked == [1] * 9 + [6] * 3
 
 
-def test_every_row_is_counted_once(device: Device) -> None:
+def test_every_row_is_counted_once(device: Device, monkeypatch: pytest.MonkeyPatch) -> None:
+    rows_at_a_time(monkeypatch, 64)
     told = list[int]()
 
     @contextmanager
