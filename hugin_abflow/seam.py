@@ -7,12 +7,12 @@ borders, where they show least. This is a labelling of least energy,
 
     sum_cells (r (1 - s_k) + h e_k)  +  sum_neighbours c (t + t') / 2 [k != k']  +  sum_borders c t
 
-with r the residual of low frequencies, t that of all, s_k the share of the softmax, c the price of a cut
-(labelling.py), and h that of what layer k clips of what another one, as bright, still shows, e_k. A cut
-through somebody who is as bright as what is behind shows in t alone. Regions keep to themselves: elsewhere
-the softmax stays as it is, and the transition lies where the layers agree. What is clipped in one photo only
-is no such difference: it is brighter in the other by an unknown amount, and changes over best where it does
-so slowly.
+with r the residual of low frequencies, t that of all, of each cell by itself, s_k the share of the softmax, c
+the price of a cut (labelling.py), and h that of what layer k clips of what another one, as bright, still
+shows, e_k. A cut through somebody who is as bright as what is behind shows in t alone. Regions keep to
+themselves: elsewhere the softmax stays as it is, and the transition lies where the layers agree. What is
+clipped in one photo only is no such difference: it is brighter in the other by an unknown amount, and changes
+over best where it does so slowly.
 
 Where there is no flow, layers are not aligned, and each overlap is such a region, whole: on finer cells, with
 the mean square of the difference in place of r and t, since fine texture is as much in the way, and with
@@ -51,9 +51,9 @@ _STRONG, _WEAK = 0.2, 0.045
 # By how much less, or more, of the first a cell counts not at all, or wholly.
 _DOUBT = 0.05
 # Strong cells, of the equator's size, that a region has at least: fewer are an edge that is a pixel off.
-_LEAST = 6.0
-# Price of a cut, in cells: what is cut off must be favoured by the softmax over this depth, or more where
-# what is crossed exceeds r.
+_LEAST = 4.5
+# Price of a cut, in cells: what is cut off must be favoured by the softmax over this depth, or more where t
+# exceeds r.
 _CUT = 10.0
 # The same without flow, where the softmax has little to say: overlaps are some hundred cells wide.
 _FINE_CUT = 120.0
@@ -81,9 +81,9 @@ class Residuals:
     any pair and channel, 0 where no two lie.
 
     mean    r: of their low frequencies.
-    rms     t: of all. In `divide` both are the mean square, on finer cells.
-    crossed what a cut crosses: t of each cell by itself. What is strong, averaged, fills a gap beside it, and
-            a cut through somebody's chin is as cheap as one below. None: it is t.
+    rms     of all, averaged as well. In `divide` both are the mean square, on finer cells.
+    crossed t: of all, what a cut crosses. What is strong, averaged, fills a gap beside it, and a cut through
+            somebody's chin is as cheap as one below. None: as `rms`.
     told    where any pair has pixels to compare: none are where layers are clipped, or sampled beyond their
             borders. None: everywhere.
     """
@@ -95,7 +95,7 @@ class Residuals:
 
     @property
     def crossing(self) -> npt.NDArray[np.float64]:
-        """`crossed`, or t."""
+        """t."""
         return self.rms if self.crossed is None else self.crossed
 
 
