@@ -7,12 +7,12 @@ borders, where they show least. This is a labelling of least energy,
 
     sum_cells (r (1 - s_k) + h e_k)  +  sum_neighbours c (t + t') / 2 [k != k']  +  sum_borders c t
 
-with r the residual of low frequencies, t that of all, of each cell by itself, s_k the share of the softmax, c
-the price of a cut (labelling.py), and h that of what layer k clips of what another one, as bright, still
-shows, e_k. A cut through somebody who is as bright as what is behind shows in t alone. Regions keep to
-themselves: elsewhere the softmax stays as it is, and the transition lies where the layers agree. What is
-clipped in one photo only is no such difference: it is brighter in the other by an unknown amount, and changes
-over best where it does so slowly.
+with r the residual of low frequencies, averaged over the cells around, t that of all, not averaged, s_k the
+share of the softmax, c the price of a cut (labelling.py), and h that of what layer k clips of what another
+one, as bright, still shows, e_k. A cut through somebody who is as bright as what is behind shows in t alone.
+Regions keep to themselves: elsewhere the softmax stays as it is, and the transition lies where the layers
+agree. What is clipped in one photo only is no such difference: it is brighter in the other by an unknown
+amount, and changes over best where it does so slowly.
 
 Where there is no flow, layers are not aligned, and each overlap is such a region, whole: on finer cells, with
 the mean square of the difference in place of r and t, since fine texture is as much in the way, and with
@@ -48,12 +48,11 @@ _SIGMA, _REACH = 1.0, 3
 # Residual of low frequencies, of full scale, that makes a region one layer's, and that of its outskirts.
 # Where that of all frequencies reaches the first there are outskirts as well.
 _STRONG, _WEAK = 0.2, 0.045
-# By how much less, or more, of the first a cell counts not at all, or wholly.
+# From the first less this to it and this more, a cell counts from not at all to wholly as strong.
 _DOUBT = 0.05
 # Strong cells, of the equator's size, that a region has at least: fewer are an edge that is a pixel off.
 _LEAST = 4.5
-# Price of a cut, in cells: what is cut off must be favoured by the softmax over this depth, or more where t
-# exceeds r.
+# Price of a cut, in cells: what is cut off must be favoured by the softmax over this depth, times t / r.
 _CUT = 10.0
 # The same without flow, where the softmax has little to say: overlaps are some hundred cells wide.
 _FINE_CUT = 120.0
@@ -77,13 +76,14 @@ Prices = npt.NDArray[np.float64]  # (layers, height, width) on the seam grid
 
 @dataclass(frozen=True)
 class Residuals:
-    """How far aligned, corrected layers differ, both float64 (height, width) on the seam grid: the largest of
+    """How far aligned, corrected layers differ, float64 (height, width) on the seam grid: the largest of
     any pair and channel, 0 where no two lie.
 
     mean    r: of their low frequencies.
-    rms     of all, averaged as well. In `divide` both are the mean square, on finer cells.
-    crossed t: of all, what a cut crosses. What is strong, averaged, fills a gap beside it, and a cut through
-            somebody's chin is as cheap as one below. None: as `rms`.
+    rms     t: of all, of each cell by itself. What is strong, averaged, would fill a gap beside it, and a cut
+            through somebody's chin be as cheap as one below. In `divide` both are the mean square, on finer
+            cells.
+    around  of all, averaged as r is, for the outskirts of regions. None: t.
     told    where any pair has pixels to compare: none are where layers are clipped, or sampled beyond their
             borders. None: everywhere.
     """
@@ -91,12 +91,7 @@ class Residuals:
     mean: npt.NDArray[np.float64]
     rms: npt.NDArray[np.float64]
     told: Cells | None = None
-    crossed: npt.NDArray[np.float64] | None = None
-
-    @property
-    def crossing(self) -> npt.NDArray[np.float64]:
-        """t."""
-        return self.rms if self.crossed is None else self.crossed
+    around: npt.NDArray[np.float64] | None = None
 
 
 def seam_grid(grid: Grid) -> Grid:
@@ -114,7 +109,7 @@ def residuals(
 ) -> Residuals:
     """What flow and exposure do not explain."""
     cells = seam_grid(grid)
-    mean, square, crossed = (np.zeros(cells.shape) for _ in range(3))
+    mean, square, around = (np.zeros(cells.shape) for _ in range(3))
     told = np.zeros(cells.shape, bool)
     clipped = [clipping(layer) for layer in layers]
     for its, found in _differences(device, layers, fields, pairs, correction, grid, cells, clipped):
@@ -122,10 +117,10 @@ def residuals(
         smooth = _smooth(np.concatenate([found[..., :4] * share, share], -1), cells)
         smooth = (share > 0) * smooth[..., :4] / np.where(share > 0, smooth[..., 4:], 1)
         mean[its] = np.maximum(mean[its], np.abs(smooth[..., :3]).max(-1))
-        square[its] = np.maximum(square[its], smooth[..., 3])
-        crossed[its] = np.maximum(crossed[its], found[..., 3])
+        square[its] = np.maximum(square[its], found[..., 3])
+        around[its] = np.maximum(around[its], smooth[..., 3])
         told[its] |= share[..., 0] > 0
-    return Residuals(mean, np.sqrt(square), told, np.sqrt(crossed))
+    return Residuals(mean, np.sqrt(square), told, np.sqrt(around))
 
 
 def lost(
@@ -276,8 +271,7 @@ def _completed(residual: Residuals, cover: npt.NDArray[np.bool_], wraps: bool) -
         whole = np.where(missing, values[tuple(nearest)], values)
         return whole[:, by : whole.shape[1] - by]
 
-    mean, rms, crossed = map(completed, (residual.mean, residual.rms, residual.crossing))
-    return Residuals(mean, rms, crossed=crossed)
+    return Residuals(completed(residual.mean), completed(residual.rms))
 
 
 def _yield(
@@ -358,8 +352,10 @@ def _smooth(values: npt.NDArray[np.float64], cells: Grid) -> npt.NDArray[np.floa
 
 def _regions(residual: Residuals, cells: Grid, once: Cells) -> list[Cells]:
     """Connected outskirts that hold enough of strong residual, or anything of `once`, grown by a cell."""
-    weak = (residual.mean > _WEAK) | (residual.rms > _STRONG) | once
-    strong = np.clip((residual.mean - _STRONG) / (2 * _DOUBT) + 0.5, 0, 1) * cells.row_widths[:, None]
+    around = residual.rms if residual.around is None else residual.around
+    weak = (residual.mean > _WEAK) | (around > _STRONG) | once
+    strong = np.interp(residual.mean, (_STRONG - _DOUBT, _STRONG + _DOUBT), (0, 1))
+    strong *= cells.row_widths[:, None]
     return [
         region
         for region in _connected(grown(weak, 1, cells.wraps), cells.wraps)
@@ -396,7 +392,7 @@ def label(
     candidates = np.flatnonzero(cover[:, rows, columns].any(1))
     if candidates.size < 2:
         return np.full(rows.size, candidates[0] if candidates.size else 0)
-    weight, rough = residual.mean[rows, columns], residual.crossing[rows, columns]
+    weight, rough = residual.mean[rows, columns], residual.rms[rows, columns]
     present = cover[candidates][:, rows, columns]
     price = np.where(present, weight * (1 - shares[candidates][:, rows, columns]), _FORBIDDEN)
     if lost is not None:

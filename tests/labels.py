@@ -47,7 +47,7 @@ def problems(draw, layers: int, most: int):
     # from all alike to a few cells that count for all
     low, rough = random.random((2, height, width)) ** draw(st.sampled_from([0.1, 1, 4]))
     scale = draw(st.sampled_from([0.5, 3]))
-    residual = seam.Residuals(scale * low, scale * np.maximum(low, rough))
+    residual = seam.Residuals(scale * low, scale * rough)
     shares = random.random((layers, height, width)) ** draw(st.sampled_from([0.2, 1, 20]))
     shares /= np.maximum(shares.sum(0), 1e-9)
     cover = random.random((layers, height, width)) < draw(st.sampled_from([0.4, 0.8, 1]))

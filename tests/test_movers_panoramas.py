@@ -121,7 +121,9 @@ def test_who_took_a_step_is_shown_once_and_unbent(turned: int, order: slice) -> 
 
 @pytest.mark.usefixtures(one_device.__name__)
 def test_what_is_beside_him_would_be_bent(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The checks above can fail: were neither he looked for nor what differs, nor transitions led around."""
+    """The checks above can fail. To look for him or for regions is enough here; without either, and with
+    transitions that are not led around him, what is beside him is bent.
+    """
     one = shoot(PERSON)
     monkeypatch.setattr(movers, "find", lambda *_: None)
     monkeypatch.setattr(seam, "_LEAST", np.inf)

@@ -95,7 +95,7 @@ def test_cells_beside_are_as_if_compared(device: Device, name: str, monkeypatch:
         excess = np.ones((len(layers), *grid.shape), np.float32)
         lost = seam.lost(device, layers, fields, pairs, correction, excess, grid)
         gains = [gain.get() for gain in correction.gains]
-        results.append([*gains, residual.mean, residual.rms, residual.told, lost])
+        results.append([*gains, residual.mean, residual.rms, residual.around, residual.told, lost])
         cut = [device.copy(field) for field in fields]
         masks = Masks(grid, tuple(device.upload(mask, np.uint8) for mask in covered), covered)
         seam.divide(device, layers, cut, pairs, correction, masks, grid)

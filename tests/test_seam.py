@@ -231,6 +231,7 @@ LAYERS = [SimpleNamespace(layer=SimpleNamespace(dtype=np.dtype(np.uint8)), white
 
 
 def test_a_cell_of_which_little_is_seen_tells_as_much_less(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of those around; a cut through it crosses what is seen."""
     found = np.zeros((9, 12, 5))
     found[..., 4] = 1
     found[4, 6] = 0.5, -0.6, 0.1, 0.4, 0.1
@@ -240,9 +241,10 @@ def test_a_cell_of_which_little_is_seen_tells_as_much_less(monkeypatch: pytest.M
     y, x = np.mgrid[0:9, 0:12]
     weight = np.exp(-0.5 * ((y - 4) ** 2 + (x - 6) ** 2)) * found[..., 4]
     assert np.isclose(residual.mean[4, 6], 0.6 * 0.1 / weight.sum(), rtol=0.01)
-    assert np.isclose(residual.rms[4, 6], np.sqrt(0.4 * 0.1 / weight.sum()), rtol=0.01)
-    assert residual.mean[4, 7] == residual.rms[4, 7] == 0
-    assert residual.crossing[4, 6] == residual.crossing.sum() == np.sqrt(0.4)
+    assert residual.around is not None
+    assert np.isclose(residual.around[4, 6], np.sqrt(0.4 * 0.1 / weight.sum()), rtol=0.01)
+    assert residual.mean[4, 7] == residual.around[4, 7] == residual.rms[4, 7] == 0
+    assert residual.rms[4, 6] == residual.rms.sum() == np.sqrt(0.4)
     assert residual.told is not None and residual.told.sum() == 107 and not residual.told[4, 7]
 
 
@@ -260,10 +262,7 @@ def test_a_cut_goes_through_a_gap_of_one_cell(monkeypatch: pytest.MonkeyPatch) -
     cover = np.ones((2, 16, 12), bool)
     cover[0, 14:] = cover[1, 0] = False
     rows, columns = np.nonzero(np.ones((14, 12)))
-    mean, rms, crossed = (
-        np.pad(one, [(0, 2), (0, 0)]) for one in (residual.mean, residual.rms, residual.crossing)
-    )
-    padded = seam.Residuals(mean, rms, crossed=crossed)
+    padded = seam.Residuals(*(np.pad(one, [(0, 2), (0, 0)]) for one in (residual.mean, residual.rms)))
     owner = seam.label(rows, columns, padded, np.full((2, 16, 12), 0.5), cover, False).reshape(14, 12)
     assert (owner[1:7, 2:10] == 0).all() and (owner[8:, 2:10] == 1).all()
 
@@ -286,6 +285,7 @@ def test_a_cell_is_told_of_by_any_pair(monkeypatch: pytest.MonkeyPatch) -> None:
     """What is as bright as clipped pixels are is not compared, but without flow."""
     found = np.zeros((2, 9, 12, 5))
     found[0, :, :5, 4], found[1, 3, 3:, 4] = 0.2, 1
+    found[0, 3, 3, 3], found[1, 3, 3, 3], found[1, 3, 8, 3] = 0.09, 0.01, 0.04
     asked = []
     everywhere = [(np.s_[0:9, 0:12], one) for one in found]
     monkeypatch.setattr(seam, "_differences", lambda *given: asked.append(given[-1]) or iter(everywhere))
@@ -293,6 +293,8 @@ def test_a_cell_is_told_of_by_any_pair(monkeypatch: pytest.MonkeyPatch) -> None:
     assert np.array_equal(residual.told, (found[..., 4] > 0).any(0)) and asked == [
         [(0.98, 0.98, 0.98, 1.0)] * 2
     ]
+    assert np.isclose(residual.rms[3, [3, 8]], [0.3, 0.2]).all()
+    assert residual.around is not None and (residual.around[3, [3, 8]] > 0.05).all()
 
 
 # Regions
@@ -334,13 +336,20 @@ def test_a_region_is_strong_and_takes_its_outskirts() -> None:
     assert regions(alike(residual), cells) == []  # 4 cells here, 4 there: edges
     residual[8, 7:10] = 2.0
     (region,) = regions(alike(residual), cells)
-    residual[6:8, 7:9] = residual[8, 7:10] = seam._STRONG  # as strong as not: each cell counts by half
-    assert regions(alike(residual), cells) == []
-    residual[6:8, 7:13] = seam._STRONG
-    assert len(regions(alike(residual), cells)) == 1
     expected = np.zeros((40, 60), bool)
     expected[4:13, 4:21] = True
     assert np.array_equal(region, expected)
+
+
+@pytest.mark.parametrize(("off", "count", "found"), [
+    (-1.0, 60, False), (-0.5, 17, False), (-0.5, 19, True), (0.0, 8, False), (0.0, 10, True),
+    (0.5, 5, False), (0.5, 7, True), (1.0, 4, False), (1.0, 5, True),
+])  # fmt: skip
+def test_what_is_nearly_strong_counts_in_part(off: float, count: int, found: bool) -> None:
+    """Cells so far from strong, of what makes them count not at all or wholly."""
+    residual = np.zeros((40, 60))
+    residual[20, :count] = seam._STRONG + off * seam._DOUBT
+    assert len(regions(alike(residual), plane(480, 320).resized(60, 40))) == found
 
 
 def test_texture_that_differs_joins_a_region_but_makes_none() -> None:
@@ -352,6 +361,8 @@ def test_texture_that_differs_joins_a_region_but_makes_none() -> None:
     mean[5:12, [5, 19]] = 2 * seam._STRONG
     assert len(regions(alike(mean), cells)) == 2
     assert len(regions(seam.Residuals(mean, rms), cells)) == 1
+    assert len(regions(seam.Residuals(mean, 0 * rms, around=rms), cells)) == 1
+    assert len(regions(seam.Residuals(mean, rms, around=mean), cells)) == 2
     for aligned in (True, False):  # between the arms, where texture tells
         assert seam.regions(seam.Residuals(mean, rms), plane(480, 320), aligned)[8, 12] == aligned
 
