@@ -4,11 +4,14 @@ One gain field per layer and channel on a coarse grid, on the exposure scale of 
 images, log of floats): where layers overlap, the corrected layers agree; from there the correction spreads
 through each layer, smoothly, and fades out. It is the minimum of
 
-    sum_pairs c (g_a - g_b + d_ab)^2  +  sum_k |grad g_k|^2  +  g_k^2 / fade^2
+    sum_pairs c (g_a - g_b + d_ab)^2 + h |grad (g_a - g_b)|^2  +  sum_k |grad g_k|^2 + g_k^2 / fade^2
 
 with d_ab the measured difference of the aligned layers, and c how far it can be trusted, how much it tells
 (dark samples little) and how far both are seen: a sparse linear system, solved directly; in the first rounds,
 which only tell what to trust, for blocks of cells. Where there is no difference it is exactly zero.
+
+h is not 0 where what layers show tells nothing, as somebody whom one of them shows does not: gains would fade
+there, and leave a step beside him. Their difference is rather as it is around.
 
 Cameras' curves level off towards white, by which log odds move colours as exposure does; others run straight
 into it. The scale's shoulder, between both, is the one that leaves the least of the differences: else a
@@ -53,6 +56,8 @@ _STRICT = ((0.01, 4.0), (0.03, 2.5), (0.3, 1.6), (3.0, 1.2), (100.0, 1.0))
 _ROUGH, _BLOCK = 1.0, 2
 # Weight of a clipped cell against smoothness: what it tells is a bound, of a brightness that nobody knows.
 _BOUND = 0.1
+# Weight of the smoothness of the difference of two layers' gains, where nothing is to tell of it.
+_TOGETHER = 10.0
 # Weight of what is seen of one layer alone: where layers are not mixed they are best left as they are.
 _UNSEEN = 0.003
 # The correction fades out over this share of the canvas's width; a trend hardly does.
@@ -165,14 +170,14 @@ def correction(
     if not settings.exposure:
         return none
     differences = measured.differences
-    if ignored is not None:
-        counts = ~on_cells(ignored[None], cells, np.logical_or)[0]
-        differences = tuple(_weighed(d, counts[d.cells]) for d in differences)
+    unknown = None if ignored is None else on_cells(ignored[None], cells, np.logical_or)[0]
+    if unknown is not None:
+        differences = tuple(_weighed(d, ~unknown[d.cells]) for d in differences)
     if settings.flow:  # without, layers are not mixed but cut, somewhere
         differences = tuple(_weighed(d, d.mixing + _UNSEEN) for d in differences)
     if not any(np.any(v[..., :3] * v[..., 3:]) for d in differences for v in (d.values, d.beyond)):
         return none
-    gains = solve(replace(measured, differences=differences), _STRICT if strict else _ROUNDS)
+    gains = solve(replace(measured, differences=differences), _STRICT if strict else _ROUNDS, unknown)
     gains = np.sign(gains) * np.maximum(np.abs(gains) - NEGLIGIBLE, 0)
     result: list[Buffer | None] = []
     ends = np.cumsum(np.count_nonzero(inside, axis=(1, 2)))
@@ -254,27 +259,25 @@ def _shoulder(overlaps: Sequence[_Overlap]) -> float:
     return _SHOULDERS[best if total[best] < _BETTER * total[0] else 0]
 
 
-def solve(measured: Measured, rounds: Sequence[tuple[float, float]] = _ROUNDS) -> npt.NDArray[np.float64]:
-    """Gains (cells, 3) of the layers' cells, in the order of `measured.inside`, for differences."""
+def solve(
+    measured: Measured,
+    rounds: Sequence[tuple[float, float]] = _ROUNDS,
+    unknown: npt.NDArray[np.bool_] | None = None,
+) -> npt.NDArray[np.float64]:
+    """Gains (cells, 3) of the layers' cells, in the order of `measured.inside`, for differences.
+
+    unknown: (height, width), the cells of which these tell nothing, by what is seen there.
+    """
     cells, inside, differences = measured.grid, measured.inside, measured.differences
     area = np.maximum(cells.row_widths, 0.02)[:, None]
-    layer, row, column = np.nonzero(inside)
-    count = layer.size
     number = np.zeros(inside.shape, np.int32)  # of a layer's cell among the unknowns
-    own = np.arange(count)
-    number[inside] = own
-    # a cell's sides: steps along a row are shorter near a pole, so neighbours there are bound closer
-    right, below = (column + 1) % cells.width, np.minimum(row + 1, cells.height - 1)
-    goes_on = (column + 1 < cells.width) | cells.wraps
-    east = (inside[layer, row, right] & goes_on) / area[row, 0]
-    south = (inside[layer, below, column] & (below > row)) * np.sqrt(area[row, 0] * area[below, 0])
-    step, stiffness = _steps(
-        [(own, number[layer, row, right], east), (own, number[layer, below, column], south)], count
-    )
+    count = int(np.count_nonzero(inside))
+    number[inside] = np.arange(count)
+    shared = np.zeros((len(differences), *cells.shape), bool)
     evidence = []
-    for d in differences:
+    for d, its in zip(differences, shared, strict=True):
         # what a layer is measured to be beside its own cells binds nothing else
-        both = inside[d.a][d.cells] & inside[d.b][d.cells]
+        both = its[d.cells] = inside[d.a][d.cells] & inside[d.b][d.cells]
         evidence.append(d.values[..., 3] * area[d.cells[0]] * both)
     link, weight = _steps(
         [(number[d.a][d.cells], number[d.b][d.cells], e) for d, e in zip(differences, evidence, strict=True)],
@@ -282,15 +285,23 @@ def solve(measured: Measured, rounds: Sequence[tuple[float, float]] = _ROUNDS) -
     )
     difference = np.concatenate([d.values[e > 0, :3] for d, e in zip(differences, evidence, strict=True)])
     bounds = _Bounds(measured, number, area, count)
+    step, stiffness = _slopes(inside, area, cells.wraps)
     smooth = step.T @ scipy.sparse.diags_array(stiffness) @ step
+    if unknown is not None:
+        pairs = [(number[d.a][i], number[d.b][i], i[i]) for d, i in zip(differences, shared, strict=True)]
+        step, stiffness = _slopes(shared, area, cells.wraps)
+        beside = abs(step) @ np.broadcast_to(unknown, shared.shape)[shared] > 0
+        apart = step[beside] @ _steps(pairs, count)[0]
+        smooth += _TOGETHER * (apart.T @ scipy.sparse.diags_array(stiffness[beside]) @ apart)
     # a step between blocks stands for _BLOCK steps, each of that part of it: their squares are less by that
     blocks = _blocks(inside)
     smooth_blocks = blocks.T @ smooth @ blocks / _BLOCK
+    own_area = area[np.nonzero(inside)[1], 0]
     round_ = cells.circumference / (cells.lens[1] or 1.0)  # cells
     solution, solver, rough_solver = np.zeros((count, 3)), _Solver(), _Solver()
     for data, limit in rounds:
         fade = _TREND_FADE if rounds is _STRICT and data < rounds[-1][0] else _FADE
-        hold = area[row, 0] / max(1.0, fade * round_) ** 2
+        hold = own_area / max(1.0, fade * round_) ** 2
         off = link @ solution + difference if solution.any() else np.zeros_like(difference)
         trusted = data * weight * _biweight(off, limit)
         held, pull = bounds.active(solution, limit)
@@ -302,6 +313,25 @@ def solve(measured: Measured, rounds: Sequence[tuple[float, float]] = _ROUNDS) -
         else:
             solution = solver.solve(data_term + smooth, wanted)
     return np.asarray(solution)
+
+
+def _slopes(
+    masks: npt.NDArray[np.bool_], area: npt.NDArray[np.float64], wraps: bool
+) -> tuple[scipy.sparse.csr_array, npt.NDArray[np.float64]]:
+    """A matrix (steps, cells) that takes the steps between neighbouring cells, of each of some masks (n,
+    height, width), and their stiffness (steps,); area: of the cells of each row, (height, 1).
+    """
+    mask, row, column = np.nonzero(masks)
+    own = np.arange(mask.size)
+    number = np.zeros(masks.shape, np.int32)
+    number[masks] = own
+    right, below = (column + 1) % masks.shape[2], np.minimum(row + 1, masks.shape[1] - 1)
+    goes_on = (column + 1 < masks.shape[2]) | wraps
+    # a cell's sides: steps along a row are shorter near a pole, so neighbours there are bound closer
+    east = (masks[mask, row, right] & goes_on) / area[row, 0]
+    south = (masks[mask, below, column] & (below > row)) * np.sqrt(area[row, 0] * area[below, 0])
+    ends = [(number[mask, row, right], east), (number[mask, below, column], south)]
+    return _steps([(own, end, stiffness) for end, stiffness in ends], mask.size)
 
 
 def _blocks(inside: npt.NDArray[np.bool_]) -> scipy.sparse.csr_array:

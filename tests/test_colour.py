@@ -148,7 +148,19 @@ def test_twins_of_the_exposure_scale(monkeypatch: pytest.MonkeyPatch) -> None:
         assert np.allclose(scales[1] - scales[0], 0.4)
 
 
-def dense_gains(measured: colour.Measured, rounds: tuple) -> np.ndarray:
+def slopes(mask: np.ndarray, area: np.ndarray, wraps: bool) -> list[tuple]:
+    """Neighbouring cells of a mask, row and column of each, and how stiff the step between them is."""
+    found, width = [], mask.shape[1]
+    for y, x in np.argwhere(mask):
+        right = (x + 1) % width
+        if (right > x or wraps) and mask[y, right]:
+            found.append(((y, x), (y, right), 1 / area[y]))
+        if y + 1 < len(mask) and mask[y + 1, x]:
+            found.append(((y, x), (y + 1, x), math.sqrt(area[y] * area[y + 1])))
+    return found
+
+
+def dense_gains(measured: colour.Measured, rounds: tuple, unknown: np.ndarray) -> np.ndarray:
     """The minimum of the sum in colour.py by least squares, of blocks where differences weigh little."""
     cells, inside = measured.grid, measured.inside
     (_, height, width), index = inside.shape, np.arange(inside.size).reshape(inside.shape)
@@ -173,16 +185,17 @@ def dense_gains(measured: colour.Measured, rounds: tuple) -> np.ndarray:
             targets.append(target * math.sqrt(weight))
 
         nothing = np.zeros(3)
-        for k, y, x in np.argwhere(inside):
-            term(area[y] / fade**2, {index[k, y, x]: 1}, nothing)
-            right = (x + 1) % width
-            if (right > x or cells.wraps) and inside[k, y, right]:
-                term(slack / area[y], {index[k, y, x]: 1, index[k, y, right]: -1}, nothing)
-            if y + 1 < height and inside[k, y + 1, x]:
-                between = slack * math.sqrt(area[y] * area[y + 1])
-                term(between, {index[k, y, x]: 1, index[k, y + 1, x]: -1}, nothing)
+        for k, mask in enumerate(inside):
+            for y, x in np.argwhere(mask):
+                term(area[y] / fade**2, {index[k, y, x]: 1}, nothing)
+            for here, there, stiff in slopes(mask, area, cells.wraps):
+                term(slack * stiff, {index[k, *here]: 1, index[k, *there]: -1}, nothing)
         for one in measured.differences:
             a, b, d = one.a, one.b, one.values
+            for here, there, stiff in slopes(inside[a] & inside[b], area, cells.wraps):
+                if unknown[here] or unknown[there]:
+                    entries = {index[a, *here]: 1, index[b, *here]: -1, index[a, *there]: -1}
+                    term(slack * stiff * colour._TOGETHER, entries | {index[b, *there]: 1}, nothing)
             for y, x in np.argwhere(d[..., 3] > 0):
                 off = solution[a, y, x] - solution[b, y, x] + d[y, x, :3]
                 distance = np.linalg.norm(off) if solution.any() else 0.0
@@ -231,11 +244,14 @@ CELLS = {
 
 @pytest.mark.parametrize("rounds", [colour._ROUNDS, colour._STRICT], ids=["normal", "strict"])
 @pytest.mark.parametrize("name", list(CELLS))
-def test_solve_is_dense_least_squares(name: str, rounds: tuple[tuple[float, float], ...]) -> None:
+@pytest.mark.parametrize("hole", [False, True])
+def test_solve_is_dense_least_squares(name: str, rounds: tuple[tuple[float, float], ...], hole: bool) -> None:
     cells = CELLS[name]
     measured = overlapping(0, cells)
-    gains = solved(measured, rounds)
-    expected = dense_gains(measured, rounds)
+    unknown = np.zeros(measured.inside.shape[1:], bool)
+    unknown[2, 0] = unknown[3:, 4:6] = hole  # between 0 and 2, and 0 and 1; these end there
+    gains = solved(measured, rounds, unknown if hole else None)
+    expected = dense_gains(measured, rounds, unknown)
     assert np.abs(expected).max() > 0.05
     assert np.allclose(gains, expected, atol=1e-7)
     assert not gains[~measured.inside].any()
@@ -305,6 +321,26 @@ def test_layers_agree_where_they_are_mixed(device: Device) -> None:
     assert np.allclose([one[:, 18:22] for one in found], 0.4, atol=0.01)
     assert (found[0][:, 12:15] > 0.9).all()
     assert (found[1][:, 12:15] < found[0][:, 12:15] - 0.1).all()
+
+
+@pytest.mark.parametrize("rounds", [colour._ROUNDS, colour._STRICT], ids=["normal", "strict"])
+def test_a_difference_goes_on_where_nothing_tells_of_it(rounds: tuple[tuple[float, float], ...]) -> None:
+    """As behind somebody who fills an overlap from side to side: gains fade out beside it, their difference
+    does not, nor does it stay behind where it changes.
+    """
+    cells, inside = plane(640, 480).resized(40, 30), np.zeros((2, 30, 40), bool)
+    inside[0, :, :23], inside[1, :, 17:] = True, True
+    values = np.zeros((30, 40, 4))
+    values[..., :3] = np.linspace(0.4, 0.7, 30)[:, None, None]
+    values[..., 3] = inside.all(0)
+    values[10:20, :, 3] = 0
+    difference = colour.Difference(0, 1, values, np.zeros_like(values), np.ones((30, 40)))
+    measured, off = colour.Measured(cells, inside, 1.0, (difference,)), []
+    for unknown in (None, values[..., 3] == 0):
+        one, other = solved(measured, rounds, unknown)
+        off.append(np.abs((other - one - values[..., :3])[:, 17:23]).max())
+        assert np.abs(one[:, 0]).max() < 0.5 * np.abs(one[:, 20]).max()
+    assert off[1] < 0.05 < 0.15 < off[0]
 
 
 def test_gains_reach_two_cells_beyond_a_layer() -> None:
