@@ -67,7 +67,7 @@ _CLIPPED, _DARKER = 0.5, 0.05
 _TRACE = 1e-12
 # How much more a region may cost if that shows things once and whole, from a layer that has most of it: where
 # flow tells that something moved, and anywhere.
-_ONCE, _WHOLE, _MOSTLY = 2.0, 1.7, 0.5
+_ONCE, _WHOLE, _MOSTLY = 2.0, 1.65, 0.5
 
 
 Cells = npt.NDArray[np.bool_]  # (height, width) on the seam grid
