@@ -8,10 +8,11 @@ through each layer, smoothly, and fades out. It is the minimum of
 
 with d_ab the measured difference of the aligned layers, and c how far it can be trusted, how much it tells
 (dark samples little) and how far both are seen: a sparse linear system, solved directly; in the first rounds,
-which only tell what to trust, for blocks of cells. Where there is no difference it is exactly zero.
+which only tell what to trust, for blocks of cells. Where no layers differ, all gains are exactly zero.
 
-h is not 0 where what layers show tells nothing, as somebody whom one of them shows does not: gains would fade
-there, and leave a step beside him. Their difference is rather as it is around.
+h is 0 but in and beside cells where what is seen tells nothing of exposure, such as somebody whom only one
+layer shows. Without it both gains would fade there, and with them their difference: a step beside him. With
+it the difference goes on from around, and fades much more slowly.
 
 Cameras' curves level off towards white, by which log odds move colours as exposure does; others run straight
 into it. The scale's shoulder, between both, is the one that leaves the least of the differences: else a
@@ -56,7 +57,8 @@ _STRICT = ((0.01, 4.0), (0.03, 2.5), (0.3, 1.6), (3.0, 1.2), (100.0, 1.0))
 _ROUGH, _BLOCK = 1.0, 2
 # Weight of a clipped cell against smoothness: what it tells is a bound, of a brightness that nobody knows.
 _BOUND = 0.1
-# Weight of the smoothness of the difference of two layers' gains, where nothing is to tell of it.
+# Weight of the smoothness of the difference of two layers' gains, for steps into and within cells that tell
+# nothing; that of each gain's own is 1.
 _TOGETHER = 10.0
 # Weight of what is seen of one layer alone: where layers are not mixed they are best left as they are.
 _UNSEEN = 0.003
@@ -266,7 +268,7 @@ def solve(
 ) -> npt.NDArray[np.float64]:
     """Gains (cells, 3) of the layers' cells, in the order of `measured.inside`, for differences.
 
-    unknown: (height, width), the cells of which these tell nothing, by what is seen there.
+    unknown: (height, width), cells where what is seen tells nothing of exposure, and no difference weighs.
     """
     cells, inside, differences = measured.grid, measured.inside, measured.differences
     area = np.maximum(cells.row_widths, 0.02)[:, None]
@@ -277,8 +279,8 @@ def solve(
     evidence = []
     for d, its in zip(differences, shared, strict=True):
         # what a layer is measured to be beside its own cells binds nothing else
-        both = its[d.cells] = inside[d.a][d.cells] & inside[d.b][d.cells]
-        evidence.append(d.values[..., 3] * area[d.cells[0]] * both)
+        its[d.cells] = inside[d.a][d.cells] & inside[d.b][d.cells]
+        evidence.append(d.values[..., 3] * area[d.cells[0]] * its[d.cells])
     link, weight = _steps(
         [(number[d.a][d.cells], number[d.b][d.cells], e) for d, e in zip(differences, evidence, strict=True)],
         count,
@@ -288,7 +290,8 @@ def solve(
     step, stiffness = _slopes(inside, area, cells.wraps)
     smooth = step.T @ scipy.sparse.diags_array(stiffness) @ step
     if unknown is not None:
-        pairs = [(number[d.a][i], number[d.b][i], i[i]) for d, i in zip(differences, shared, strict=True)]
+        of_pairs = zip(differences, shared, strict=True)
+        pairs = [(number[d.a][its], number[d.b][its], np.ones(its.sum())) for d, its in of_pairs]
         step, stiffness = _slopes(shared, area, cells.wraps)
         beside = abs(step) @ np.broadcast_to(unknown, shared.shape)[shared] > 0
         apart = step[beside] @ _steps(pairs, count)[0]
@@ -318,8 +321,10 @@ def solve(
 def _slopes(
     masks: npt.NDArray[np.bool_], area: npt.NDArray[np.float64], wraps: bool
 ) -> tuple[scipy.sparse.csr_array, npt.NDArray[np.float64]]:
-    """A matrix (steps, cells) that takes the steps between neighbouring cells, of each of some masks (n,
-    height, width), and their stiffness (steps,); area: of the cells of each row, (height, 1).
+    """The steps between neighbouring cells within each of some masks (n, height, width): a matrix (steps,
+    cells) that takes them, cells in the order of `np.nonzero(masks)`, and their stiffness (steps,).
+
+    area: of each row's cells, (height, 1).
     """
     mask, row, column = np.nonzero(masks)
     own = np.arange(mask.size)
