@@ -121,14 +121,16 @@ def test_who_took_a_step_is_shown_once_and_unbent(turned: int, order: slice) -> 
 
 @pytest.mark.usefixtures(one_device.__name__)
 def test_what_is_beside_him_would_be_bent(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The checks above can fail. To look for him or for regions is enough here; without either, and with
-    transitions that are not led around him, what is beside him is bent.
+    """The checks above can fail. Without regions that layers differ in, and transitions that are led around
+    him, to look for him is what keeps him whole; without that he is bent, and so is what is beside him.
     """
     one = shoot(PERSON)
-    monkeypatch.setattr(movers, "find", lambda *_: None)
     monkeypatch.setattr(seam, "_LEAST", np.inf)
     published = {"transition_strain": 0.0}
-    assert beside_him(merged(one.layers, CANVAS, **published), one, **published) > 5 * FEW
+    assert best(merged(one.layers, CANVAS, **published), one)[0][0] < WHOLE
+    monkeypatch.setattr(movers, "find", lambda *_: None)
+    bent = merged(one.layers, CANVAS, **published)
+    assert best(bent, one)[0][0] > 2 * WHOLE and beside_him(bent, one, **published) > 5 * FEW
 
 
 def test_his_place_is_known_wherever_it_matters(device: Device, monkeypatch: pytest.MonkeyPatch) -> None:
