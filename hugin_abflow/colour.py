@@ -275,12 +275,11 @@ def solve(
     number = np.zeros(inside.shape, np.int32)  # of a layer's cell among the unknowns
     count = int(np.count_nonzero(inside))
     number[inside] = np.arange(count)
-    shared = np.zeros((len(differences), *cells.shape), bool)
     evidence = []
-    for d, its in zip(differences, shared, strict=True):
+    for d in differences:
         # what a layer is measured to be beside its own cells binds nothing else
-        its[d.cells] = inside[d.a][d.cells] & inside[d.b][d.cells]
-        evidence.append(d.values[..., 3] * area[d.cells[0]] * its[d.cells])
+        both = inside[d.a][d.cells] & inside[d.b][d.cells]
+        evidence.append(d.values[..., 3] * area[d.cells[0]] * both)
     link, weight = _steps(
         [(number[d.a][d.cells], number[d.b][d.cells], e) for d, e in zip(differences, evidence, strict=True)],
         count,
@@ -290,8 +289,8 @@ def solve(
     step, stiffness = _slopes(inside, area, cells.wraps)
     smooth = step.T @ scipy.sparse.diags_array(stiffness) @ step
     if unknown is not None:
-        of_pairs = zip(differences, shared, strict=True)
-        pairs = [(number[d.a][its], number[d.b][its], np.ones(its.sum())) for d, its in of_pairs]
+        shared = np.stack([inside[d.a] & inside[d.b] for d in differences])
+        pairs = [(number[d.a], number[d.b], its) for d, its in zip(differences, shared, strict=True)]
         step, stiffness = _slopes(shared, area, cells.wraps)
         beside = abs(step) @ np.broadcast_to(unknown, shared.shape)[shared] > 0
         apart = step[beside] @ _steps(pairs, count)[0]
@@ -299,7 +298,7 @@ def solve(
     # a step between blocks stands for _BLOCK steps, each of that part of it: their squares are less by that
     blocks = _blocks(inside)
     smooth_blocks = blocks.T @ smooth @ blocks / _BLOCK
-    own_area = area[np.nonzero(inside)[1], 0]
+    own_area = np.broadcast_to(area, inside.shape)[inside]
     round_ = cells.circumference / (cells.lens[1] or 1.0)  # cells
     solution, solver, rough_solver = np.zeros((count, 3)), _Solver(), _Solver()
     for data, limit in rounds:
