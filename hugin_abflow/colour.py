@@ -1,18 +1,9 @@
 """Smooth exposure and colour correction of each layer (kernels/colour.cl).
 
-One gain field per layer and channel on a coarse grid, on the exposure scale of common.cl (log odds of integer
-images, log of floats): where layers overlap, the corrected layers agree; from there the correction spreads
-through each layer, smoothly, and fades out. It is the minimum of
-
-    sum_pairs c (g_a - g_b + d_ab)^2 + h |grad (g_a - g_b)|^2  +  sum_k |grad g_k|^2 + g_k^2 / fade^2
-
-with d_ab the measured difference of the aligned layers, and c how far it can be trusted, how much it tells
-(dark samples little) and how far both are seen: a sparse linear system, solved directly; in the first rounds,
-which only tell what to trust, for blocks of cells. Where no layers differ, all gains are exactly zero.
-
-h is 0 but in and beside cells where what is seen tells nothing of exposure, such as somebody whom only one
-layer shows. Without it both gains would fade there, and with them their difference: a step beside him. With
-it the difference goes on from around, and fades much more slowly.
+The aligned layers are compared in their overlaps, on a coarse grid, on the exposure scale of common.cl (log
+odds of integer images, log of floats). Smooth gains that explain how they differ (gains.py) correct them. A
+difference counts as far as it can be trusted, how much it tells (dark samples little) and how far both layers
+are seen.
 
 Cameras' curves level off towards white, by which log odds move colours as exposure does; others run straight
 into it. The scale's shoulder, between both, is the one that leaves the least of the differences: else a
@@ -25,13 +16,13 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any, Final
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-import scipy
 
 from hugin_abflow.coefficient import on_cells
+from hugin_abflow.gains import Difference, Measured, solve
 from hugin_abflow.geometry import Pair
 from hugin_abflow.layer import Box
 from hugin_abflow.opencl import Buffer, Device
@@ -47,23 +38,8 @@ _DEEP = 4.0
 _CLIPPED = 0.98
 # Standard deviation of the differences within a cell that halves its trust, on the exposure scale.
 _SPREAD = 0.3
-# Rounds of (weight of the measured differences against smoothness, distance from the solution at which a cell
-# counts no longer): what is smooth is followed bit by bit.
-_ROUNDS = ((0.1, 4.0), (1.0, 3.0), (100.0, 2.5))
-# The same, slower and stricter: what lies far from it is no exposure but something that only one layer shows.
-_STRICT = ((0.01, 4.0), (0.03, 2.5), (0.3, 1.6), (3.0, 1.2), (100.0, 1.0))
-# Where differences weigh no more than smoothness, gains are smooth, and blocks of so many cells across share
-# one: nearly all of a round's time goes into eliminating unknowns.
-_ROUGH, _BLOCK = 1.0, 2
-# Weight of a clipped cell against smoothness: what it tells is a bound, of a brightness that nobody knows.
-_BOUND = 0.1
-# Weight of the smoothness of the difference of two layers' gains, for steps into and within cells that tell
-# nothing; that of each gain's own is 1.
-_TOGETHER = 10.0
 # Weight of what is seen of one layer alone: where layers are not mixed they are best left as they are.
 _UNSEEN = 0.003
-# The correction fades out over this share of the canvas's width; a trend hardly does.
-_FADE, _TREND_FADE = 0.12, 1.0
 # All gains, and offsets of multiband.py, shrink towards 0 by this, at most a quarter of an 8-bit level, so
 # that small ones are exactly 0.
 NEGLIGIBLE = 1e-3
@@ -74,43 +50,6 @@ _SHOULDERS = (1.0, 0.75, 0.5, 0.25)
 _BETTER = 0.8
 # Misfit, of full scale, that halves the trust in a cell.
 _MISFIT = 0.05
-
-# Of the layers' cells, as the unknowns of `solve`.
-_Numbers = npt.NDArray[np.signedinteger[Any]]
-
-
-@dataclass(frozen=True)
-class Difference:
-    """How layers a and b (indices) differ, float64 (height, width, 4) on cells of the colour grid.
-
-    values  a - b on the exposure scale, r, g, b, and a weight 0..1.
-    beyond  the same where only one of them is clipped, a if the weight is positive, b if it is negative: at
-            least that much.
-    mixing  how far both are seen, (height, width).
-    cells   rows and columns of the grid that these are; what only one layer can be in is left out.
-    """
-
-    a: int
-    b: int
-    values: npt.NDArray[np.float64]
-    beyond: npt.NDArray[np.float64]
-    mixing: npt.NDArray[np.float64]
-    cells: tuple[slice, slice] = (slice(None), slice(None))
-
-
-@dataclass(frozen=True)
-class Measured:
-    """What the layers' overlaps tell of their exposure.
-
-    grid        the colour grid.
-    inside      (layers, height, width): the cells of each layer.
-    shoulder    of the exposure scale (common.cl).
-    """
-
-    grid: Grid
-    inside: npt.NDArray[np.bool_]
-    shoulder: float
-    differences: tuple[Difference, ...]
 
 
 @dataclass(frozen=True)
@@ -179,7 +118,7 @@ def correction(
         differences = tuple(_weighed(d, d.mixing + _UNSEEN) for d in differences)
     if not any(np.any(v[..., :3] * v[..., 3:]) for d in differences for v in (d.values, d.beyond)):
         return none
-    gains = solve(replace(measured, differences=differences), _STRICT if strict else _ROUNDS, unknown)
+    gains = solve(replace(measured, differences=differences), strict, unknown)
     gains = np.sign(gains) * np.maximum(np.abs(gains) - NEGLIGIBLE, 0)
     result: list[Buffer | None] = []
     ends = np.cumsum(np.count_nonzero(inside, axis=(1, 2)))
@@ -259,171 +198,6 @@ def _shoulder(overlaps: Sequence[_Overlap]) -> float:
     total = (misfit / (1 + misfit.min(1, keepdims=True) / _MISFIT**2)).sum(0)
     best = int(np.argmin(total))
     return _SHOULDERS[best if total[best] < _BETTER * total[0] else 0]
-
-
-def solve(
-    measured: Measured,
-    rounds: Sequence[tuple[float, float]] = _ROUNDS,
-    unknown: npt.NDArray[np.bool_] | None = None,
-) -> npt.NDArray[np.float64]:
-    """Gains (cells, 3) of the layers' cells, in the order of `measured.inside`, for differences.
-
-    unknown: (height, width), cells where what is seen tells nothing of exposure, and no difference weighs.
-    """
-    cells, inside, differences = measured.grid, measured.inside, measured.differences
-    area = np.maximum(cells.row_widths, 0.02)[:, None]
-    number = np.zeros(inside.shape, np.int32)  # of a layer's cell among the unknowns
-    count = int(np.count_nonzero(inside))
-    number[inside] = np.arange(count)
-    evidence = []
-    for d in differences:
-        # what a layer is measured to be beside its own cells binds nothing else
-        both = inside[d.a][d.cells] & inside[d.b][d.cells]
-        evidence.append(d.values[..., 3] * area[d.cells[0]] * both)
-    link, weight = _steps(
-        [(number[d.a][d.cells], number[d.b][d.cells], e) for d, e in zip(differences, evidence, strict=True)],
-        count,
-    )
-    difference = np.concatenate([d.values[e > 0, :3] for d, e in zip(differences, evidence, strict=True)])
-    bounds = _Bounds(measured, number, area, count)
-    step, stiffness = _slopes(inside, area, cells.wraps)
-    smooth = step.T @ scipy.sparse.diags_array(stiffness) @ step
-    if unknown is not None:
-        shared = np.stack([inside[d.a] & inside[d.b] for d in differences])
-        pairs = [(number[d.a], number[d.b], its) for d, its in zip(differences, shared, strict=True)]
-        step, stiffness = _slopes(shared, area, cells.wraps)
-        beside = abs(step) @ np.broadcast_to(unknown, shared.shape)[shared] > 0
-        apart = step[beside] @ _steps(pairs, count)[0]
-        smooth += _TOGETHER * (apart.T @ scipy.sparse.diags_array(stiffness[beside]) @ apart)
-    # a step between blocks stands for _BLOCK steps, each of that part of it: their squares are less by that
-    blocks = _blocks(inside)
-    smooth_blocks = blocks.T @ smooth @ blocks / _BLOCK
-    own_area = np.broadcast_to(area, inside.shape)[inside]
-    round_ = cells.circumference / (cells.lens[1] or 1.0)  # cells
-    solution, solver, rough_solver = np.zeros((count, 3)), _Solver(), _Solver()
-    for data, limit in rounds:
-        fade = _TREND_FADE if rounds is _STRICT and data < rounds[-1][0] else _FADE
-        hold = own_area / max(1.0, fade * round_) ** 2
-        off = link @ solution + difference if solution.any() else np.zeros_like(difference)
-        trusted = data * weight * _biweight(off, limit)
-        held, pull = bounds.active(solution, limit)
-        data_term = scipy.sparse.diags_array(hold + held) + link.T @ scipy.sparse.diags_array(trusted) @ link
-        wanted = pull - link.T @ (trusted[:, None] * difference)
-        if data <= _ROUGH:
-            matrix = blocks.T @ data_term @ blocks + smooth_blocks
-            solution = blocks @ rough_solver.solve(matrix, blocks.T @ wanted)
-        else:
-            solution = solver.solve(data_term + smooth, wanted)
-    return np.asarray(solution)
-
-
-def _slopes(
-    masks: npt.NDArray[np.bool_], area: npt.NDArray[np.float64], wraps: bool
-) -> tuple[scipy.sparse.csr_array, npt.NDArray[np.float64]]:
-    """The steps between neighbouring cells within each of some masks (n, height, width): a matrix (steps,
-    cells) that takes them, cells in the order of `np.nonzero(masks)`, and their stiffness (steps,).
-
-    area: of each row's cells, (height, 1).
-    """
-    mask, row, column = np.nonzero(masks)
-    own = np.arange(mask.size)
-    number = np.zeros(masks.shape, np.int32)
-    number[masks] = own
-    right, below = (column + 1) % masks.shape[2], np.minimum(row + 1, masks.shape[1] - 1)
-    goes_on = (column + 1 < masks.shape[2]) | wraps
-    # a cell's sides: steps along a row are shorter near a pole, so neighbours there are bound closer
-    east = (masks[mask, row, right] & goes_on) / area[row, 0]
-    south = (masks[mask, below, column] & (below > row)) * np.sqrt(area[row, 0] * area[below, 0])
-    ends = [(number[mask, row, right], east), (number[mask, below, column], south)]
-    return _steps([(own, end, stiffness) for end, stiffness in ends], mask.size)
-
-
-def _blocks(inside: npt.NDArray[np.bool_]) -> scipy.sparse.csr_array:
-    """A matrix (cells, blocks) that gives each of the layers' cells the value of its block."""
-    layer, row, column = np.nonzero(inside)
-    names = np.stack([layer, row // _BLOCK, column // _BLOCK])
-    blocks, its = np.unique(np.ravel_multi_index(tuple(names), inside.shape), return_inverse=True)
-    return scipy.sparse.csr_array((np.ones(its.size), (np.arange(its.size), its)), (its.size, blocks.size))
-
-
-class _Solver:
-    """Solves symmetric positive definite systems of much the same pattern: the order in which the first one's
-    unknowns are best eliminated serves the others as well. No factors are kept; they are large.
-    """
-
-    # SuperLU's own supernodes and panels are for factors that are less sparse than a grid's
-    _OPTIONS: Final = {
-        "diag_pivot_thresh": 0,
-        "relax": 1,
-        "panel_size": 4,
-        "options": {"SymmetricMode": True},
-    }
-
-    def __init__(self) -> None:
-        self._order: _Numbers | None = None
-
-    def solve(
-        self, matrix: scipy.sparse.csr_array, wanted: npt.NDArray[np.float64]
-    ) -> npt.NDArray[np.float64]:
-        """x (n, k) of matrix (n, n) @ x = wanted."""
-        from scipy.sparse.linalg import splu  # SciPy's parts load when they are needed
-
-        if self._order is None:
-            factors = splu(matrix.tocsc(), "MMD_AT_PLUS_A", **self._OPTIONS)
-            self._order = np.argsort(factors.perm_c)
-            return np.asarray(factors.solve(wanted))
-        ordered = matrix[self._order][:, self._order].tocsc()
-        solution = np.empty_like(wanted)
-        solution[self._order] = splu(ordered, "NATURAL", **self._OPTIONS).solve(wanted[self._order])
-        return solution
-
-
-class _Bounds:
-    """Where only one of two layers is clipped, the other is to be raised by their difference at least."""
-
-    def __init__(
-        self, measured: Measured, number: _Numbers, area: npt.NDArray[np.float64], count: int
-    ) -> None:
-        unknowns, targets, weights = [], [], []
-        for d in measured.differences:
-            for other, sign in ((d.b, 1.0), (d.a, -1.0)):
-                its = measured.inside[other][d.cells]
-                weight = np.maximum(sign * d.beyond[..., 3], 0) * area[d.cells[0]] * its
-                unknowns.append(number[other][d.cells][weight > 0])
-                targets.append(sign * d.beyond[weight > 0, :3])
-                weights.append(weight[weight > 0])
-        self._count = count
-        self._unknowns, self._targets, self._weights = map(np.concatenate, (unknowns, targets, weights))
-
-    def active(
-        self, solution: npt.NDArray[np.float64], limit: float
-    ) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
-        """How strongly each unknown of a solution is held, (count,), and pulled, (count, 3)."""
-        short = self._targets - solution[self._unknowns]
-        weight = _BOUND * self._weights * (short.mean(1) > 0) * _biweight(short, limit)
-        held, pull = np.zeros(self._count), np.zeros((self._count, 3))
-        np.add.at(held, self._unknowns, weight)
-        np.add.at(pull, self._unknowns, weight[:, None] * self._targets)
-        return held, pull
-
-
-def _biweight(off: npt.NDArray[np.float64], limit: float) -> npt.NDArray[np.float64]:
-    """Tukey's biweight of vectors (n, 3): 1 at 0, nothing from `limit` on."""
-    return np.asarray(np.maximum(0.0, 1 - (np.square(off).sum(1) / limit**2)) ** 2)
-
-
-def _steps(
-    weighted: Sequence[tuple[_Numbers, _Numbers, npt.NDArray[np.float64]]], count: int
-) -> tuple[scipy.sparse.csr_array, npt.NDArray[np.float64]]:
-    """A matrix (n, count) that takes differences of `count` unknowns, and the weights (n,) of these.
-
-    weighted    arrays of one shape: the unknown to take, the one to subtract, the weight; 0: no row.
-    """
-    taken, less, weights = (np.concatenate([entry[k][entry[2] > 0] for entry in weighted]) for k in range(3))
-    rows = np.arange(weights.size)
-    signs = np.repeat([1.0, -1.0], rows.size)
-    places = np.tile(rows, 2), np.concatenate([taken, less])
-    return scipy.sparse.csr_array((signs, places), shape=(rows.size, count)), weights
 
 
 def _extend(

@@ -1,4 +1,4 @@
-"""Exposure: measured differences against their twin, and what they correct (gains: test_colour_gains.py)."""
+"""Exposure: measured differences against their twin, and what they correct."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ from tolerances import POSITION, assert_close
 from hugin_abflow import colour
 from hugin_abflow.chart import pair_chart
 from hugin_abflow.coefficient import on_cells
+from hugin_abflow.gains import Difference, Measured
 from hugin_abflow.geometry import PairFlow
 from hugin_abflow.opencl import Device
 from hugin_abflow.settings import Settings
@@ -246,3 +247,47 @@ def test_what_is_ignored_is_no_evidence(device: Device) -> None:
             assert np.abs(seen - gains[-1]).max() > 0.02
     assert np.array_equal(gains[0], gains[1])
     assert np.abs(gains[0] - gains[2]).max() < 0.03  # beside 0.25 each
+
+
+def test_cells_grow_where_many_layers_lie_on_each_other() -> None:
+    """Up to four layers change nothing; with twice as many, cells are twice as wide."""
+    for layers, cells in ((1, 10), (4, 10), (8, 5)):
+        assert colour.colour_grid(plane(160, 160), np.ones((layers, 53, 77), bool)).shape == (cells, cells)
+
+
+def test_layers_agree_where_they_are_mixed(device: Device) -> None:
+    """What is seen of one layer alone has little to say."""
+    cells, inside = GRIDS["plane"].resized(40, 5), np.ones((2, 5, 40), bool)
+    values = np.full((5, 40, 4), 1.0)
+    values[:, 16:24, :3] = 0.4
+    found = []
+    for everywhere in (True, False):
+        mixing = np.full((5, 40), float(everywhere))
+        mixing[:, 16:24] = 1
+        difference = Difference(0, 1, values, np.zeros((5, 40, 4)), mixing)
+        measured = Measured(cells, inside, 1.0, (difference,))
+        a, b = (gain.get()[..., 0] for gain in colour.correction(device, measured, Settings()).gains)
+        found.append(b - a)
+    assert np.allclose([one[:, 18:22] for one in found], 0.4, atol=0.01)
+    assert (found[0][:, 12:15] > 0.9).all()
+    assert (found[1][:, 12:15] < found[0][:, 12:15] - 0.1).all()
+
+
+@pytest.mark.parametrize("strict", [False, True], ids=["normal", "strict"])
+def test_a_difference_goes_on_where_nothing_tells_of_it(device: Device, strict: bool) -> None:
+    """As behind somebody who fills an overlap: gains fade out beside it, their difference does not."""
+    cells, inside = plane(640, 480).resized(40, 30), np.zeros((2, 30, 40), bool)
+    inside[0, :, :23], inside[1, :, 17:] = True, True
+    wanted = np.broadcast_to(np.linspace(0.4, 0.7, 30)[:, None, None], (30, 40, 3))
+    values = np.concatenate([wanted, inside.all(0)[..., None]], 2)
+    somebody = np.zeros((30, 40), bool)
+    somebody[10:20] = True
+    values[somebody, :3] = -1
+    measured = Measured(
+        cells, inside, 1.0, (Difference(0, 1, values, np.zeros_like(values), np.ones((30, 40))),)
+    )
+    found = colour.correction(device, measured, Settings(), somebody, strict).gains
+    one, other = (gain.get()[..., :3] for gain in found)
+    off = np.abs(other - one - wanted)[:, 17:23].max((1, 2))
+    assert off[somebody[:, 0]].max() < 0.05 and off[~somebody[:, 0]].max() < 0.005
+    assert np.abs(one[:, 0]).max() < 0.5 * np.abs(one[:, 20]).max()

@@ -13,6 +13,7 @@ from scipy import ndimage
 
 from hugin_abflow import colour, seam
 from hugin_abflow.coefficient import Masks, Overlaps
+from hugin_abflow.gains import Difference, Measured, solve
 from hugin_abflow.geometry import Pair
 from hugin_abflow.layer import Box
 from hugin_abflow.opencl import Device
@@ -115,13 +116,13 @@ def test_differences_count_in_their_rows_and_columns() -> None:
         one[..., 3] = np.abs(one[..., 3]) if one is few[0] else np.round(one[..., 3])
         same[1:5, 13:20] = one
     differences = (
-        colour.Difference(0, 1, *few, np.ones((4, 7)), np.s_[1:5, 13:20]),
-        colour.Difference(0, 1, *wide, np.ones(cells.shape)),
+        Difference(0, 1, *few, np.ones((4, 7)), np.s_[1:5, 13:20]),
+        Difference(0, 1, *wide, np.ones(cells.shape)),
     )
     for beyond_alone in (False, True):
         if beyond_alone:
             few[0][..., 3] = wide[0][..., 3] = 0
-        gains = [colour.solve(colour.Measured(cells, inside, 1.0, (one,))) for one in differences]
+        gains = [solve(Measured(cells, inside, 1.0, (one,))) for one in differences]
         assert np.array_equal(*gains)
         assert (np.abs(gains[0]) > 0.01).any()
 

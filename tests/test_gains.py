@@ -1,4 +1,4 @@
-"""Gains: the solver against dense least squares, and what it makes of what overlaps tell."""
+"""Gains: the solver against dense least squares, and what it makes of differences."""
 
 from __future__ import annotations
 
@@ -7,21 +7,20 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from grids import GRIDS, plane, sphere
+from grids import plane, sphere
 
-from hugin_abflow import colour
-from hugin_abflow.opencl import Device
-from hugin_abflow.settings import Settings
+from hugin_abflow import gains
+from hugin_abflow.gains import Difference, Measured
 from hugin_abflow.working import Grid
 
 STRICT = pytest.mark.parametrize("strict", [False, True], ids=["normal", "strict"])
 
 
-def solved(measured: colour.Measured, *rounds) -> np.ndarray:
+def solved(measured: Measured, strict: bool = False, unknown: np.ndarray | None = None) -> np.ndarray:
     """Gains (layers, height, width, 3); 0 beside the layers' cells."""
-    gains = np.zeros((*measured.inside.shape, 3))
-    gains[measured.inside] = colour.solve(measured, *rounds)
-    return gains
+    result = np.zeros((*measured.inside.shape, 3))
+    result[measured.inside] = gains.solve(measured, strict, unknown)
+    return result
 
 
 def slopes(mask: np.ndarray, area: np.ndarray, wraps: bool) -> list[tuple]:
@@ -36,8 +35,8 @@ def slopes(mask: np.ndarray, area: np.ndarray, wraps: bool) -> list[tuple]:
     return found
 
 
-def dense_gains(measured: colour.Measured, rounds: tuple, unknown: np.ndarray) -> np.ndarray:
-    """The minimum of the sum in colour.py by least squares, of blocks where differences weigh little."""
+def dense_gains(measured: Measured, strict: bool, unknown: np.ndarray) -> np.ndarray:
+    """The minimum of the sum in gains.py by least squares, of blocks where differences weigh little."""
     cells, inside = measured.grid, measured.inside
     (_, height, width), index = inside.shape, np.arange(inside.size).reshape(inside.shape)
     latitude = cells.lens[2] - (np.arange(height) + 0.5) * cells.lens[3]
@@ -47,10 +46,11 @@ def dense_gains(measured: colour.Measured, rounds: tuple, unknown: np.ndarray) -
     blocks = np.zeros((inside.size, inside.size))
     for k, y, x in np.argwhere(inside):
         blocks[index[k, y, x], index[k, y // 2, x // 2]] = 1
+    rounds = gains._STRICT if strict else gains._ROUNDS
     for data, limit in rounds:
         slack, onto = (0.5, blocks) if data <= 1 else (1.0, np.eye(inside.size))
-        last = rounds is colour._ROUNDS or (data, limit) == rounds[-1]
-        fade = max(1.0, (colour._FADE if last else colour._TREND_FADE) * circle)
+        last = not strict or (data, limit) == rounds[-1]
+        fade = max(1.0, (gains._FADE if last else gains._TREND_FADE) * circle)
         rows, targets = [], []
 
         def term(weight: float, entries: dict[int, float], target: np.ndarray, rows=rows, targets=targets):
@@ -71,7 +71,7 @@ def dense_gains(measured: colour.Measured, rounds: tuple, unknown: np.ndarray) -
             for here, there, stiff in slopes(inside[a] & inside[b], area, cells.wraps):
                 if unknown[here] or unknown[there]:
                     entries = {index[a, *here]: 1, index[b, *here]: -1, index[a, *there]: -1}
-                    term(slack * stiff * colour._TOGETHER, entries | {index[b, *there]: 1}, nothing)
+                    term(slack * stiff * gains._TOGETHER, entries | {index[b, *there]: 1}, nothing)
             for y, x in np.argwhere(d[..., 3] > 0):
                 off = solution[a, y, x] - solution[b, y, x] + d[y, x, :3]
                 distance = np.linalg.norm(off) if solution.any() else 0.0
@@ -85,14 +85,14 @@ def dense_gains(measured: colour.Measured, rounds: tuple, unknown: np.ndarray) -
                 short = least - solution[raised]
                 if inside[raised] and short.mean() > 0 and np.linalg.norm(short) < limit:
                     trust = (1 - (np.linalg.norm(short) / limit) ** 2) ** 2
-                    weight = colour._BOUND * area[y] * abs(one.beyond[y, x, 3]) * trust
+                    weight = gains._BOUND * area[y] * abs(one.beyond[y, x, 3]) * trust
                     term(weight, {index[raised]: 1}, least)
         solution = onto @ np.linalg.lstsq(np.array(rows) @ onto, np.array(targets), rcond=None)[0]
         solution = solution.reshape(*inside.shape, 3)
     return solution
 
 
-def overlapping(seed: int, cells: Grid) -> colour.Measured:
+def overlapping(seed: int, cells: Grid) -> Measured:
     """Measured differences of three layers, and which cells each covers."""
     random = np.random.default_rng(seed)
     inside = np.zeros((3, cells.height, cells.width), bool)
@@ -107,8 +107,8 @@ def overlapping(seed: int, cells: Grid) -> colour.Measured:
         beyond[3:, ::2] = [0.9, 0.5, 0.7, 0.6]  # a is clipped
         beyond[4:, 1::2] = [-0.2, -0.6, -0.8, -0.9]
         mixing = np.ones(d.shape[:2])
-        differences.append(colour.Difference(a, b, d, beyond * (inside[a] & inside[b])[..., None], mixing))
-    return colour.Measured(cells, inside, 1.0, tuple(differences))
+        differences.append(Difference(a, b, d, beyond * (inside[a] & inside[b])[..., None], mixing))
+    return Measured(cells, inside, 1.0, tuple(differences))
 
 
 CELLS = {
@@ -122,37 +122,30 @@ CELLS = {
 @pytest.mark.parametrize("name", list(CELLS))
 @pytest.mark.parametrize("hole", [False, True])
 def test_solve_is_dense_least_squares(name: str, strict: bool, hole: bool) -> None:
-    rounds = colour._STRICT if strict else colour._ROUNDS
     cells = CELLS[name]
     measured = overlapping(0, cells)
     unknown = np.zeros(measured.inside.shape[1:], bool)
     unknown[2, 0] = unknown[3:, 4:6] = hole  # between 0 and 2, and 0 and 1; these end there
     measured.inside[0, :, -1] = hole  # which 2 lies on as well, on both sides of the border
-    gains = solved(measured, rounds, unknown if hole else None)
-    expected = dense_gains(measured, rounds, unknown)
+    found = solved(measured, strict, unknown if hole else None)
+    expected = dense_gains(measured, strict, unknown)
     assert np.abs(expected).max() > 0.05
-    assert np.allclose(gains, expected, atol=1e-7)
-    assert not gains[~measured.inside].any()
-
-
-def test_cells_grow_where_many_layers_lie_on_each_other() -> None:
-    """Up to four layers change nothing; with twice as many, cells are twice as wide."""
-    for layers, cells in ((1, 10), (4, 10), (8, 5)):
-        assert colour.colour_grid(plane(160, 160), np.ones((layers, 53, 77), bool)).shape == (cells, cells)
+    assert np.allclose(found, expected, atol=1e-7)
+    assert not found[~measured.inside].any()
 
 
 @pytest.mark.parametrize(("shift", "off"), [(2, 1e-6), (4, 1e-6), (1, 5e-3)])
 def test_turning_a_panorama_turns_its_gains(shift: int, off: float) -> None:
     """Where blocks of cells turn as well; else first rounds differ a little."""
     measured = overlapping(2, sphere(110, 55).resized(10, 5))
-    gains = solved(measured)
+    found = solved(measured)
     turned = [
         replace(d, values=np.roll(d.values, shift, 1), beyond=np.roll(d.beyond, shift, 1))
         for d in measured.differences
     ]
     inside = np.roll(measured.inside, shift, 2)
     again = solved(replace(measured, inside=inside, differences=tuple(turned)))
-    assert np.allclose(np.roll(gains, shift, 2), again, atol=off)
+    assert np.allclose(np.roll(found, shift, 2), again, atol=off)
 
 
 def test_no_difference_is_exactly_no_gain() -> None:
@@ -171,8 +164,8 @@ def test_what_is_clipped_is_a_bound_for_the_other() -> None:
     nothing = np.zeros_like(beyond)
 
     def solve(values: np.ndarray, beyond: np.ndarray) -> np.ndarray:
-        difference = colour.Difference(0, 1, values, beyond, np.ones((5, 9)))
-        return solved(colour.Measured(CELLS["plane"], inside, 1.0, (difference,)))
+        difference = Difference(0, 1, values, beyond, np.ones((5, 9)))
+        return solved(Measured(CELLS["plane"], inside, 1.0, (difference,)))
 
     raised, other = solve(nothing, beyond)
     assert (raised[:, 3:6] > 0.02).all() and (raised <= 0.7).all()
@@ -181,41 +174,3 @@ def test_what_is_clipped_is_a_bound_for_the_other() -> None:
     less = beyond * [0.1, 0.1, 0.1, 1.0]
     assert (solve(brighter, nothing)[0][:, 3:6] > 0.1).all()
     assert np.allclose(solve(brighter, less), solve(brighter, nothing), atol=0.02)
-
-
-def test_layers_agree_where_they_are_mixed(device: Device) -> None:
-    """What is seen of one layer alone has little to say."""
-    cells, inside = GRIDS["plane"].resized(40, 5), np.ones((2, 5, 40), bool)
-    values = np.full((5, 40, 4), 1.0)
-    values[:, 16:24, :3] = 0.4
-    found = []
-    for everywhere in (True, False):
-        mixing = np.full((5, 40), float(everywhere))
-        mixing[:, 16:24] = 1
-        difference = colour.Difference(0, 1, values, np.zeros((5, 40, 4)), mixing)
-        measured = colour.Measured(cells, inside, 1.0, (difference,))
-        a, b = (gain.get()[..., 0] for gain in colour.correction(device, measured, Settings()).gains)
-        found.append(b - a)
-    assert np.allclose([one[:, 18:22] for one in found], 0.4, atol=0.01)
-    assert (found[0][:, 12:15] > 0.9).all()
-    assert (found[1][:, 12:15] < found[0][:, 12:15] - 0.1).all()
-
-
-@STRICT
-def test_a_difference_goes_on_where_nothing_tells_of_it(device: Device, strict: bool) -> None:
-    """As behind somebody who fills an overlap: gains fade out beside it, their difference does not."""
-    cells, inside = plane(640, 480).resized(40, 30), np.zeros((2, 30, 40), bool)
-    inside[0, :, :23], inside[1, :, 17:] = True, True
-    wanted = np.broadcast_to(np.linspace(0.4, 0.7, 30)[:, None, None], (30, 40, 3))
-    values = np.concatenate([wanted, inside.all(0)[..., None]], 2)
-    somebody = np.zeros((30, 40), bool)
-    somebody[10:20] = True
-    values[somebody, :3] = -1
-    measured = colour.Measured(
-        cells, inside, 1.0, (colour.Difference(0, 1, values, np.zeros_like(values), np.ones((30, 40))),)
-    )
-    found = colour.correction(device, measured, Settings(), somebody, strict).gains
-    one, other = (gain.get()[..., :3] for gain in found)
-    off = np.abs(other - one - wanted)[:, 17:23].max((1, 2))
-    assert off[somebody[:, 0]].max() < 0.05 and off[~somebody[:, 0]].max() < 0.005
-    assert np.abs(one[:, 0]).max() < 0.5 * np.abs(one[:, 20]).max()
