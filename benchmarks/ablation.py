@@ -25,6 +25,7 @@ PARTS: dict[str, Mapping[str, Any]] = {
     "no flow": {"flow": False},
     "no flow, no seam": {"flow": False, "seam": False},
     "no seam": {"seam": False},
+    "no clones": {"clones": False},
     "no movers": {"movers": False},
     "no foreground": {"foreground": False},
     "no relay": {"relay": False},

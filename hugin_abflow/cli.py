@@ -69,6 +69,7 @@ def _print_devices(context: click.Context, parameter: click.Parameter, wanted: b
 _file, _new_file, _new_image = click.Path(path_type=Path), NewFile(), NewFile(image=True)
 _layers = partial(click.option, cls=Option, group="Layers")
 _blending = partial(click.option, cls=Option, group="Blending", show_default=True)
+_switch = partial(_blending, type=click.Choice(["auto", "off"]), default="auto")
 _result = partial(click.option, cls=Option, group="Result")
 _batch = partial(click.option, cls=Option, group="Many projects")
 _resources = partial(click.option, cls=Option, group="Resources")
@@ -132,16 +133,12 @@ _information = partial(click.option, cls=Option, group="Information")
     default=_DEFAULTS.merge,
     help="joint: all layers at once. sequential: two at a time, as published; for comparison.",
 )
-@_blending(
+@_switch(
     "--exposure",
-    type=click.Choice(["auto", "off"]),
-    default="auto" if _DEFAULTS.exposure else "off",
     help="Match brightness and colour, and blend low frequencies widely. off: leave both as nona made them.",
 )
-@_blending(
+@_switch(
     "--guides",
-    type=click.Choice(["auto", "off"]),
-    default="auto" if _DEFAULTS.guides else "off",
     help="Let the project's control points lead the flow where it goes astray. off: leave them aside.",
 )
 @_blending(
@@ -151,11 +148,13 @@ _information = partial(click.option, cls=Option, group="Information")
     help="Search for motion of up to a tenth of the canvas's width (very near things). auto: keep what makes "
     "photos clearly more alike, unless it is small and walked; on: all that is found, even if grids mislead.",
 )
-@_blending(
+@_switch(
     "--seam",
-    type=click.Choice(["auto", "off"]),
-    default="auto" if _DEFAULTS.seam else "off",
     help="Take from one photo, whole, what flow cannot explain (somebody who walked). off: blend it.",
+)
+@_switch(
+    "--clones",
+    help="Show somebody once whom two photos show at two places, unless that cuts him. off: at both.",
 )
 @_blending(
     "--softmax-sharpness",
@@ -385,6 +384,7 @@ def _options(
     guides: str,
     large_motion: LargeMotion,
     seam: str,
+    clones: str,
     softmax_sharpness: float,
     flow_magnitude: float,
     no_flow: bool,
@@ -406,6 +406,7 @@ def _options(
         exposure=exposure == "auto",
         guides=guides == "auto",
         seam=seam == "auto",
+        clones=clones == "auto",
         large_motion=large_motion,
         device=device,
         max_memory=max_memory or 0,

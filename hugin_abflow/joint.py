@@ -18,6 +18,7 @@ import numpy.typing as npt
 
 from hugin_abflow import (
     blend,
+    clones,
     coefficient,
     colour,
     figures,
@@ -49,6 +50,7 @@ from hugin_abflow.guides import Guide, by_pair
 from hugin_abflow.layer import Canvas, Layer
 from hugin_abflow.opencl import Buffer, Device, DeviceMemoryError
 from hugin_abflow.progress import Progress
+from hugin_abflow.regions import Cells
 from hugin_abflow.settings import FlowQuality, Settings
 from hugin_abflow.working import Grid, WorkingLayer
 
@@ -238,7 +240,7 @@ class _Aligned:
     fields: list[Buffer]
     reaches: list[list[float]]
     correction: Correction
-    whole: seam.Cells | None
+    whole: Cells | None
     unlike: Unlike | None
 
 
@@ -247,7 +249,7 @@ def _align(
     layers: Sequence[WorkingLayer],
     pairs: Sequence[Pair],
     flows: list[PairFlow],
-    once: seam.Cells | None,
+    once: Cells | None,
     masks: Masks,
     grid: Grid,
     settings: Settings,
@@ -270,7 +272,7 @@ def _align(
     device.give_back()  # two solutions at a time take the most memory
     with ThreadPoolExecutor(2, "gains") as solving:  # each on one core: the device goes on meanwhile
 
-        def gains(how: Settings, ignored: seam.Cells | None, stern: bool = False) -> Future[Correction]:
+        def gains(how: Settings, ignored: Cells | None, stern: bool = False) -> Future[Correction]:
             return solving.submit(colour.correction, device, measured, how, ignored, stern)
 
         # exposure explains a difference whether it is corrected or not
@@ -279,7 +281,7 @@ def _align(
         # what the layers get, unless something is to be whole, which is rarely known before
         hoped = gains(settings, None) if settings.flow and once is None and settings.cores > 1 else None
         reaches = [geometry.reach(device, *one, grid) for one in zip(layers, fields, strict=True)]
-        whole: seam.Cells | None = None
+        whole: Cells | None = None
         unlike: Unlike | None = None
         for _ in range(rounds):
             strict = (first if first and whole is None else gains(exposure, whole, True)).result()
@@ -298,8 +300,12 @@ def _align(
             last = gains(settings, whole)
             lost = seam.lost(device, layers, fields, pairs, strict, clipped.excess, grid)
             highlights.regain(device, layers, fields, further, whole, grid)
-            owner = seam.cut(device, layers, fields, residual, whole, masks, grid, once, lost)
             cells = seam.seam_grid(grid)
+            each_once = partial(clones.owners, device, layers, fields, pairs, strict, grid, cells)
+            owner = seam.cut(
+                device, layers, fields, residual, whole, masks, grid, once, lost,
+                choose=each_once if settings.clones else None,
+            )  # fmt: skip
             unlike = Unlike.of(cells, residual.mean, whole, once)
             for k in membrane.stretch(
                 device, layers, fields, owner, whole, unlike.anywhere, masks, grid, cells

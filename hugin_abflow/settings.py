@@ -38,6 +38,7 @@ class Settings:
                         blend low frequencies widely.
     highlights          take what one layer shows clipped from another that does not.
     seam                take from one layer, whole, what flow cannot explain (people who moved, occlusions).
+    clones              with it, show somebody once whom two layers show at two places, if that cuts nobody.
     movers              with it, take so, too, what flow matches although it moved by itself, where flow tells
                         how the camera moved.
     foreground          and near things that would be bent, where one layer shows all of them.
@@ -71,6 +72,7 @@ class Settings:
     exposure: bool = True
     highlights: bool = True
     seam: bool = True
+    clones: bool = True
     movers: bool = True
     foreground: bool = True
     relay: bool = True
@@ -115,7 +117,7 @@ class Settings:
                 expected = " or ".join(map(repr, choices))
                 raise SettingsError(f"{name} is {value!r}; choose {expected}")
         for name in (
-            "flow", "exposure", "highlights", "seam", "movers", "foreground", "relay", "guides",
+            "flow", "exposure", "highlights", "seam", "clones", "movers", "foreground", "relay", "guides",
             "intermediate",
         ):  # fmt: skip
             if not isinstance(getattr(self, name), bool):

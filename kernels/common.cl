@@ -368,17 +368,23 @@ static inline float2 layer_position(float2 q, float3 d, float4 lens) {
     return canvas_position(canvas_point(q, lens) + d, lens);
 }
 
+/* What an aligned layer shows for working pixel p; false where it shows nothing. */
+static inline bool layer_shown(__global const float4 *layer, __global const float4 *field, int4 box, int2 p,
+                               int4 border, float4 lens, float4 *c) {
+    const int at = box_index(p, box);
+    if (at < 0 || layer[at].w == 0.0f)
+        return false;
+    const float2 q = (float2)(p.x + 0.5f, p.y + 0.5f);
+    *c = layer_sample(layer, box, layer_position(q, field[at].xyz, lens), border);
+    return c->w != 0.0f;
+}
+
 /* What two aligned layers show for working pixel p; false where they do not both show something. */
 static inline bool layer_pair(__global const float4 *layer_a, __global const float4 *field_a, int4 box_a,
                               __global const float4 *layer_b, __global const float4 *field_b, int4 box_b,
                               int2 p, int4 border, float4 lens, float4 *a, float4 *b) {
-    const int at_a = box_index(p, box_a), at_b = box_index(p, box_b);
-    if (at_a < 0 || at_b < 0 || layer_a[at_a].w == 0.0f || layer_b[at_b].w == 0.0f)
-        return false;
-    const float2 q = (float2)(p.x + 0.5f, p.y + 0.5f);
-    *a = layer_sample(layer_a, box_a, layer_position(q, field_a[at_a].xyz, lens), border);
-    *b = layer_sample(layer_b, box_b, layer_position(q, field_b[at_b].xyz, lens), border);
-    return a->w != 0.0f && b->w != 0.0f;
+    return layer_shown(layer_a, field_a, box_a, p, border, lens, a) &&
+           layer_shown(layer_b, field_b, box_b, p, border, lens, b);
 }
 
 /* The scale on which exposure differences are smooth fields, c in 0..1 of full scale: log odds of shoulder * c.
@@ -411,6 +417,18 @@ EXPOSURE_RAISE(3)
 /* Add a gain on the exposure scale. */
 static inline float3 exposure_shift(float3 c, float3 gain, float shoulder) {
     return exposure_raise3(c, exponential4(gain.xyzz).xyz - 1.0f, 1.0f, shoulder);
+}
+
+/* A colour as a difference of it is seen: integer images are coded so already, floats are linear light. */
+static inline float3 exposure_look(float3 c, float3 gain, float shoulder) {
+    c = exposure_shift(c, gain, shoulder);
+    c = GREATEST(c, (float3)(0.0f));
+    return shoulder > 0.0f ? c : (float3)(ROOT(c.x), ROOT(c.y), ROOT(c.z));
+}
+
+/* Where a grid of gains, which are smooth, has that of a cell's centre. */
+static inline int gain_index(int column, int row, int4 cells, int4 colours) {
+    return (2 * row + 1) * colours.y / (2 * cells.y) * colours.x + (2 * column + 1) * colours.x / (2 * cells.x);
 }
 
 /* Weights of the four taps around fraction t by cubic convolution (Keys, "Cubic convolution interpolation for

@@ -1,12 +1,5 @@
 /* Where one layer is taken whole. */
 
-/* A colour as a difference of it is seen: integer images are coded so already, floats are linear light. */
-static inline float3 seam_look(float3 c, float3 gain, float shoulder) {
-    c = exposure_shift(c, gain, shoulder);
-    c = GREATEST(c, (float3)(0.0f));
-    return shoulder > 0.0f ? c : (float3)(ROOT(c.x), ROOT(c.y), ROOT(c.z));
-}
-
 /* Mean difference a - b of two aligned, corrected layers over the pixels of a cell (every second one in x and y)
    that both show unclipped, the share of these, and the mean square of the channel that differs most. */
 __kernel void seam_difference(__global const float4 *layer_a, __global const float4 *field_a, int4 box_a,
@@ -26,8 +19,7 @@ __kernel void seam_difference(__global const float4 *layer_a, __global const flo
         return;
     const int cx = part.x + column, cy = part.y + row;
     const int4 its = cell_pixels(cx, cy, border, cells);
-    /* gains are smooth: the cell's centre will do */
-    const int g = (2 * cy + 1) * colours.y / (2 * cells.y) * colours.x + (2 * cx + 1) * colours.x / (2 * cells.x);
+    const int g = gain_index(cx, cy, cells, colours);
     float3 sum = (float3)(0.0f), squares = sum;
     float n = 0.0f, tried = 0.0f;
     for (int y = its.y; y < its.w; y += 2)
@@ -37,7 +29,7 @@ __kernel void seam_difference(__global const float4 *layer_a, __global const flo
             if (!layer_pair(layer_a, field_a, box_a, layer_b, field_b, box_b, (int2)(x, y), border, lens, &a, &b) ||
                 any(a.xyz > clipped_a.xyz) || any(b.xyz > clipped_b.xyz))
                 continue;
-            const float3 d = seam_look(a.xyz, gain_a[g].xyz, shoulder) - seam_look(b.xyz, gain_b[g].xyz, shoulder);
+            const float3 d = exposure_look(a.xyz, gain_a[g].xyz, shoulder) - exposure_look(b.xyz, gain_b[g].xyz, shoulder);
             sum += d;
             squares += d * d;
             n += 1.0f;

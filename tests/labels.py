@@ -1,4 +1,4 @@
-"""Label problems of seam.py, at random, and what a labelling costs."""
+"""Label problems of regions.py, at random, and what a labelling costs."""
 
 from __future__ import annotations
 
@@ -7,26 +7,34 @@ from hypothesis import settings
 from hypothesis import strategies as st
 from scipy import ndimage
 
-from hugin_abflow import seam
+from hugin_abflow import regions
+
+# Price of a cut, in cells.
+CUT = 10.0
+
+
+def label(rows, columns, residual, shares, cover, wraps, dearer=None, lost=None, unwanted=None) -> np.ndarray:
+    """The layers of a region's cells, with cuts of that price."""
+    return regions.label(rows, columns, residual, shares, cover, wraps, CUT, dearer, lost, unwanted)[0]
 
 
 def energies(labels, rows, columns, residual, shares, cover, wraps) -> np.ndarray:
-    """The sum in seam.py for each of the labellings (n, cells), cell by cell."""
+    """The sum in regions.py for each of the labellings (n, cells), cell by cell."""
     height, width = residual.mean.shape
     number = {(y, x): k for k, (y, x) in enumerate(zip(rows.tolist(), columns.tolist(), strict=True))}
     total = np.zeros(len(labels))
     for (y, x), k in number.items():
         chosen = labels[:, k]
         r, t = residual.mean[y, x], residual.rms[y, x]
-        total += np.where(cover[chosen, y, x], r * (1 - shares[chosen, y, x]), seam._FORBIDDEN)
+        total += np.where(cover[chosen, y, x], r * (1 - shares[chosen, y, x]), regions._FORBIDDEN)
         for down, right in ((0, 1), (1, 0), (0, -1), (-1, 0)):
             v, u = y + down, x + right
             if not 0 <= v < height or not (wraps or 0 <= u < width):
                 continue
             u %= width
-            total += seam._CUT * t * (cover[:, v, u].any() & ~cover[chosen, v, u])
+            total += CUT * t * (cover[:, v, u].any() & ~cover[chosen, v, u])
             if (v, u) in number and down + right > 0:
-                pair = seam._CUT * (t + residual.rms[v, u]) / 2
+                pair = CUT * (t + residual.rms[v, u]) / 2
                 total += pair * (chosen != labels[:, number[v, u]])
     return total
 
@@ -47,7 +55,7 @@ def problems(draw, layers: int, most: int):
     # from all alike to a few cells that count for all
     low, rough = random.random((2, height, width)) ** draw(st.sampled_from([0.1, 1, 4]))
     scale = draw(st.sampled_from([0.5, 3]))
-    residual = seam.Residuals(scale * low, scale * rough)
+    residual = regions.Residuals(scale * low, scale * rough)
     shares = random.random((layers, height, width)) ** draw(st.sampled_from([0.2, 1, 20]))
     shares /= np.maximum(shares.sum(0), 1e-9)
     cover = random.random((layers, height, width)) < draw(st.sampled_from([0.4, 0.8, 1]))
@@ -59,6 +67,6 @@ def problems(draw, layers: int, most: int):
 many = settings(max_examples=150)
 
 
-def alike(residual: np.ndarray) -> seam.Residuals:
+def alike(residual: np.ndarray) -> regions.Residuals:
     """Layers that differ by low frequencies alone."""
-    return seam.Residuals(residual, residual)
+    return regions.Residuals(residual, residual)

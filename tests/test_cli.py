@@ -92,6 +92,8 @@ def test_option_reaches_merge_project(calls: Calls, arguments: list[str], name: 
         (["--merge", "sequential"], "merge", "sequential"),
         (["--exposure", "off"], "exposure", False),
         (["--guides", "off"], "guides", False),
+        (["--seam", "off"], "seam", False),
+        (["--clones", "off"], "clones", False),
         (["--softmax-sharpness", "3.5"], "softmax_sharpness", 3.5),
         (["--flow-magnitude", "0"], "flow_magnitude", 0.0),
         (["--no-flow"], "flow", False),

@@ -225,7 +225,7 @@ def test_somebody_who_is_cut_out_leaves_less_of_a_shade(monkeypatch: pytest.Monk
 
     def panorama(*he: int | None) -> Array:
         layers = [photo(1.0, 0, 270, he[0]), photo(1.25, 95, width, he[1])]
-        return merged(layers, Canvas.plane(width, height))[..., :3].astype(float)
+        return merged(layers, Canvas.plane(width, height), clones=False)[..., :3].astype(float)
 
     clean = panorama(None, None)
 

@@ -18,6 +18,7 @@ from hugin_abflow.colour import Correction
 from hugin_abflow.geometry import Pair
 from hugin_abflow.layer import Canvas, Layer
 from hugin_abflow.opencl import Buffer, Device
+from hugin_abflow.regions import Residuals
 from hugin_abflow.settings import Settings
 
 __all__ = ["one_device"]
@@ -295,7 +296,7 @@ def test_what_flow_cannot_explain_is_not_taken_from_the_photo_that_clips_it(
     assert seam.lost(device, layers, fields, [Pair(0, 1)], correction, 0 * clipped, grid) is None
     whole = np.zeros(cells.shape, bool)
     whole[3:, 2:6] = True  # columns 15 to 46, below the white corner
-    residual = seam.Residuals(np.full(cells.shape, 0.3), np.zeros(cells.shape))
+    residual = Residuals(np.full(cells.shape, 0.3), np.zeros(cells.shape))
     seam.cut(device, layers, fields, residual, whole, masks, grid, lost=prices)
     grey, white = (field.get()[38:48, 29:33, 3] for field in fields)  # both cover all of the grid
     assert (grey > 10 * white).all() if light > 1 else (grey < 1e-3 * white).all()
@@ -308,7 +309,7 @@ def test_what_is_cut_out_of_a_layer_that_gave_way_is_that_layers(device: Device)
     cells = seam.seam_grid(grid)
     whole = np.zeros(cells.shape, bool)
     whole[3:, 2:6] = True
-    residual = seam.Residuals(np.full(cells.shape, 0.3), np.zeros(cells.shape))
+    residual = Residuals(np.full(cells.shape, 0.3), np.zeros(cells.shape))
     fields = weighted(device, layers, (1.0, 1.0, 0.0))
     clipped = highlights.measure(device, layers, masks, grid, Settings())
     further = highlights.give_way(device, layers, fields, clipped, masks, grid)

@@ -11,7 +11,7 @@ from reference import common
 from rooms import ROOM, Thing, hit, pattern, unit
 from scipy import ndimage
 
-from hugin_abflow import joint, movers, multiband, seam
+from hugin_abflow import joint, movers, multiband, regions, seam
 from hugin_abflow.content import Unlike
 from hugin_abflow.guides import Guide
 from hugin_abflow.layer import Canvas, Layer
@@ -125,7 +125,7 @@ def test_what_is_beside_him_would_be_bent(monkeypatch: pytest.MonkeyPatch) -> No
     him, to look for him is what keeps him whole; without that he is bent, and so is what is beside him.
     """
     one = shoot(PERSON)
-    monkeypatch.setattr(seam, "_LEAST", np.inf)
+    monkeypatch.setattr(regions, "_LEAST", np.inf)
     published = {"transition_strain": 0.0}
     assert best(merged(one.layers, CANVAS, **published), one)[0][0] < WHOLE
     monkeypatch.setattr(movers, "find", lambda *_: None)

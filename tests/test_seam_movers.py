@@ -8,17 +8,18 @@ import numpy as np
 import pytest
 from grids import on_device, plane
 from hypothesis import given
-from labels import alike, energies, many, problems
+from labels import alike, energies, label, many, problems
 
-from hugin_abflow import coefficient, labelling, seam
+from hugin_abflow import coefficient, labelling, regions, seam
 from hugin_abflow.colour import Correction
 from hugin_abflow.geometry import Pair
 from hugin_abflow.opencl import Device
+from hugin_abflow.regions import Residuals
 
 WRAPS = [False, True]
 
 
-def twice(favour: float, beside: float = 0.001) -> tuple[seam.Residuals, np.ndarray]:
+def twice(favour: float, beside: float = 0.001) -> tuple[Residuals, np.ndarray]:
     """Somebody stands on the left in one layer, on the right in the other: residual, and shares, by which
     each layer is favoured where he stands in it, the second a little more. beside: how they differ there.
     """
@@ -39,17 +40,17 @@ def test_what_moved_is_shown_once() -> None:
     for turned, best in ((slice(None), 1), (slice(None, None, -1), 0)):
         for wraps in WRAPS:
             problem = (*everywhere(), residual, shares[turned], cover, wraps)
-            found = seam.label(*problem).reshape(12, 30)
+            found = label(*problem).reshape(12, 30)
             assert (found[:, 4:13] == 1 - best).all() and (found[:, 17:26] == best).all()
-            assert (seam.label(*problem, dearer=seam._ONCE) == best).all()
+            assert (label(*problem, dearer=seam._ONCE) == best).all()
 
 
 def test_a_cut_that_is_much_better_is_kept() -> None:
     """Each layer shows him where it is favoured by far, as the other has its border there."""
     residual, shares = twice(0.45)
     cover = np.ones((2, 12, 30), bool)
-    cut = seam.label(*everywhere(), residual, shares, cover, False)
-    once = seam.label(*everywhere(), residual, shares, cover, False, dearer=seam._ONCE)
+    cut = label(*everywhere(), residual, shares, cover, False)
+    once = label(*everywhere(), residual, shares, cover, False, dearer=seam._ONCE)
     problem = (*everywhere(), residual, shares, cover, False)
     least, *alone = energies(np.stack([cut, 0 * cut, 0 * cut + 1]), *problem)
     assert min(alone) > seam._ONCE * least
@@ -61,7 +62,7 @@ def test_a_cut_that_is_much_better_is_kept() -> None:
 def test_one_layer_of_two_is_taken_if_it_costs_no_more_than_twice_as_much(problem) -> None:
     """One that has more than half of the region, as far as it goes; the other one where it does not."""
     rows, columns, cover = problem[0], problem[1], problem[4]
-    found, cut = seam.label(*problem, dearer=seam._ONCE), seam.label(*problem)
+    found, cut = label(*problem, dearer=seam._ONCE), label(*problem)
     assert cover[found, rows, columns].all()
     there = cover[:, rows, columns]
     if not there.any(1).all():
@@ -86,7 +87,7 @@ def test_cells_that_no_layer_covers_cost_nothing() -> None:
     cover = np.ones((2, 12, 30), bool)
     cover[:, 11, 20:] = False
     cut, once = (
-        seam.label(*everywhere(), residual, shares, cover, False, dearer=more) for more in (None, seam._ONCE)
+        label(*everywhere(), residual, shares, cover, False, dearer=more) for more in (None, seam._ONCE)
     )
     shown = cover.any(0).ravel()
     assert np.array_equal(cut[shown], once[shown]) and 0 < cut[shown].mean() < 1
@@ -100,7 +101,7 @@ def test_where_the_one_layer_ends_another_goes_on() -> None:
     cover = np.ones((3, 12, 30), bool)
     cover[1, :, :3] = False
     problem = (*everywhere(), residual, shares, cover, False)
-    cut, found = (seam.label(*problem, dearer=more).reshape(12, 30) for more in (None, seam._ONCE))
+    cut, found = (label(*problem, dearer=more).reshape(12, 30) for more in (None, seam._ONCE))
     assert np.array_equal(found[:, :3], cut[:, :3]) and (found[:, 3:] == 1).all()
     assert (cut[:, 4:13] == 0).all()
 
@@ -111,7 +112,7 @@ def test_a_third_layer_in_a_corner_does_not_show_what_moved_twice() -> None:
     shares = np.concatenate([shares, 0.1 * shares[:1]])
     cover = np.ones((3, 12, 30), bool)
     cover[2, :, 2:] = False
-    found = seam.label(*everywhere(), residual, shares, cover, False, dearer=seam._ONCE).reshape(12, 30)
+    found = label(*everywhere(), residual, shares, cover, False, dearer=seam._ONCE).reshape(12, 30)
     assert (found[:, 4:13] == 1).all() and (found[:, 17:26] == 1).all()
 
 
@@ -123,8 +124,8 @@ def test_what_moved_makes_a_region_whatever_the_layers_show() -> None:
         found = seam.regions(alike(residual), grid, aligned, moved)
         assert np.argwhere(found).tolist() == [[y, x] for y in range(5, 9) for x in range(6, 10)]
         assert not seam.regions(alike(residual), grid, aligned).any()
-    residual[6:8, 9] = 0.5 * (seam._WEAK + seam._STRONG)
-    residual[30, 30] = 2 * seam._STRONG
+    residual[6:8, 9] = 0.5 * (regions._WEAK + regions._STRONG)
+    residual[30, 30] = 2 * regions._STRONG
     found = seam.regions(alike(residual), grid, once=moved)
     assert np.argwhere(found).tolist() == [[y, x] for y in range(5, 9) for x in range(6, 11)]
     assert not seam.regions(alike(residual), grid).any()
@@ -143,13 +144,13 @@ def owners(told: np.ndarray, residual: np.ndarray, turn: int = 0) -> np.ndarray:
         np.roll(v, turn, -1) for v in (told, residual, region, covers, share)
     )
     fields = [np.stack([0 * s] * 3 + [s], -1).repeat(8, 0).repeat(8, 1) for s in (1 - share, share)]
-    found = seam._owners(
+    choice = seam._choice(
         [SimpleNamespace(box=(0, 0, 240, 96))] * 2,
         [SimpleNamespace(get=lambda field=field: field) for field in fields],
-        seam.Residuals(residual, residual, told), region, SimpleNamespace(host=covers), grid,
+        Residuals(residual, residual, told), region, SimpleNamespace(host=covers), grid,
         seam.seam_grid(grid), seam._CUT, seam._ONCE * region,
     )  # fmt: skip
-    return np.roll(found, -turn, 1)
+    return np.roll(choice.owners()[0], -turn, 1)
 
 
 @pytest.mark.parametrize("flow", [True, False])
@@ -195,8 +196,8 @@ def test_one_layer_may_cost_more_where_something_moved(
     grid = plane(240, 96)
     region = np.zeros((12, 30), bool)
     region[2:10, 4:26] = True
-    energies = iter([1.0, cost, 9.0])
-    monkeypatch.setattr(seam, "energy", lambda *graph: next(energies))
+    energies = iter([1.0, cost, 9.0, cost])
+    monkeypatch.setattr(regions, "energy", lambda *graph: next(energies))
     seen = []
     monkeypatch.setattr(seam, "_yield", lambda *given: seen.append(given[3]))
     once = np.zeros(region.shape, bool)
@@ -206,7 +207,7 @@ def test_one_layer_may_cost_more_where_something_moved(
     residual = np.where(region, 0.3, 0.0)
     residual[:, 14:16] = 0
     found = seam.cut(
-        None, [SimpleNamespace(box=(0, 0, 240, 96))] * 2, fields, seam.Residuals(residual, residual), region,
+        None, [SimpleNamespace(box=(0, 0, 240, 96))] * 2, fields, Residuals(residual, residual), region,
         SimpleNamespace(host=np.ones((2, 12, 30), bool)), grid, once,
     )  # fmt: skip
     assert len(seen) == 1
@@ -241,7 +242,7 @@ def test_cells_beside_a_border_of_which_nothing_tells_are_as_the_nearest(wraps: 
         turned = [np.roll(v, turn, -1) for v in (mean, rms, told, cover)]
         if turn and not wraps:
             continue
-        found = seam._completed(seam.Residuals(*turned[:3]), turned[3], wraps)
+        found = regions.completed(Residuals(*turned[:3]), turned[3], wraps)
         its_mean, its_rms = (np.roll(v, -turn, 1) for v in (found.mean, found.rms))
         missing = cover[1] & ~told
         missing[clipped] = False
@@ -255,5 +256,5 @@ def test_cells_beside_a_border_of_which_nothing_tells_are_as_the_nearest(wraps: 
             nearest = apart == apart.min()
             assert its_mean[row, column] in mean[y, x][nearest]
             assert its_rms[row, column] in rms[y, x][nearest]
-    nothing = seam.Residuals(mean, rms, 0 * told)
-    assert seam._completed(nothing, cover, wraps) is nothing
+    nothing = Residuals(mean, rms, 0 * told)
+    assert regions.completed(nothing, cover, wraps) is nothing

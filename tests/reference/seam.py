@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from reference.common import Array, Numbers, bilinear, cell_parts, exposure_shift, layer_seen, pixels
+from reference.common import Array, Numbers, bilinear, cell_parts, layer_look, pixels
 
 
 def seam_difference(
@@ -28,22 +28,13 @@ def seam_difference(
 ) -> tuple[Array, Array]:
     """Mean corrected difference a - b of every cell's pixels, every other one in x and y, with their share,
     and the largest channel's mean square; samples brighter than `clipped` of their layer are left out."""
-    columns, rows = pixels(border[0], border[1])
-    gain_row = (2 * np.arange(cells[1]) + 1) * colours[1] // (2 * cells[1])
-    gain_column = (2 * np.arange(cells[0]) + 1) * colours[0] // (2 * cells[0])
-    cell = [
-        np.searchsorted(np.arange(1, c + 1) * b // c, np.arange(b), "right")
-        for b, c in zip(border, cells, strict=False)
-    ]
     looks = []
     usable = np.ones((border[1], border[0]), bool)
     sides = (layer_a, field_a, box_a, gain_a, clipped_a), (layer_b, field_b, box_b, gain_b, clipped_b)
-    for layer, field, box, gain, clipped in sides:
-        seen = layer_seen(layer, field, box, columns, rows, border, lens)
+    for *side, clipped in sides:
+        seen, look = layer_look(*side, border, lens, colours, cells, shoulder)
         usable &= (seen[..., 3] > 0) & (seen[..., :3] <= np.float32(clipped)[:3]).all(-1)
-        here = gain[gain_row[cell[1]][:, None], gain_column[cell[0]][None], :3].astype(np.float64)
-        shifted = exposure_shift(seen[..., :3], here, shoulder)
-        looks.append(shifted if shoulder else np.sqrt(np.maximum(shifted, 0)))
+        looks.append(look)
     result, square = np.zeros((cells[1], cells[0], 4)), np.zeros((cells[1], cells[0]))
     for place, part in cell_parts(border, cells, 2):
         values = (looks[0] - looks[1])[part][usable[part]]

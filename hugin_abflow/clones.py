@@ -1,0 +1,255 @@
+"""Somebody whom two layers show at two places, shown once (kernels/clones.cl).
+
+Who walks along while photos are taken may stand twice in the overlap of two layers: here one shows him, and
+the other what is behind, there it is the other way round. A cut between both places costs nothing, so that
+the labelling of least energy (regions.py) shows him at both. He is told by what he looks like: with a and b
+what two aligned, corrected layers show in a cell p, and d the cells from one of his places to the other,
+
+    sum_p max(0, <(|a(p) - b(p)|^2 + |a(p + d) - b(p + d)|^2) / 2 - l |a(p) - b(p + d)|^2>)
+
+is large, < > the mean of 3 x 3 cells. What is behind him is alike at both places as well, and gives the same
+for -d; but unlike it he ends where his outline is. Of his two places, the one without which the energy is
+less is taken from the other layer, unless that would cost more than showing him twice.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from functools import lru_cache, partial
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from hugin_abflow.colour import Correction
+from hugin_abflow.geometry import Pair
+from hugin_abflow.layer import Box
+from hugin_abflow.opencl import Buffer, Device
+from hugin_abflow.regions import Cells, Choice
+from hugin_abflow.working import Grid, WorkingLayer, cells_under, connected
+
+# l: how unlike his two images may be, against how unlike he is to what is behind him.
+_UNLIKE = 2.0
+# Squared difference, summed over r, g, b, of a cell in which two layers show different things.
+_DIFFERS = 0.02
+# Cells between his places, at least, and at most across and down; people keep to the ground.
+_NEAR, _ACROSS, _DOWN = 2, 48, 6
+# The sum, and cells of the equator's size, that tell of somebody.
+_TOLD, _LEAST = 0.5, 8.0
+# How much more he has to differ from what is around him than what is behind him does.
+_OUTLINED = 1.2
+# Displacements of a pair of layers that are looked at.
+_TRIED = 12
+# The share of what he differs by that has to be shown at each place for him to be there.
+_SHOWN = 0.3
+# What it costs to show him in a cell where he shall not be: more than all cuts around it.
+_UNWANTED = 5.0
+# Energy that showing him once may cost, by how much he differs (of the place where he differs less): what the
+# softmax favours costs once that, and the rest is left for a cut through his feet, or beside a border.
+_DEARER = 1.75
+# Cells narrower than that, of the equator's width, are not looked at: what moves there is turned as well.
+_NARROW = 0.5
+
+# Layers' looks that are kept: each of 300 layers meets few others.
+_KEPT = 16
+
+_log = logging.getLogger(__name__)
+
+Part = tuple[slice, slice]
+Look = npt.NDArray[np.float32]  # (height, width, 4) on cells: r, g, b as seen, and the share that is shown
+
+
+@dataclass(frozen=True)
+class Clone:
+    """What layers a and b (indices) show alike, cells of the seam grid: a at `first`, b at `second`.
+
+    told: how clearly, the sum above.
+    """
+
+    a: int
+    b: int
+    first: Cells
+    second: Cells
+    told: float
+
+    @property
+    def places(self) -> tuple[tuple[int, Cells], tuple[int, Cells]]:
+        """Each layer and where it shows it."""
+        return (self.a, self.first), (self.b, self.second)
+
+
+def owners(
+    device: Device,
+    layers: Sequence[WorkingLayer],
+    fields: Sequence[Buffer],
+    pairs: Sequence[Pair],
+    correction: Correction,
+    grid: Grid,
+    cells: Grid,
+    choice: Choice,
+) -> npt.NDArray[np.intp]:
+    """The layer of each cell, as `choice.owners`, but that nobody is there twice if it can be helped.
+
+    fields      of geometry.py.
+    cells       the seam grid, over the region of `grid`.
+    """
+    owner, energy = choice.owners()
+    differs, unwanted = choice.residual.mean, None
+    look = lru_cache(_KEPT)(partial(_look, device, layers, fields, correction, grid, cells))
+    clones = list[Clone]()
+    for pair in pairs:
+        both = choice.whole & choice.cover[pair.a] & choice.cover[pair.b]
+        if all(np.count_nonzero(both & (owner == k)) >= _LEAST for k in (pair.a, pair.b)):
+            clones += find(pair, look(pair.a), look(pair.b), both, cells)
+    for clone in sorted(clones, key=lambda one: -one.told):
+        if any(differs[at & (owner == k)].sum() < _SHOWN * differs[at].sum() for k, at in clone.places):
+            continue
+        without = []
+        for k, at in clone.places:
+            prices = np.zeros(choice.cover.shape) if unwanted is None else unwanted.copy()
+            prices[k][at] += _UNWANTED
+            without.append(prices)
+        found = [choice.owners(prices) for prices in without]
+        best = min((0, 1), key=lambda place: found[place][1])
+        if found[best][1] - energy <= _DEARER * min(differs[at].sum() for _, at in clone.places):
+            (owner, energy), unwanted = found[best], without[best]
+            here, there = (layers[clone.places[place][0]].layer.name for place in (best, 1 - best))
+            _log.info("%s and %s show the same at two places; it is taken from the latter alone", here, there)
+    return owner
+
+
+def find(pair: Pair, a: Look, b: Look, both: Cells, cells: Grid) -> Iterator[Clone]:
+    """What the layers of a pair show at two places.
+
+    both: cells of regions that both layers cover.
+    """
+    if not both.any():
+        return
+    turn = _turn(both) if cells.wraps else 0
+    both = np.roll(both, turn, 1)
+    rows, columns = (np.flatnonzero(both.any(axis)) for axis in (1, 0))
+    # a cell more to each side, where outlines end
+    part = np.s_[max(0, rows[0] - 1) : rows[-1] + 2, max(0, columns[0] - 1) : columns[-1] + 2]
+    a, b = (np.roll(one, turn, 1)[part] for one in (a, b))
+    search = _Search(a, b, both[part], cells.row_widths[part[0], None])
+    for first, second, told in search.found():
+        places = np.zeros((2, *cells.shape), bool)
+        places[(slice(None), *part)] = first, second
+        first, second = np.roll(places, -turn, 2)
+        yield Clone(pair.a, pair.b, first, second, told)
+
+
+def _turn(mask: Cells) -> int:
+    """By how many columns to roll what goes once around for its widest gap to be at the border."""
+    columns = np.flatnonzero(mask.any(0))
+    gaps = np.diff(np.append(columns, columns[0] + mask.shape[1]))
+    return -int(columns[(int(gaps.argmax()) + 1) % columns.size])
+
+
+class _Search:
+    """The search for what two layers show at two places, of a part of the grid that does not wrap."""
+
+    def __init__(self, a: Look, b: Look, both: Cells, widths: npt.NDArray[np.float64]) -> None:
+        self._a, self._b, self._widths = a[..., :3], b[..., :3], widths
+        self._compared = (a[..., 3] > 0) & (b[..., 3] > 0)
+        self._off = np.square(self._a - self._b).sum(-1)
+        # where somebody may be who was not found yet
+        self._open = both & self._compared & (self._off > _DIFFERS) & (widths > _NARROW)
+
+    def found(self) -> Iterator[tuple[Cells, Cells, float]]:
+        """Where a shows it, and b, and how clearly."""
+        height, width = self._off.shape
+        down, across = min(height - 3, _DOWN), min(width - 3, _ACROSS)
+        moves = [
+            (dy, dx)
+            for dy in range(-down, down + 1)
+            for dx in range(-across, across + 1)
+            if dy * dy + dx * dx >= _NEAR**2
+        ]
+        told = {move: float(self._told(move)[0].sum()) for move in moves}
+        refused: list[tuple[int, int]] = []
+        for move in sorted(told, key=lambda one: -told[one]):
+            if told[move] < _TOLD or len(refused) == _TRIED:
+                return
+            if any(max(abs(move[0] - y), abs(move[1] - x)) <= _NEAR for y, x in refused):
+                continue
+            first, second = self._places(move)
+            if self._is_somebody(first, second):
+                self._open &= ~(first | second)
+                yield first, second, told[move]
+            else:
+                refused.append(move)
+
+    def _told(self, move: tuple[int, int]) -> tuple[npt.NDArray[np.float32], Part, Part]:
+        """By how much each cell tells that a shows there what b does `move` (down, right) from there; these
+        cells, and those where they lead.
+        """
+        here, there = self._part(-move[0], -move[1]), self._part(*move)
+        gain = (self._off[here] + self._off[there]) / 2
+        gain -= _UNLIKE * np.square(self._a[here] - self._b[there]).sum(-1)
+        gain *= self._open[here] & self._open[there]
+        mean = cv2.blur(gain, (3, 3), borderType=cv2.BORDER_CONSTANT)
+        return np.where(gain > 0, np.maximum(mean, 0), 0), here, there
+
+    def _part(self, down: int, across: int) -> Part:
+        """The cells that are others moved so far."""
+        height, width = self._off.shape
+        return (
+            slice(max(0, down), height + min(0, down)),
+            slice(max(0, across), width + min(0, across)),
+        )
+
+    def _places(self, move: tuple[int, int]) -> tuple[Cells, Cells]:
+        """The largest connected part of what a and b show `move` apart, where a shows it, and b."""
+        told, here, there = self._told(move)
+        parts = connected(told > 0, wraps=False)
+        sizes = np.bincount(parts[parts > 0], minlength=2)
+        places = np.zeros((2, *self._off.shape), bool)
+        places[0][here] = places[1][there] = parts == max(1, int(sizes.argmax()))
+        return places[0], places[1]
+
+    def _is_somebody(self, first: Cells, second: Cells) -> bool:
+        """Whether what a shows at the first place, and b at the second, is large enough, and ends there,
+        unlike what the other one shows.
+        """
+        if (self._widths * first).sum() < _LEAST:
+            return False
+        sides = ((first, self._a, self._b), (second, self._b, self._a))
+        return all(
+            self._outline(its, at) > _OUTLINED * self._outline(behind, at) for at, its, behind in sides
+        )
+
+    def _outline(self, look: npt.NDArray[np.float32], place: Cells) -> float:
+        """Mean difference of a look across the outline of a place, r, g and b together."""
+        total, count = 0.0, 0
+        for here, there in ((np.s_[:, 1:], np.s_[:, :-1]), (np.s_[1:], np.s_[:-1])):
+            across = (place[here] != place[there]) & self._compared[here] & self._compared[there]
+            total += float(np.abs(look[here] - look[there])[across].sum())
+            count += int(np.count_nonzero(across))
+        return total / max(count, 1)
+
+
+def _look(
+    device: Device,
+    layers: Sequence[WorkingLayer],
+    fields: Sequence[Buffer],
+    correction: Correction,
+    grid: Grid,
+    cells: Grid,
+    k: int,
+) -> Look:
+    """What layer k, aligned and corrected, shows in cells; nothing where its box does not reach."""
+    layer, colours = layers[k], correction.grid
+    part = cells_under(Box.at(*layer.box), grid, cells)
+    gain = correction.gains[k] or device.zeros((*colours.shape, 4))
+    shown = device.empty((part.height, part.width, 4))
+    device.run(
+        "clones", "clones_look", (part.width, part.height),
+        layer.pixels, fields[k], layer.box, gain, grid.border, grid.lens, colours.border, cells.border,
+        part.place, correction.shoulder, shown,
+    )  # fmt: skip
+    look = np.zeros((*cells.shape, 4), np.float32)
+    look[part.slices] = shown.get()
+    return look

@@ -1,0 +1,205 @@
+"""Regions that one layer shows, whole: where they are, and which layer that is (on the host).
+
+In each connected region of cells where aligned layers differ every cell is given to one layer: the one that
+the softmax favours, with cuts between layers, and at the layers' own borders, where they show least. This is
+a labelling of least energy,
+
+    sum_cells (r (1 - s_k) + h e_k)  +  sum_neighbours c (t + t') / 2 [k != k']  +  sum_borders c t
+
+with r the residual of low frequencies, averaged over the cells around, t that of all, not averaged, s_k the
+share of the softmax, c the price of a cut (labelling.py), and h that of what layer k clips of what another
+one, as bright, still shows, e_k. A cut through somebody who is as bright as what is behind shows in t alone.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import numpy.typing as npt
+import scipy
+
+from hugin_abflow.cells import grown, neighbours
+from hugin_abflow.labelling import Graph, Labels, energy, least
+from hugin_abflow.working import Grid, connected
+
+# Residual of low frequencies, of full scale, that makes a region one layer's, and that of its outskirts.
+# Where that of all frequencies reaches the first there are outskirts as well.
+_STRONG, _WEAK = 0.2, 0.045
+# From the first less this to it and this more, a cell counts from not at all to wholly as strong.
+_DOUBT = 0.05
+# Strong cells, of the equator's size, that a region has at least: fewer are an edge that is a pixel off.
+_LEAST = 4.5
+# No layer is taken where it is not.
+_FORBIDDEN = 1e4
+# The share of a region's cells that a layer has for it to be taken from there, whole.
+_MOSTLY = 0.5
+
+Cells = npt.NDArray[np.bool_]  # (height, width) on the seam grid
+Prices = npt.NDArray[np.float64]  # (layers, height, width) on the seam grid
+
+
+@dataclass(frozen=True)
+class Residuals:
+    """How far aligned, corrected layers differ, float64 (height, width) on the seam grid: the largest of
+    any pair and channel, 0 where no two lie.
+
+    mean    r: of their low frequencies.
+    rms     t: of all, of each cell by itself. What is strong, averaged, would fill a gap beside it, and a cut
+            through somebody's chin be as cheap as one below. In `seam.divide` both are the mean square, on
+            finer cells.
+    around  of all, averaged as r is, for the outskirts of regions. None: t.
+    told    where any pair has pixels to compare: none are where layers are clipped, or sampled beyond their
+            borders. None: everywhere.
+    """
+
+    mean: npt.NDArray[np.float64]
+    rms: npt.NDArray[np.float64]
+    told: Cells | None = None
+    around: npt.NDArray[np.float64] | None = None
+
+
+@dataclass(frozen=True)
+class Choice:
+    """What tells which layer each cell of some regions is taken from.
+
+    whole       (height, width): the cells of all regions.
+    residual    on the same grid.
+    shares      of the softmax, cover: of the layers (layers, height, width).
+    wraps       whether the grid goes once around.
+    cut_price   of a cut, in cells.
+    dearer      how much more than a cut one layer may cost, (height, width), of a region the most; None: it
+                is not asked.
+    lost        what each layer costs in a cell besides; None: nothing.
+    """
+
+    whole: Cells
+    residual: Residuals
+    shares: Prices
+    cover: npt.NDArray[np.bool_]
+    wraps: bool
+    cut_price: float
+    dearer: npt.NDArray[np.float64] | None = None
+    lost: Prices | None = None
+
+    def owners(self, unwanted: Prices | None = None) -> tuple[npt.NDArray[np.intp], float]:
+        """The layer of each cell, (height, width): in the regions the one it is taken from, elsewhere the one
+        that the softmax favours, -1 where none is; and the energy of all regions.
+
+        unwanted: what each layer costs in a cell, which does not count as energy.
+        """
+        owner = np.where(self.cover.any(0), (self.shares * self.cover).argmax(0), -1)
+        total = 0.0
+        for region in parts(self.whole, self.wraps):
+            rows, columns = np.nonzero(region)
+            more = None if self.dearer is None else float(self.dearer[region].max())
+            owner[rows, columns], its = label(
+                rows, columns, self.residual, self.shares, self.cover, self.wraps, self.cut_price, more,
+                self.lost, unwanted,
+            )  # fmt: skip
+            total += its
+        return owner, total
+
+
+def find(residual: Residuals, cells: Grid, once: Cells) -> list[Cells]:
+    """Connected outskirts that hold enough of strong residual, or anything of `once`, grown by a cell."""
+    around = residual.rms if residual.around is None else residual.around
+    weak = (residual.mean > _WEAK) | (around > _STRONG) | once
+    strong = np.interp(residual.mean, (_STRONG - _DOUBT, _STRONG + _DOUBT), (0, 1))
+    strong *= cells.row_widths[:, None]
+    return [
+        region
+        for region in parts(grown(weak, 1, cells.wraps), cells.wraps)
+        if strong[region].sum() >= _LEAST or once[region].any()
+    ]
+
+
+def parts(mask: Cells, wraps: bool) -> list[Cells]:
+    """The connected parts of a mask."""
+    labels = connected(mask, wraps)
+    return [labels == k for k in np.unique(labels[mask])]
+
+
+def completed(residual: Residuals, cover: npt.NDArray[np.bool_], wraps: bool) -> Residuals:
+    """With the nearest cell's residual in cells that nothing tells of, from a layer's border on: things are
+    moved away from there, and a cut would cost nothing, and leave half of somebody.
+
+    cover       (layers, height, width): the cells that each of them covers.
+    """
+    if residual.told is None or not residual.told.any():
+        return residual
+    by = residual.told.shape[1] // 2 if wraps else 0
+    around = [(0, 0), (by, by)]
+    cover = np.pad(cover, [(0, 0), *around], mode="wrap")
+    told = np.pad(residual.told, around, mode="wrap")
+    borders = [one & scipy.ndimage.binary_dilation(~one, np.ones((3, 3))) for one in cover]
+    missing = (cover.sum(0) > 1) & ~told
+    missing = scipy.ndimage.binary_propagation(np.any(borders, 0) & missing, np.ones((3, 3)), missing)
+    nearest = scipy.ndimage.distance_transform_edt(~told, return_distances=False, return_indices=True)
+
+    def whole(values: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+        values = np.pad(values, around, mode="wrap")
+        filled = np.where(missing, values[tuple(nearest)], values)
+        return filled[:, by : filled.shape[1] - by]
+
+    return Residuals(whole(residual.mean), whole(residual.rms))
+
+
+def label(
+    rows: npt.NDArray[np.intp],
+    columns: npt.NDArray[np.intp],
+    residual: Residuals,
+    shares: npt.NDArray[np.float64],
+    cover: npt.NDArray[np.bool_],
+    wraps: bool,
+    cut_price: float,
+    dearer: float | None = None,
+    lost: Prices | None = None,
+    unwanted: Prices | None = None,
+) -> tuple[npt.NDArray[np.intp], float]:
+    """Which layer each cell (rows, columns) of a region is taken from, and the energy of that: the least
+    found.
+
+    shares, cover: shares of the softmax and coverage (layers, height, width).
+    cut_price: of a cut, in cells.
+    lost: what each layer costs in a cell besides (layers, height, width).
+    dearer: one layer is taken, as far as it goes, if that costs no more than so many times as much (None: it
+    is not asked). Somebody may stand there twice, and a cut between his two places, or where these overlap,
+    is as cheap as one beside him.
+    """
+    candidates = np.flatnonzero(cover[:, rows, columns].any(1))
+    if candidates.size < 2:
+        return np.full(rows.size, candidates[0] if candidates.size else 0), 0.0
+    weight, rough = residual.mean[rows, columns], residual.rms[rows, columns]
+    present = cover[candidates][:, rows, columns]
+    price = np.where(present, weight * (1 - shares[candidates][:, rows, columns]), _FORBIDDEN)
+    if lost is not None:
+        price += lost[candidates][:, rows, columns]
+    number = np.full(residual.mean.shape, -1)
+    number[rows, columns] = np.arange(rows.size)
+    links = []
+    for down, right in ((0, 1), (1, 0), (0, -1), (-1, 0)):
+        inside, there = neighbours(rows + down, columns + right, residual.mean.shape, wraps)
+        # a layer's own border is a cut as well, where the union goes on
+        price += cut_price * rough * (inside & cover[:, *there].any(0) & ~cover[candidates][:, *there])
+        if down + right > 0:
+            linked = np.flatnonzero(inside & (number[there] >= 0))
+            links.append(np.stack([linked, number[there][linked]]))
+    first, second = np.concatenate(links, 1)
+    cuts = cut_price * (rough[first] + rough[second]) / 2
+    plain = Graph(rows, columns, price, present, first, second, cuts)
+    wanted = (
+        plain if unwanted is None else replace(plain, price=price + unwanted[candidates][:, rows, columns])
+    )
+    labels = least(wanted)
+    if dearer is not None:
+        alone = [np.where(one, k, labels) for k, one in enumerate(present) if one.mean() > _MOSTLY]
+        energies = [_energy(wanted, one) for one in (labels, *alone)]
+        if alone and min(energies[1:]) <= dearer * energies[0]:
+            labels = alone[int(np.argmin(energies[1:]))]
+    return candidates[labels], _energy(plain, labels)
+
+
+def _energy(graph: Graph, labels: Labels) -> float:
+    """What a labelling costs, where any layer is."""
+    return energy(replace(graph, price=np.where(graph.possible.any(0), graph.price, 0.0)), labels)
