@@ -13,13 +13,20 @@ import OpenImageIO as oiio
 import pytest
 import tifffile
 from conftest import ProjectMaker, names_in, require_program
+from layer_files import RATIONAL, X_POSITION, Y_POSITION
 from pictures import one_device
 from test_exif import shown
 from test_hugin import CANVAS, NAME, stacked
 from test_metadata import shot
 
 from hugin_abflow import cli
-from hugin_abflow.errors import ExitCode, LayersMissingError, OutputError, ProgramFailedError
+from hugin_abflow.errors import (
+    ExitCode,
+    LayersMismatchError,
+    LayersMissingError,
+    OutputError,
+    ProgramFailedError,
+)
 from hugin_abflow.images import read_layer
 from hugin_abflow.merge import merge_project
 from hugin_abflow.outputs import Kind
@@ -219,6 +226,24 @@ def test_compression_that_enfuse_does_not_know(make_project: ProjectMaker, caplo
     assert tifffile.TiffFile(by_enfuse).pages[0].compression.name == "LZW"
     assert tifffile.TiffFile(by_us).pages[0].compression.name == "ZSTD"
     assert caplog.text.count("enfuse knows no compression zstd; its files get LZW") == 1
+
+
+@pytest.mark.parametrize("pages", [3, 2])
+def test_layers_in_one_file_of_pages_are_refused(make_project: ProjectMaker, pages: int) -> None:
+    """As many as there are images, and fewer."""
+    project = make_project(panorama=CANVAS)
+    project.write_text(project.read_text() + asked(Kind.EXPOSURE_LAYERS))
+    with tifffile.TiffWriter(project.parent / "pano_exposure_layers_.tif") as writer:
+        for _ in range(pages):
+            tags = [(tag, RATIONAL, 1, (0, 150), True) for tag in (X_POSITION, Y_POSITION)]
+            pixels = np.full((20, 30, 4), 255, np.uint8)
+            writer.write(
+                pixels, photometric="rgb", extrasamples=["unassalpha"], subfiletype=2, extratags=tags,
+                resolution=(150, 150), resolutionunit="inch", metadata=None,
+            )  # fmt: skip
+    with pytest.raises(LayersMismatchError, match=r"pano_exposure_layers_\.tif holds .* --remap always"):
+        stitch_project(project, remap="never")
+    assert stitch_project(project, Settings(flow=False), remap="always")
 
 
 @pytest.mark.parametrize("disabled", [(), (0,)])
