@@ -94,7 +94,7 @@ def settle(
     unlike: (height, width) on any coarse grid over the same region, from 0 to 1, where layers cannot be
     brought to one brightness.
     """
-    grids = [_cells(grid, pixels) for pixels in _CELLS]
+    grids = [grid.coarser(pixels) for pixels in _CELLS]
     covers = _covers(masks, grids)
     price = _price(device, flows, masks, grid, grids[-1], covers[-1])
     shares: Shares | None = None
@@ -116,12 +116,6 @@ def settle(
         relax(device, shares, system, 1.0, _SWEEPS)
     assert shares is not None
     _expand(device, layers, coefficients, shares, grid)
-
-
-def _cells(grid: Grid, pixels: int) -> Grid:
-    """A grid of cells of about `pixels` x `pixels`; where it wraps, its columns can be parted by colour."""
-    cells = grid.coarser(pixels)
-    return grid.resized(cells.width + cells.width % 2, cells.height) if grid.wraps else cells
 
 
 def _covers(masks: Masks, grids: Sequence[Grid]) -> list[Mask]:

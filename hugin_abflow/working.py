@@ -124,7 +124,14 @@ class Grid:
 
     def coarser(self, pixels: int) -> Grid:
         """A grid over the same region, of cells of about `pixels` x `pixels` of this one's."""
-        return self.resized(max(1, round(self.width / pixels)), max(1, round(self.height / pixels)))
+        return self.reduced(max(1, round(self.width / pixels)), max(1, round(self.height / pixels)))
+
+    def reduced(self, width: int, height: int) -> Grid:
+        """The same region on fewer pixels; where it wraps, a column more if that makes them even. Crossing a
+        pole goes half of them further, and sweeps take every other one.
+        """
+        wider = self.wraps and width < self.width
+        return self.resized(width + width % 2 if wider else width, height)
 
     def resized(self, width: int, height: int) -> Grid:
         """The same region on another number of pixels."""
@@ -212,9 +219,7 @@ def working_grid(full: Grid, settings: Settings) -> Grid:
     pixels = math.sqrt(full.width * full.height / settings.working_limit)
     ratio = max(1.0, pixels, longest, full.height / _MOST_ROWS)
     width, height = max(2, round(full.width / ratio)), max(1, round(full.height / ratio))
-    if ratio > 1 and full.wraps:
-        width += width % 2  # crossing a pole goes half the width further
-    return full.resized(min(width, full.width), min(height, full.height))
+    return full.reduced(min(width, full.width), min(height, full.height))
 
 
 def device_dtype(layer: Layer) -> np.dtype[Any]:

@@ -199,13 +199,6 @@ def test_wells_are_as_large_as_their_cells() -> None:
     assert curved == pytest.approx(np.repeat(100 * np.cos(latitudes)[:, None], 40, 1), rel=1e-5)
 
 
-@pytest.mark.parametrize("width", range(31, 41))
-def test_columns_that_wrap_can_be_parted_by_colour(width: int) -> None:
-    """Else the first and the last one of a row, of one colour, would read each other."""
-    assert transition._cells(plane(width, 20, wraps=True), 4).width % 2 == 0
-    assert transition._cells(plane(width, 20), 4) == plane(width, 20).coarser(4)
-
-
 def test_cells_that_no_layer_covers_whole_are_shared_by_those_that_reach_into_them() -> None:
     masks = np.zeros((2, 8, 16), bool)
     masks[0, :, :6], masks[1, :, 6:] = True, True
