@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from hugin_abflow.errors import ImageReadError, LayersMismatchError
+from hugin_abflow.errors import CanvasError, ImageReadError, LayersMismatchError
 from hugin_abflow.projection import EQUIRECTANGULAR
 
 _log = logging.getLogger(__name__)
@@ -181,6 +181,16 @@ def other_canvas(layer: Layer, canvas: Canvas) -> str | None:
     """The canvas that a layer was made for, as "800x400", if its file tells it and it is another one."""
     size = layer.canvas_size
     return None if size is None or size == (canvas.width, canvas.height) else f"{size[0]}x{size[1]}"
+
+
+def check_canvas(canvas: Canvas) -> None:
+    """Raise `CanvasError` unless the canvas has pixels and its crop is a part of it that has some, too."""
+    crop = canvas.crop
+    if not (0 <= crop.left < crop.right <= canvas.width and 0 <= crop.top < crop.bottom <= canvas.height):
+        raise CanvasError(
+            f"the crop of columns {crop.left} to {crop.right} and rows {crop.top} to {crop.bottom} is no "
+            f"part of the canvas of {canvas.width}x{canvas.height}; choose one inside that has pixels"
+        )
 
 
 def check_layers(canvas: Canvas, layers: Sequence[Layer]) -> None:

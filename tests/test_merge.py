@@ -11,7 +11,15 @@ import pytest
 from pictures import expected_picture, masked, masks_of, merged, noise, one_device, pixel_places, texture
 
 from hugin_abflow import blend, merge, opencl
-from hugin_abflow.errors import DeviceError, LayersMismatchError, LayersMissingError, SettingsError
+from hugin_abflow.errors import (
+    CanvasError,
+    DeviceError,
+    GuideError,
+    LayersMismatchError,
+    LayersMissingError,
+    SettingsError,
+)
+from hugin_abflow.guides import Guide
 from hugin_abflow.images import read_layer
 from hugin_abflow.layer import Box, Canvas, Layer
 from hugin_abflow.merge import merge_layers, merge_project
@@ -233,6 +241,29 @@ def test_bands_read_only_rows_near_them():
 def test_no_layers():
     with pytest.raises(LayersMissingError, match="no layers to merge"):
         merge_layers([], CANVASES["plane"])
+
+
+@pytest.mark.parametrize(
+    "crop", [(0, 0, 0, 0), (5, 9, 30, 9), (9, 5, 9, 30), (-1, 0, 20, 20), (0, 0, 302, 20), (0, 9, 20, 152)]
+)
+def test_crops_that_are_no_part_of_the_canvas(crop):
+    with pytest.raises(CanvasError, match=r"crop of columns .* canvas of 301x151; choose"):
+        merge_layers([Layer.from_array("a", noise(20, 20))], cropped(CANVASES["plane"], *crop))
+
+
+@pytest.mark.parametrize("a, b", [(0, 2), (2, 0), (-1, 0), (1, 1), (0.5, 1)])
+def test_guides_of_layers_that_are_none(a, b):
+    layers = [Layer.from_array(name, noise(20, 20)) for name in "ab"]
+    with pytest.raises(GuideError, match=rf"^one is about the layers {a} and {b}; .* of 0 to 1, "):
+        merge_layers(layers, CANVASES["plane"], guides=[Guide(a, b, (1, 1), (2, 2), "one")])
+
+
+@pytest.mark.parametrize("place", [(float("nan"), 1.0), (1.0, float("inf"))])
+def test_guides_of_places_that_are_none(place):
+    layers = [Layer.from_array(name, noise(20, 20)) for name in "ab"]
+    for ends in ((place, (1, 1)), ((1, 1), place)):
+        with pytest.raises(GuideError, match=r"guide is at .*; give canvas pixels"):
+            merge_layers(layers, CANVASES["plane"], guides=[Guide(1, 0, *ends)])
 
 
 @pytest.mark.parametrize(
