@@ -24,7 +24,7 @@ from hugin_abflow.images import read_layer
 from hugin_abflow.layer import Box, Canvas, Layer
 from hugin_abflow.merge import merge_layers, merge_project
 from hugin_abflow.project import read_plan
-from hugin_abflow.settings import Settings
+from hugin_abflow.settings import MOST_WORKING_PIXELS, Settings
 
 shared_device = pytest.mark.usefixtures(one_device.__name__)
 
@@ -326,6 +326,7 @@ def test_numbers_become_what_kernels_take():
         {"softmax_sharpness": -1},
         {"flow_magnitude": 1e5},
         {"working_pixels": 1},
+        {"working_pixels": MOST_WORKING_PIXELS + 1},
         {"flow_magnitude": float("nan")},
         {"band_rows": -1},
         {"merge": "average"},
