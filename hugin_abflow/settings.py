@@ -31,7 +31,8 @@ class Settings:
     flow                bring the layers together by optical flow; else they stay where they are, and every
                         overlap is cut along the seam that shows least.
     flow_quality        how much time the flow may take: "fast", "normal" or "best".
-    large_motion        search for motion of up to a tenth of the canvas's width, for very near things:
+    large_motion        search for motion of up to a tenth of the canvas's width, and half of the root of the
+                        overlap's area, for very near things:
                         "auto" keeps what makes at least a quarter of an overlap clearly more alike, both
                         ways, or what moves as things do that stand still when the camera moves; "on" all
                         that is found; what repeats (grids, tiles) and who walks may mislead it. "off":
