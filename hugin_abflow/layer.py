@@ -113,7 +113,9 @@ class Layer:
     read        ``read(top, bottom)`` gives rows of the layer (its own row 0 is box.top) as an array
                 (bottom - top, box.width, channels + 1) of `dtype`, C-contiguous. Alpha is unassociated;
                 a pixel is valid where alpha is at least half of full scale (1.0 for floats). The
-                reader is safe to call again and in any order; ascending order is fast.
+                reader is safe to call again and in any order; ascending order is fast. It is called
+                from other threads, if `strip` is more than 1 from several at a time. Nobody writes
+                into the array, which must not change afterwards: it is read later, too.
     icc         the ICC profile, if any.
     canvas_size (width, height) of the canvas that the layer was made for, if its file tells it.
     file        the file that `read` decodes; None for pixels in memory.
