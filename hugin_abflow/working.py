@@ -38,6 +38,9 @@ _PART_STRIPS = 8
 _LARGEST_PRODUCT = 0.99 * 2**31
 _MOST_ROWS = 32_000
 
+# Integer samples brighter than this, of what a layer shows white, may be clipped.
+CLIPPED = 0.98
+
 # OpenCL type and full-scale value of each depth; half is widened on the host.
 PIXEL = {"uint8": ("uchar", 255.0), "uint16": ("ushort", 65535.0), "float32": ("float", 1.0)}
 
