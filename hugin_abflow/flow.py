@@ -46,7 +46,7 @@ class FlowParameters:
 
 # Work items that relax a row together: many, but few beyond the row's end. Rows of a board are whole groups.
 _ROW_GROUP = 64
-# Planes of a board, as of kernels/common.cl.
+# Planes of a board: BOARD_PLANES of kernels/common.cl.
 _PLANES = 22
 # Pixels of a grid up to which a graphics card relaxes it by one work-group a way, so that it is started once;
 # and columns of such a group, which has as many rows as there can be.
