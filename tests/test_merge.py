@@ -17,14 +17,13 @@ from hugin_abflow.errors import (
     GuideError,
     LayersMismatchError,
     LayersMissingError,
-    SettingsError,
 )
 from hugin_abflow.guides import Guide
 from hugin_abflow.images import read_layer
 from hugin_abflow.layer import Box, Canvas, Layer
 from hugin_abflow.merge import merge_layers, merge_project
 from hugin_abflow.project import read_plan
-from hugin_abflow.settings import MOST_WORKING_PIXELS, Settings
+from hugin_abflow.settings import Settings
 
 shared_device = pytest.mark.usefixtures(one_device.__name__)
 
@@ -280,63 +279,6 @@ def test_guides_of_places_that_are_none(place):
 def test_layers_that_do_not_belong_together(other, message):
     with pytest.raises(LayersMismatchError, match=message):
         merge_layers([Layer.from_array("a", noise(20, 20)), other], CANVASES["plane"])
-
-
-@pytest.mark.parametrize(
-    "values",
-    [
-        {"softmax_sharpness": "10"},
-        {"softmax_sharpness": True},
-        {"softmax_sharpness": None},
-        {"softmax_sharpness": float("nan")},
-        {"softmax_sharpness": np.ones(2)},
-        {"flow_magnitude": 1j},
-        {"flow_magnitude": float("inf")},
-        {"working_pixels": 2e6},
-        {"threads": "1"},
-        {"band_rows": False},
-        {"merge": ["joint"]},
-        {"merge": np.array(["joint", "joint"])},
-        {"interpolation": None},
-        {"flow_quality": 2},
-        {"exposure": 1},
-        {"seam": "auto"},
-        {"flow": "off"},
-        {"guides": "off"},
-        {"large_motion": True},
-        {"exposure": "auto"},
-        {"device": 0},
-    ],
-)
-def test_settings_of_a_wrong_type(values):
-    with pytest.raises(SettingsError, match=next(iter(values))):
-        Settings(**values)
-
-
-def test_numbers_become_what_kernels_take():
-    """An integer's bits would be read as those of a tiny float."""
-    settings = Settings(softmax_sharpness=np.float32(3), flow_magnitude=7, working_pixels=np.int64(5000))
-    numbers = settings.softmax_sharpness, settings.flow_magnitude, settings.working_pixels
-    assert numbers == (3, 7, 5000) and list(map(type, numbers)) == [float, float, int]
-
-
-@pytest.mark.parametrize(
-    "values",
-    [
-        {"softmax_sharpness": -1},
-        {"flow_magnitude": 1e5},
-        {"working_pixels": 1},
-        {"working_pixels": MOST_WORKING_PIXELS + 1},
-        {"flow_magnitude": float("nan")},
-        {"band_rows": -1},
-        {"merge": "average"},
-        {"interpolation": "sinc"},
-        {"flow_quality": "better"},
-    ],
-)
-def test_settings_out_of_range(values):
-    with pytest.raises(SettingsError, match=next(iter(values))):
-        Settings(**values)
 
 
 def test_threads_bound_reading_and_writing_as_well(tmp_path, monkeypatch):
