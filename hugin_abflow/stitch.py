@@ -9,7 +9,6 @@ from dataclasses import replace
 from functools import partial
 from itertools import groupby
 from pathlib import Path
-from typing import Any
 
 from hugin_abflow.errors import LayersMismatchError, ProgramMissingError
 from hugin_abflow.exif import embed
@@ -86,19 +85,22 @@ def stitch_project(
 
 def show_project(
     path: Path | str,
+    settings: Settings | None = None,
     *,
     output: Path | str | None = None,
     prefix: str | Path | None = None,
     layers: Sequence[str | Path] | None = None,
     remap: Remap = "auto",
+    keep_layers: bool = False,
     compression: str | None = None,
     jpeg_quality: int | None = None,
+    metadata: bool = True,
     options: Sequence[str] = (),
-    **others: Any,
 ) -> list[str]:
     """What `stitch_project` would do, as lines of a shell script: a comment on the plan, then the commands.
 
     options     of our own command line that say how to blend; the other arguments are `stitch_project`'s.
+                Of settings, keep_layers and metadata the commands know by these options alone.
 
     Photos that miss the crop, which nona tells later, are taken for part of the panorama. Raises as
     `stitch_project` does for what the project can get wrong.

@@ -315,6 +315,14 @@ def test_dry_run_of_one_panorama(
         assert line.startswith(begin.format(here=tmp_path))
 
 
+def test_dry_run_takes_what_the_run_takes_and_nothing_else(make_project: ProjectMaker) -> None:
+    project = make_project()
+    shown = show_project(project)
+    assert shown == show_project(project, Settings(), keep_layers=True, metadata=False)
+    with pytest.raises(TypeError, match="prefixes"):
+        show_project(project, prefixes="l")  # type: ignore[call-arg]
+
+
 def test_dry_run_says_how_to_blend(make_project: ProjectMaker, capsys: pytest.CaptureFixture[str]) -> None:
     """By the command line or a file of settings; storing is said of outputs alone."""
     project = stacked(
