@@ -102,8 +102,9 @@ def correction(
 ) -> Correction:
     """Solve for the gains of all layers.
 
-    ignored: (height, width) on any grid over the same region: what is no evidence, none of a cell's.
-    strict: leave out what may not be exposure, to see it.
+    ignored: (height, width) on any grid over the same region: pixels whose differences are not used; a colour
+    cell with any of them counts for nothing.
+    strict: reject outliers earlier, so that what moved stays visible in the residual.
     With `settings.exposure` off there is no correction.
     """
     cells, inside = measured.grid, measured.inside

@@ -98,7 +98,7 @@ class Grid:
 
     @property
     def circumference(self) -> float:
-        """The canvas's width as the flow-magnitude term takes it: radians on the sphere, else grid px."""
+        """The whole canvas's width: radians on a sphere (2 pi if it wraps), grid px on a plane."""
         if self.lens[1] and self.wraps:
             return 2 * math.pi
         share = self.canvas_width / self.region.width if self.canvas_width else 1.0
