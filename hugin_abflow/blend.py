@@ -76,7 +76,9 @@ class BlendLayer:
 
 @dataclass(frozen=True)
 class _Band:
-    """part: the band, in pixels of the region. rows: of each layer, what it may sample; equal if none."""
+    """part: the band, in pixels of the region. rows: for each layer, the half-open range of its rows that
+    this band may sample; both ends equal where it samples none.
+    """
 
     part: Box
     rows: tuple[Span, ...]

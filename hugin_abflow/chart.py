@@ -23,6 +23,8 @@ _MARGIN = 16
 # Widths of charts that wrap are multiples of this, so that they halve exactly seven times: on every level of
 # the pyramid of a chart whose shorter side is below 1536 px.
 _WRAP_MULTIPLE = 128
+# Pixels of a row that a work item takes: CHART_CHUNK of kernels/chart.cl.
+_CHUNK = 4
 # Brightness that is added before the logarithm: about the dark noise of a photo, full scale is 1.
 _FLOOR = 0.05
 
@@ -193,10 +195,10 @@ def pair_chart(overlap: npt.NDArray[np.bool_], mask_grid: Grid, grid: Grid, coar
 def sample(device: Device, layer: WorkingLayer, grid: Grid, chart: Chart) -> Level:
     """Log brightness of a layer on the chart, with its mask."""
     size = (chart.width, chart.height)
-    four_at_a_time = (-(-chart.width // 4), chart.height)
+    chunks = (-(-chart.width // _CHUNK), chart.height)
     level = Level(device.empty(size[::-1]), device.empty(size[::-1]), chart.wraps)
     device.run(
-        "chart", "chart_sample", four_at_a_time, layer.pixels, layer.box, grid.border, grid.lens,
+        "chart", "chart_sample", chunks, layer.pixels, layer.box, grid.border, grid.lens,
         chart.transform, size, chart.coarse, _FLOOR, level.image, level.mask,
     )  # fmt: skip
     return level

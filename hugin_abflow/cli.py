@@ -123,8 +123,8 @@ _information = partial(click.option, cls=Option, group="Information")
     type=click.Choice(get_args(Remap)),
     default="auto",
     show_default=True,
-    help="Make the layers with nona. auto: only if they are missing, cut off, or older than the project "
-    "or its photos.",
+    help="Make the layers with nona. auto: only if they are missing, cannot be opened, or are older than "
+    "the project or its photos.",
 )
 @_layers("--keep-layers", is_flag=True, help="Keep the layers that nona made, beside the project.")
 @_blending(

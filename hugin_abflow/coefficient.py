@@ -74,10 +74,7 @@ def _on_rows(values: npt.NDArray[_Kind], count: int, rule: np.ufunc) -> npt.NDAr
 def masks(device: Device, layers: Sequence[WorkingLayer], grid: Grid) -> Masks:
     """The layers' masks; a mask pixel is covered if every working pixel under it is."""
     factor = 1 if grid.width * grid.height <= _FINE_PIXELS else 2
-    width = -(-grid.width // factor)
-    if grid.poles:
-        width += width % 2  # crossing a pole goes half the width further
-    mask_grid = grid.resized(width, -(-grid.height // factor))
+    mask_grid = grid.reduced(-(-grid.width // factor), -(-grid.height // factor))
     buffers = []
     for layer in layers:
         mask = device.empty(mask_grid.shape, np.uint8)

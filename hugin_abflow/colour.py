@@ -27,15 +27,13 @@ from hugin_abflow.geometry import Pair
 from hugin_abflow.layer import Box
 from hugin_abflow.opencl import Buffer, Device
 from hugin_abflow.settings import Settings
-from hugin_abflow.working import Grid, WorkingLayer, shared_cells
+from hugin_abflow.working import CLIPPED, Grid, WorkingLayer, shared_cells
 
 # Working pixels per cell of the colour grid.
 _CELL = 16
 # Layers that lie on each other, by their cubic mean: from here on cells grow with them, because the solution
 # takes time by cells^1.5 and layers^3.
 _DEEP = 4.0
-# Samples brighter than this, of what a layer shows white, may be clipped and measure nothing (integers only).
-_CLIPPED = 0.98
 # Standard deviation of the differences within a cell that halves its trust, on the exposure scale.
 _SPREAD = 0.3
 # Weight of what is seen of one layer alone: where layers are not mixed they are best left as they are.
@@ -70,8 +68,10 @@ def colour_grid(grid: Grid, covered: npt.NDArray[np.bool_]) -> Grid:
 
 
 def clipping(layer: WorkingLayer) -> tuple[float, ...]:
-    """The r, g, b above which a layer's samples may be clipped, and an unused 1; floats never are."""
-    share = _CLIPPED if layer.layer.dtype.kind == "u" else math.inf
+    """The r, g, b above which a layer's samples may be clipped and measure nothing, and an unused 1; floats
+    never are.
+    """
+    share = CLIPPED if layer.layer.dtype.kind == "u" else math.inf
     return (*(share * white for white in layer.white), 1.0)
 
 
@@ -102,8 +102,9 @@ def correction(
 ) -> Correction:
     """Solve for the gains of all layers.
 
-    ignored: (height, width) on any grid over the same region: what is no evidence, none of a cell's.
-    strict: leave out what may not be exposure, to see it.
+    ignored: (height, width) on any grid over the same region: pixels whose differences are not used; a colour
+    cell with any of them counts for nothing.
+    strict: reject outliers earlier, so that what moved stays visible in the residual.
     With `settings.exposure` off there is no correction.
     """
     cells, inside = measured.grid, measured.inside

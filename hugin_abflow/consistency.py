@@ -22,7 +22,7 @@ from hugin_abflow.geometry import Pair, PairFlow
 from hugin_abflow.opencl import Buffer, Device
 from hugin_abflow.pyramid import Level
 
-# Brightness of what tells nothing, as of kernels/common.cl.
+# Brightness of what tells nothing: UNTOLD of kernels/common.cl.
 UNTOLD = 1e3
 # Pixels between start and return that leave a sixteenth of the trust, whatever the chart's resolution:
 # refined flow is that much more exact. What is far off must leave next to nothing: many such pixels would

@@ -63,6 +63,18 @@ class LayersMissingError(AbflowError):
     exit_code = ExitCode.LAYERS_MISSING
 
 
+class CanvasError(AbflowError):
+    """A canvas has no pixels, or its crop has none or some that are beyond it."""
+
+    exit_code = ExitCode.PROJECT
+
+
+class GuideError(AbflowError):
+    """A guide is not about two of the layers, or about no place."""
+
+    exit_code = ExitCode.PROJECT
+
+
 class PhotoMissingError(AbflowError):
     """A photo that nona would need is not there."""
 

@@ -7,6 +7,7 @@ XMP specification part 3, the PNG specification (third edition).
 
 from __future__ import annotations
 
+import logging
 import struct
 import zlib
 from dataclasses import dataclass
@@ -16,6 +17,8 @@ from typing import BinaryIO
 
 from hugin_abflow import tifftags
 from hugin_abflow.tifftags import ASCII, EXIF, GPS, MAIN, SHORT, UNDEFINED, Directories, Value
+
+_log = logging.getLogger(__name__)
 
 XMP_TAG = 700  # of TIFF
 _PNG = b"\x89PNG\r\n\x1a\n"
@@ -164,14 +167,26 @@ def embed(path: Path, format_name: str, metadata: Metadata) -> None:
 def _insert_in_jpeg(path: Path, metadata: Metadata) -> None:
     """Behind JFIF's segment, which claims the first place.
 
-    Here and in PNG: one block of EXIF is allowed, so an empty one that OpenImageIO writes is replaced.
+    Here and in PNG: one block of EXIF is allowed, so an empty one that OpenImageIO writes is replaced. A
+    block has to fit into a segment: the longest values are left out until it does.
     """
-    exif = {key: {**metadata.exif.get(key, {}), **tags} for key, tags in _JPEG_TAGS.items()}
-    block = _EXIF_MARK + tifftags.pack_directories({**metadata.exif, **exif})
-    segments = b""
-    for content in (block, _XMP_MARK + metadata.xmp if metadata.xmp else b""):
-        if 0 < len(content) <= _LONGEST:
-            segments += struct.pack(">BBH", 0xFF, _APP1, len(content) + 2) + content
+    exif = {
+        key: {**metadata.exif.get(key, {}), **_JPEG_TAGS.get(key, {})}
+        for key in {**metadata.exif, **_JPEG_TAGS}
+    }
+    xmp, left_out = _XMP_MARK + metadata.xmp if metadata.xmp else b"", []
+    while len(block := _EXIF_MARK + tifftags.pack_directories(exif)) > _LONGEST:
+        lengths = {(key, tag): len(value.data) for key, tags in exif.items() for tag, value in tags.items()}
+        key, tag = max(lengths, key=lambda place: lengths[place])
+        del exif[key][tag]
+        left_out.append(f"EXIF tag {tag} ({lengths[key, tag]} bytes)")
+    if len(xmp) > _LONGEST:
+        xmp, left_out = b"", [*left_out, f"XMP ({len(xmp)} bytes)"]
+    if left_out:
+        _log.warning("left out of the panorama, as too long for JPEG: %s", ", ".join(left_out))
+    segments = b"".join(
+        struct.pack(">BBH", 0xFF, _APP1, len(content) + 2) + content for content in (block, xmp) if content
+    )
     with path.open("r+b") as file:
         empty = len(_find_in_jpeg(file))
         replaced = empty + 4 + len(_EXIF_MARK) if empty else 0
@@ -198,14 +213,15 @@ def _chunk(kind: bytes, content: bytes) -> bytes:
 
 
 def _insert(file: BinaryIO, at: int, data: bytes, replaced: int = 0) -> None:
-    """Put `data` into a file at `at`, in place of as many bytes as are `replaced`, which are fewer."""
-    end = file.seek(0, SEEK_END)
-    while end > at + replaced:
-        start = max(at + replaced, end - _BLOCK)
+    """Put `data` into a file at `at`, in place of as many bytes as are `replaced`."""
+    end, further = file.seek(0, SEEK_END), len(data) - replaced
+    blocks = range(at + replaced, end, _BLOCK)
+    # none may overwrite what has still to be moved
+    for start in reversed(blocks) if further > 0 else blocks:
         file.seek(start)
-        block = file.read(end - start)
-        file.seek(start - replaced + len(data))
+        block = file.read(min(_BLOCK, end - start))
+        file.seek(start + further)
         file.write(block)
-        end = start
     file.seek(at)
     file.write(data)
+    file.truncate(end + further)

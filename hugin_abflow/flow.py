@@ -36,7 +36,9 @@ class FlowParameters:
     contrast: float = 0.3  # step of h across which smoothness falls to 1/e
     noise: float = 0.01  # amplitude of h that is no texture
     mean_sigma: float = 6.0  # px: h is log brightness less its Gaussian mean of this sigma
-    reach: float = 0.16  # of the longer side: how large a motion is searched where the caller does not say
+    # of the longer side: how large a motion is searched for those who do not say it, such as tests and
+    # benchmarks, to whom a picture is a whole canvas; pairflow.py says it, as a share of its canvas
+    reach: float = 0.16
     overlap: float = 0.5  # of the root of the common mask's area: no larger motion is searched
     choose_from: int = 1  # finest level (0: full) on which pixels take over flow from beside them
     decide_on: int = 1  # level on which flow with and flow without what was searched are compared at last
@@ -46,7 +48,7 @@ class FlowParameters:
 
 # Work items that relax a row together: many, but few beyond the row's end. Rows of a board are whole groups.
 _ROW_GROUP = 64
-# Planes of a board, as of kernels/common.cl.
+# Planes of a board: BOARD_PLANES of kernels/common.cl.
 _PLANES = 22
 # Pixels of a grid up to which a graphics card relaxes it by one work-group a way, so that it is started once;
 # and columns of such a group, which has as many rows as there can be.

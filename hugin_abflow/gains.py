@@ -88,7 +88,7 @@ def solve(
 ) -> npt.NDArray[np.float64]:
     """Gains, float64 (cells, 3), r, g, b of all layers' cells in the order of `np.nonzero(measured.inside)`.
 
-    strict: leave out what may not be exposure, to see it.
+    strict: reject outliers earlier, so that what moved stays visible in the residual.
     unknown: (height, width), cells where what is seen tells nothing of exposure, and no difference weighs.
     """
     cells, inside, differences = measured.grid, measured.inside, measured.differences

@@ -21,6 +21,8 @@ from hugin_abflow.working import Grid, WorkingLayer
 # Flow longer than this share of the canvas's width is implausible; it does not sharpen the softmax further.
 _PLAUSIBLE = 0.1
 _FOLLOWING_STEPS = 8
+# Pixels of a row that a work item takes: GEOMETRY_CHUNK of kernels/geometry.cl.
+_CHUNK = 4
 
 
 @dataclass(frozen=True)
@@ -94,7 +96,7 @@ def _displacement(
     """One layer's field, in which the fourth component is 0."""
     layer = layers[index]
     width, height = layer.box[2:]
-    four_at_a_time = (-(-width // 4), height)
+    chunks = (-(-width // _CHUNK), height)
     its = [pair for pair in flows if index in (pair.a, pair.b)]
     if not its:
         return device.zeros((height, width, 4))
@@ -102,7 +104,7 @@ def _displacement(
     for number, pair in enumerate(its):
         other = pair.b if index == pair.a else pair.a
         device.run(
-            "geometry", "geometry_add", four_at_a_time, coefficients[other], layers[other].box, layer.pixels,
+            "geometry", "geometry_add", chunks, coefficients[other], layers[other].box, layer.pixels,
             layer.box, grid.border, grid.lens, pair.between(other), pair.chart.border, pair.chart.transform,
             number == 0, field,
         )  # fmt: skip

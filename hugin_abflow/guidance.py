@@ -144,26 +144,37 @@ def lead(
     return flows
 
 
-def contradict(chart: Chart, flows: Flows, guides: ChartGuides, times: int) -> bool:
+def contradict(
+    chart: Chart,
+    flows: Flows,
+    guides: ChartGuides,
+    times: int,
+    parameters: GuidanceParameters | None = None,
+) -> bool:
     """Whether guides of a pair say something else than its flows, a to b and back, as `lead` sees it.
 
     chart       of both, `times` as fine as that on which guides lead.
     """
-    return bool(_wrong(_ways(chart.border, flows, guides), times * GuidanceParameters().agreement).any())
+    agreement = (parameters or GuidanceParameters()).agreement
+    return bool(_wrong(_ways(chart.border, flows, guides), times * agreement).any())
 
 
 def held(
-    images: tuple[Level, Level], flows: tuple[Buffer, Buffer], guides: ChartGuides
+    images: tuple[Level, Level],
+    flows: tuple[Buffer, Buffer],
+    guides: ChartGuides,
+    parameters: GuidanceParameters | None = None,
 ) -> tuple[Values, Values]:
     """The guides that both images show and both flows agree with: their places and moves, (n, 4) px, from a
     to b and back.
     """
+    agreement = (parameters or GuidanceParameters()).agreement
     ways = _ways(images[0].grid, (flows[0].get(), flows[1].get()), guides)
     agree = np.ones(len(guides), bool)
     for image, way in zip(images, ways, strict=True):
         inside, (row, column) = pixels_at(way.places, image.grid)
         agree &= inside & (image.mask.get()[row * inside, column * inside] > 0)
-        agree &= np.linalg.norm(way.residuals, axis=1) <= GuidanceParameters().agreement
+        agree &= np.linalg.norm(way.residuals, axis=1) <= agreement
     there, back = (np.hstack([way.places, way.moves])[agree] for way in ways)
     return there, back
 

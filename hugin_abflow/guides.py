@@ -9,6 +9,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 
+from hugin_abflow.errors import GuideError
+
 Points = npt.NDArray[np.float64]  # (n, 2): x right, y down
 
 # Ends closer than this are one place: points are set to a tenth of a pixel at best.
@@ -39,6 +41,18 @@ class Guide:
     at_a: tuple[float, float]
     at_b: tuple[float, float]
     name: str = "guide"
+
+
+def check_guides(guides: Iterable[Guide], layers: int) -> None:
+    """Raise `GuideError` unless each guide is about two of so many layers and about places."""
+    for guide in guides:
+        if guide.a == guide.b or any(index not in range(layers) for index in (guide.a, guide.b)):
+            raise GuideError(
+                f"{guide.name} is about the layers {guide.a} and {guide.b}; name two different ones of "
+                f"0 to {layers - 1}, their indices among the layers that are merged"
+            )
+        if not all(map(math.isfinite, (*guide.at_a, *guide.at_b))):
+            raise GuideError(f"{guide.name} is at {guide.at_a} and {guide.at_b}; give canvas pixels")
 
 
 def doubts(places: Points, moves: Points, radius: float, around: float = math.inf) -> list[str]:

@@ -8,6 +8,9 @@ import numpy.typing as npt
 from hugin_abflow.opencl import Buffer, Device
 from hugin_abflow.working import Place
 
+# Pixels of a row that a work item takes: HIDDEN_CHUNK of kernels/hidden.cl.
+_CHUNK = 8
+
 
 def mark(
     device: Device,
@@ -24,7 +27,7 @@ def mark(
                 in `fields`, and three numbers that are not read.
     part        of the working grid, a box as well: where it is done.
     """
-    eight_at_a_time = (-(-part[2] // 8), part[3])
+    chunks = (-(-part[2] // _CHUNK), part[3])
     device.run(
-        "hidden", "hidden_mark", eight_at_a_time, fields, device.upload(places), len(places), part, share,
+        "hidden", "hidden_mark", chunks, fields, device.upload(places), len(places), part, share,
     )  # fmt: skip

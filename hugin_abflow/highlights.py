@@ -25,12 +25,12 @@ from hugin_abflow.cells import Mask
 from hugin_abflow.coefficient import Masks, distance, on_cells
 from hugin_abflow.opencl import Buffer, Device
 from hugin_abflow.settings import Settings
-from hugin_abflow.working import Grid, WorkingLayer
+from hugin_abflow.working import CLIPPED, Grid, WorkingLayer
 
 # Working pixels per cell.
 _CELL = 16
-# A pixel's brightest channel, of white, from which on it may be clipped, and where it surely is.
-_NEARLY, _SURELY = 0.9, 0.98
+# A pixel's brightest channel, of white, from which on it counts as clipped in part; wholly from CLIPPED on.
+_NEARLY = 0.9
 # The softmax's own weights span e^10: with as much, layers are mixed next to the border of the darker one.
 # A little more, as dark spots are not clipped, and what white leaves of these looks like no photo.
 _STRENGTH = 12.0
@@ -76,7 +76,7 @@ def measure(
         found = device.empty(cells.shape)
         device.run(
             "highlights", "highlights_share", cells.border[:2], layer.pixels, layer.box, grid.border,
-            cells.border, (*layer.white, 1.0), _NEARLY, _SURELY, found,
+            cells.border, (*layer.white, 1.0), _NEARLY, CLIPPED, found,
         )  # fmt: skip
         share[:] = found.get()
     inside = on_cells(masks.host, cells, np.logical_or)

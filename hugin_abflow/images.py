@@ -1,4 +1,4 @@
-"""Read layers, write panoramas (`ImageWriter`, `write_image`): the only door to OpenImageIO.
+"""Read layers; give on what writes panoramas (imagewriter.py). These two alone use OpenImageIO.
 
 Everything outside sees arrays of (rows, width, channels + 1), unassociated alpha last. OpenImageIO
 multiplies colours by alpha unless told on both sides not to.

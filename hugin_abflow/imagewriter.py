@@ -1,4 +1,4 @@
-"""Write panoramas: whole files or none. Used through `hugin_abflow.images`.
+"""Write panoramas: whole files or none. Used through `hugin_abflow.images`, but for `named_in_unicode`.
 
 With `hugin_abflow.images` the only module that uses OpenImageIO.
 """

@@ -22,6 +22,8 @@ from hugin_abflow.working import Grid, WorkingLayer
 
 # Times that each place listens to what passes there.
 _ROUNDS = 2
+# Pixels of a row that a work item takes: INTERMEDIATE_CHUNK of kernels/intermediate.cl.
+_CHUNK = 4
 
 
 def settle(
@@ -42,9 +44,9 @@ def settle(
     for number, pair in enumerate(flows if settings.intermediate else ()):
         a, b = layers[pair.a], layers[pair.b]
         width, height = pair.chart.width, pair.chart.height
-        share, four_at_a_time = device.empty((height, width)), (-(-width // 4), height)
+        share, chunks = device.empty((height, width)), (-(-width // _CHUNK), height)
         device.run(
-            "intermediate", "intermediate_share", four_at_a_time, coefficients[pair.a], a.box,
+            "intermediate", "intermediate_share", chunks, coefficients[pair.a], a.box,
             coefficients[pair.b], b.box, grid.border, grid.lens, pair.chart.border, pair.chart.transform,
             share,
         )  # fmt: skip

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from hugin_abflow.errors import ImageReadError, LayersMismatchError
+from hugin_abflow.errors import CanvasError, ImageReadError, LayersMismatchError
 from hugin_abflow.projection import EQUIRECTANGULAR
 
 _log = logging.getLogger(__name__)
@@ -113,7 +113,9 @@ class Layer:
     read        ``read(top, bottom)`` gives rows of the layer (its own row 0 is box.top) as an array
                 (bottom - top, box.width, channels + 1) of `dtype`, C-contiguous. Alpha is unassociated;
                 a pixel is valid where alpha is at least half of full scale (1.0 for floats). The
-                reader is safe to call again and in any order; ascending order is fast.
+                reader is safe to call again and in any order; ascending order is fast. It is called
+                from other threads, if `strip` is more than 1 from several at a time. Nobody writes
+                into the array, which must not change afterwards: it is read later, too.
     icc         the ICC profile, if any.
     canvas_size (width, height) of the canvas that the layer was made for, if its file tells it.
     file        the file that `read` decodes; None for pixels in memory.
@@ -181,6 +183,16 @@ def other_canvas(layer: Layer, canvas: Canvas) -> str | None:
     """The canvas that a layer was made for, as "800x400", if its file tells it and it is another one."""
     size = layer.canvas_size
     return None if size is None or size == (canvas.width, canvas.height) else f"{size[0]}x{size[1]}"
+
+
+def check_canvas(canvas: Canvas) -> None:
+    """Raise `CanvasError` unless the canvas has pixels and its crop is a part of it that has some, too."""
+    crop = canvas.crop
+    if not (0 <= crop.left < crop.right <= canvas.width and 0 <= crop.top < crop.bottom <= canvas.height):
+        raise CanvasError(
+            f"the crop of columns {crop.left} to {crop.right} and rows {crop.top} to {crop.bottom} is no "
+            f"part of the canvas of {canvas.width}x{canvas.height}; choose one inside that has pixels"
+        )
 
 
 def check_layers(canvas: Canvas, layers: Sequence[Layer]) -> None:

@@ -19,10 +19,10 @@ from hugin_abflow.devices import choose
 from hugin_abflow.errors import LayersMissingError, OutputError
 from hugin_abflow.exif import Metadata
 from hugin_abflow.found import Remap, candidates
-from hugin_abflow.guides import Guide
+from hugin_abflow.guides import Guide, check_guides
 from hugin_abflow.images import ENDINGS, ImageWriter, check_target, use_threads
 from hugin_abflow.kept import in_use, kept_device
-from hugin_abflow.layer import Canvas, Layer, check_layers
+from hugin_abflow.layer import Canvas, Layer, check_canvas, check_layers
 from hugin_abflow.metadata import describe
 from hugin_abflow.nona import open_layers
 from hugin_abflow.opencl import Device
@@ -114,7 +114,8 @@ def write_panorama(
                     floats in TIFF unless `depth` is said, integers in EXR always.
     open_device     see `merge_project`.
 
-    Raises `OutputError`, `ImageReadError` (a layer cannot be decoded), `DeviceError`.
+    Raises `OutputError`, `ImageReadError` (a layer cannot be decoded), `SettingsError` (`max_memory` is too
+    little for the flow), `DeviceError`.
     """
     crop, first = canvas.crop, layers[0]
     with ImageWriter(
@@ -150,12 +151,16 @@ def merge_layers(
 
     guides          places that two of `layers` have in common; they lead the flow where it goes astray.
 
-    Alpha is last and unassociated. Raises `LayersMissingError` without layers, `LayersMismatchError` if
-    they do not fit the canvas or each other, `DeviceError`.
+    Alpha is last and unassociated. Raises `CanvasError` for a canvas or crop without pixels or a crop beyond
+    the canvas, `LayersMissingError` without layers, `LayersMismatchError` if they do not fit the canvas or
+    each other, `GuideError` for guides of layers or places that are none, `ImageReadError` if a layer cannot
+    be decoded, `SettingsError` if `settings.max_memory` is too little for the flow, `DeviceError`.
     """
+    check_canvas(canvas)
     if not layers:
         raise LayersMissingError("there are no layers to merge; give at least one")
     check_layers(canvas, layers)
+    check_guides(guides, len(layers))
     return np.concatenate(list(_bands(layers, canvas, settings or Settings(), progress, guides)))
 
 

@@ -84,7 +84,8 @@ def open_layers(
     `ProjectError` (a photo has another size), `OutputError` (layers cannot be kept), `SettingsError`
     (`remap` unknown, or "always" together with named layers).
     """
-    _check_request(remap, named=bool(prefix or layers))
+    named = bool(prefix or layers)
+    _check_request(remap, named)
     with work_folder() as folder:
         if layers:
             files = named_files(layers)
@@ -94,7 +95,13 @@ def open_layers(
             files = _find_or_make(plan, folder, remap, keep_layers, progress).in_order()
         opened = [layer for file in files for layer in read_layers(file)]
         check_layers(plan.canvas, opened)
-        yield opened
+        try:
+            yield opened
+        except ImageReadError as error:  # files are opened before, but not decoded
+            found = [str(file) for file in files if not named and file.parent != folder]
+            if not any(file in str(error) for file in found) or not _can_make(plan):
+                raise
+            raise ImageReadError(f"{error} (--remap always makes all of them)") from None
 
 
 def _check_request(remap: str, named: bool) -> None:

@@ -19,7 +19,7 @@ import numpy.typing as npt
 from hugin_abflow.geometry import Pair
 from hugin_abflow.layer import Box
 from hugin_abflow.opencl import Device
-from hugin_abflow.working import WorkingLayer
+from hugin_abflow.working import CLIPPED, WorkingLayer
 
 Values = npt.NDArray[np.float32]
 White = tuple[float, float, float]
@@ -38,8 +38,6 @@ _SHARE, _BEYOND = 0.003, 1 / 8
 _NEAR = 2.0
 # Nothing darker is white: exposures are not corrected by so much.
 _LEAST = 64
-# What is brighter than this, of full scale, is clipped as it is.
-_FULL = 0.98
 # What is darker than this, of full scale, is noise.
 _DARK = 0.02
 # By how much another photo has to show brighter what is clipped here, at least, and in how much of it.
@@ -98,8 +96,8 @@ def _brightest(pixels: Values) -> White | None:
     if len(seen) < _ENOUGH:
         return None
     red, green, blue = (_spike(channel) for channel in seen.T)
-    if red is None or green is None or blue is None or min(red, green, blue) > _FULL:
-        return None
+    if red is None or green is None or blue is None or min(red, green, blue) > CLIPPED:
+        return None  # of full scale: it is taken for clipped as it is
     return red, green, blue
 
 

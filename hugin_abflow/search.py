@@ -19,6 +19,8 @@ Grid = tuple[int, int, int, int]  # (width, height, wraps, 0), as the kernels ta
 
 # SEARCH_MARGIN and SEARCH_RADIUS of kernels/search.cl.
 _MARGIN, _LARGEST_RADIUS = 16, 4
+# Columns that a work item takes: the float8 of kernels/search.cl, and FLOW_CHUNK of kernels/flow.cl.
+_CHUNK, _MEDIAN_CHUNK = 8, 4
 
 
 @dataclass(frozen=True)
@@ -83,7 +85,7 @@ def _pitch(grid: Grid) -> int:
     """Columns of costs, and of descriptors without margins: what is read eight at a time, from up to two
     columns further on, ends within them.
     """
-    return 8 * (-(-grid[0] // 8) + 1)
+    return _CHUNK * (-(-grid[0] // _CHUNK) + 1)
 
 
 def filtered(
@@ -92,8 +94,8 @@ def filtered(
     """`result`, filled with the median of `flow`: both float32 (height, width, 2), or several of these, of
     which `ways` are filtered from `first` on.
     """
-    four_at_a_time = (-(-grid[0] // 4), grid[1], ways)
-    device.run("flow", "flow_median", four_at_a_time, flow, grid, first, result)
+    chunks = (-(-grid[0] // _MEDIAN_CHUNK), grid[1], ways)
+    device.run("flow", "flow_median", chunks, flow, grid, first, result)
     return result
 
 
@@ -144,10 +146,10 @@ def volumes(
     count, pitch, wide = (2 * reach[0] + 1) * (2 * reach[1] + 1), _pitch(grid), a.shape[2]
     pixel_cost, cost = (device.empty((height, count, pitch)) for _ in range(2))
     device.run(
-        "search", "search_pixel_cost", (pitch // 8 * count * height,), a, b, grid, reach, wide, outside,
+        "search", "search_pixel_cost", (pitch // _CHUNK * count * height,), a, b, grid, reach, wide, outside,
         pitch, pixel_cost,
     )  # fmt: skip
-    rows = (-(-width // 8) * count * height,)
+    rows = (-(-width // _CHUNK) * count * height,)
     device.run("search", "search_cost", rows, pixel_cost, grid, count, outside, pitch, cost)
     turned = pixel_cost  # has done its part
     device.run("search", "search_turned", rows, cost, grid, reach, outside, pitch, turned)
@@ -159,7 +161,7 @@ def _coupled(
     parameters: SearchParameters,
 ) -> Buffer:  # fmt: skip
     """The displacements of least cost, ever less free to differ from `flow`, then from their own mean."""
-    eight_at_a_time = (-(-grid[0] // 8) * grid[1],)
+    chunks = (-(-grid[0] // _CHUNK) * grid[1],)
     smooth, best, median = (device.empty(flow.shape) for _ in range(3))
     for turn, coupling in enumerate(parameters.couplings):
         if turn:
@@ -167,7 +169,7 @@ def _coupled(
                 best, median = filtered(device, best, grid, median), best
             device.run("search", "search_mean", grid[:2], best, grid, smooth)
         device.run(
-            "search", "search_best", eight_at_a_time, cost, smooth if turn else flow, grid, reach, coupling,
+            "search", "search_best", chunks, cost, smooth if turn else flow, grid, reach, coupling,
             cost.shape[2], best,
         )  # fmt: skip
     return best

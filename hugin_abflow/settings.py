@@ -15,7 +15,9 @@ FlowQuality = Literal["fast", "normal", "best"]
 LargeMotion = Literal["auto", "on", "off"]
 
 _WORKING_PIXELS: dict[FlowQuality, int] = {"fast": 500_000, "normal": 2_100_000, "best": 6_300_000}
-_LEAST_WORKING_PIXELS = 1024
+# Kernels count the 22 floats that a board (kernels/common.cl) has of each pixel of a chart in 32 bits, and
+# its rows are some hundredths longer than the chart's.
+_LEAST_WORKING_PIXELS, MOST_WORKING_PIXELS = 1024, 90_000_000
 MOST_MEMORY = 1 << 50  # of `Settings.max_memory`
 
 
@@ -29,7 +31,8 @@ class Settings:
     flow                bring the layers together by optical flow; else they stay where they are, and every
                         overlap is cut along the seam that shows least.
     flow_quality        how much time the flow may take: "fast", "normal" or "best".
-    large_motion        search for motion of up to a tenth of the canvas's width, for very near things:
+    large_motion        search for motion of up to a tenth of the canvas's width, and half of the root of the
+                        overlap's area, for very near things:
                         "auto" keeps what makes at least a quarter of an overlap clearly more alike, both
                         ways, or what moves as things do that stand still when the camera moves; "on" all
                         that is found; what repeats (grids, tiles) and who walks may mislead it. "off":
@@ -50,8 +53,8 @@ class Settings:
                         nothing is looked for, and they take the whole overlap, as published.
     guides              let control points lead the flow where it goes astray.
     interpolation       how layers are sampled; "nearest" is for comparison with the paper's own code.
-    working_pixels      upper bound of the pixels of the working canvas (flow, coefficients, colour), at least
-                        1024; 0: chosen by flow_quality.
+    working_pixels      upper bound of the pixels of the working canvas (flow, coefficients, colour), 1024
+                        to 90 million; 0: chosen by flow_quality.
     intermediate        where layer k is sampled is told by the flows that pass through p on their way from
                         one layer to the other; else by F_jk, which starts at p, as published.
     band_rows           rows of a full-resolution band; 0: chosen from the canvas width and `max_memory`.
@@ -90,7 +93,7 @@ class Settings:
         for name, low, high in (
             ("softmax_sharpness", 0, 1000),
             ("flow_magnitude", 0, 10_000),
-            ("working_pixels", _LEAST_WORKING_PIXELS if self.working_pixels else 0, 1 << 28),
+            ("working_pixels", _LEAST_WORKING_PIXELS if self.working_pixels else 0, MOST_WORKING_PIXELS),
             ("transition_strain", 0, 1),
             ("band_rows", 0, 1 << 20),
             ("max_memory", 0, MOST_MEMORY),

@@ -9,9 +9,8 @@ from dataclasses import replace
 from functools import partial
 from itertools import groupby
 from pathlib import Path
-from typing import Any
 
-from hugin_abflow.errors import ProgramMissingError
+from hugin_abflow.errors import LayersMismatchError, ProgramMissingError
 from hugin_abflow.exif import embed
 from hugin_abflow.found import Remap, find_layers, layers_there
 from hugin_abflow.images import COMPRESSIONS, ENDINGS, read_layer
@@ -86,19 +85,22 @@ def stitch_project(
 
 def show_project(
     path: Path | str,
+    settings: Settings | None = None,
     *,
     output: Path | str | None = None,
     prefix: str | Path | None = None,
     layers: Sequence[str | Path] | None = None,
     remap: Remap = "auto",
+    keep_layers: bool = False,
     compression: str | None = None,
     jpeg_quality: int | None = None,
+    metadata: bool = True,
     options: Sequence[str] = (),
-    **others: Any,
 ) -> list[str]:
     """What `stitch_project` would do, as lines of a shell script: a comment on the plan, then the commands.
 
     options     of our own command line that say how to blend; the other arguments are `stitch_project`'s.
+                Of settings, keep_layers and metadata the commands know by these options alone.
 
     Photos that miss the crop, which nona tells later, are taken for part of the panorama. Raises as
     `stitch_project` does for what the project can get wrong.
@@ -189,6 +191,20 @@ def _files(layers: Sequence[Layer]) -> list[Path]:
     return list(dict.fromkeys(layer.file for layer in layers if layer.file is not None))
 
 
+def _images(plan: Plan, layers: Sequence[Layer]) -> list[int]:
+    """The image of each layer, which has a file of its own: programs that take them take whole files.
+
+    Raises `LayersMismatchError` for pages of one file.
+    """
+    images = [image for image in images_of(plan, layers) if image is not None]
+    if not len(images) == len(_files(layers)) == len(layers):
+        raise LayersMismatchError(
+            f"{layers[0].file} holds layers as its pages, but stacks and exposures are made of layers in "
+            "files of their own; remove it, or make the layers again with --remap always"
+        )
+    return images
+
+
 class _Maker:
     """Makes the outputs of one branch, step by step."""
 
@@ -212,9 +228,9 @@ class _Maker:
             open_layers(self.plan, remap=remap, keep_layers=keep, progress=self.progress) as opened,
             work_folder() as scratch,
         ):
-            images = [image for image in images_of(self.plan, opened) if image is not None]
+            images = _images(self.plan, opened)
             names = [self.branch.layer(image) for image in images]
-            files = dict(zip(names, _files(opened), strict=False))
+            files = dict(zip(names, _files(opened), strict=True))
             made = _files(opened) if self.branch.keeps_layers else []
             for program, steps in groupby(self.branch.steps(images), key=lambda step: step.program):
                 if program == BLEND:

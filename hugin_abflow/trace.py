@@ -47,12 +47,13 @@ class _Recorder:
 
     def take(self) -> list[Event]:
         """What came since the last call, after the names of the lanes."""
+        with self._lock:  # of both: other threads add lanes meanwhile, and no event may lack its lane's name
+            lanes = list(self._lanes.items())
+            events, self._events = self._events, []
         names = [
             {"name": "thread_name", "ph": "M", "pid": os.getpid(), "tid": number, "args": {"name": lane}}
-            for lane, number in self._lanes.items()
+            for lane, number in lanes
         ]
-        with self._lock:
-            events, self._events = self._events, []
         return names + events
 
     def extend(self, events: Sequence[Event]) -> None:
@@ -85,8 +86,9 @@ def collecting() -> Iterator[Callable[[], list[Event]]]:
 
 def extend(events: Sequence[Event]) -> None:
     """Record what another process of this machine collected: all have one clock."""
-    if _recorder is not None:
-        _recorder.extend(events)
+    recorder = _recorder  # read once: another thread may end the recording
+    if recorder is not None:
+        recorder.extend(events)
 
 
 @contextmanager
@@ -128,8 +130,9 @@ def is_recording() -> bool:
 
 def add(name: str, kind: str, start: float, end: float, lane: str, **details: object) -> None:
     """Record what lasted from `start` to `end`, in seconds of `time.perf_counter`."""
-    if _recorder is not None:
-        _recorder.add(name, kind, start, end, lane, **details)
+    recorder = _recorder  # read once: another thread may end the recording
+    if recorder is not None:
+        recorder.add(name, kind, start, end, lane, **details)
 
 
 @contextmanager

@@ -94,7 +94,7 @@ def settle(
     unlike: (height, width) on any coarse grid over the same region, from 0 to 1, where layers cannot be
     brought to one brightness.
     """
-    grids = [_cells(grid, pixels) for pixels in _CELLS]
+    grids = [grid.coarser(pixels) for pixels in _CELLS]
     covers = _covers(masks, grids)
     price = _price(device, flows, masks, grid, grids[-1], covers[-1])
     shares: Shares | None = None
@@ -116,12 +116,6 @@ def settle(
         relax(device, shares, system, 1.0, _SWEEPS)
     assert shares is not None
     _expand(device, layers, coefficients, shares, grid)
-
-
-def _cells(grid: Grid, pixels: int) -> Grid:
-    """A grid of cells of about `pixels` x `pixels`; where it wraps, its columns can be parted by colour."""
-    cells = grid.coarser(pixels)
-    return grid.resized(cells.width + cells.width % 2, cells.height) if grid.wraps else cells
 
 
 def _covers(masks: Masks, grids: Sequence[Grid]) -> list[Mask]:
@@ -191,12 +185,10 @@ def links(price: npt.NDArray[np.float64], union: Mask, cells: Grid) -> tuple[Val
 
 def wells(cells: Grid, grid: Grid, strain: float, unlike: Values) -> Values:
     """(2 strain)^2 times the area of each cell, in squared working px, (height, width); 0 where layers are
-    unlike.
+    unlike, anywhere in a cell.
     """
-    rows, columns = np.arange(cells.height), np.arange(cells.width)
     area = grid.width / cells.width * grid.height / cells.height * _narrowing(cells)
-    height, width = unlike.shape
-    alike = 1 - unlike[rows * height // cells.height][:, columns * width // cells.width]
+    alike = 1 - on_cells(unlike[None], cells, np.maximum)[0]
     prices: Values = ((2 * strain) ** 2 * area[:, None] * alike).astype(np.float32)
     return prices
 

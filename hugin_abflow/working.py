@@ -38,6 +38,9 @@ _PART_STRIPS = 8
 _LARGEST_PRODUCT = 0.99 * 2**31
 _MOST_ROWS = 32_000
 
+# Integer samples brighter than this, of what a layer shows white, may be clipped.
+CLIPPED = 0.98
+
 # OpenCL type and full-scale value of each depth; half is widened on the host.
 PIXEL = {"uint8": ("uchar", 255.0), "uint16": ("ushort", 65535.0), "float32": ("float", 1.0)}
 
@@ -95,7 +98,7 @@ class Grid:
 
     @property
     def circumference(self) -> float:
-        """The canvas's width as the flow-magnitude term takes it: radians on the sphere, else grid px."""
+        """The whole canvas's width: radians on a sphere (2 pi if it wraps), grid px on a plane."""
         if self.lens[1] and self.wraps:
             return 2 * math.pi
         share = self.canvas_width / self.region.width if self.canvas_width else 1.0
@@ -124,7 +127,14 @@ class Grid:
 
     def coarser(self, pixels: int) -> Grid:
         """A grid over the same region, of cells of about `pixels` x `pixels` of this one's."""
-        return self.resized(max(1, round(self.width / pixels)), max(1, round(self.height / pixels)))
+        return self.reduced(max(1, round(self.width / pixels)), max(1, round(self.height / pixels)))
+
+    def reduced(self, width: int, height: int) -> Grid:
+        """The same region on fewer pixels; where it wraps, a column more if that makes them even. Crossing a
+        pole goes half of them further, and sweeps take every other one.
+        """
+        wider = self.wraps and width < self.width
+        return self.resized(width + width % 2 if wider else width, height)
 
     def resized(self, width: int, height: int) -> Grid:
         """The same region on another number of pixels."""
@@ -212,9 +222,7 @@ def working_grid(full: Grid, settings: Settings) -> Grid:
     pixels = math.sqrt(full.width * full.height / settings.working_limit)
     ratio = max(1.0, pixels, longest, full.height / _MOST_ROWS)
     width, height = max(2, round(full.width / ratio)), max(1, round(full.height / ratio))
-    if ratio > 1 and full.wraps:
-        width += width % 2  # crossing a pole goes half the width further
-    return full.resized(min(width, full.width), min(height, full.height))
+    return full.reduced(min(width, full.width), min(height, full.height))
 
 
 def device_dtype(layer: Layer) -> np.dtype[Any]:

@@ -97,8 +97,8 @@ def replace(monkeypatch: pytest.MonkeyPatch) -> Callable[[Merge], None]:
 
     def put(merge: Merge) -> None:
         monkeypatch.setattr(task, "stitch_project", lambda path, **keywords: [merge(path, **keywords)])
-        monkeypatch.setattr(run, "Pool", pool.Alone)
-        monkeypatch.setattr(run, "Cluster", lambda scheduler, *rest: pool.Alone(1, *rest))
+        monkeypatch.setattr(run, "Pool", lambda jobs, *rest: pool.Alone(*rest))
+        monkeypatch.setattr(run, "Cluster", lambda scheduler, *rest: pool.Alone(*rest))
 
     return put
 

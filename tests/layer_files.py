@@ -8,7 +8,7 @@ import numpy as np
 import tifffile
 
 X_POSITION, Y_POSITION, FULL_WIDTH, FULL_HEIGHT = 286, 287, 33300, 33301
-_RATIONAL, _LONG = 5, 4
+RATIONAL, _LONG = 5, 4
 
 
 def write_layer(
@@ -21,7 +21,7 @@ def write_layer(
 ) -> Path:
     """Pixels (height, width, channels + 1) at a place on the canvas, whose size goes into PIXAR's tags."""
     stored = pixels if alpha else pixels[..., :-1]
-    tags = [(X_POSITION, _RATIONAL, 1, (left, 150), True), (Y_POSITION, _RATIONAL, 1, (top, 150), True)]
+    tags = [(X_POSITION, RATIONAL, 1, (left, 150), True), (Y_POSITION, RATIONAL, 1, (top, 150), True)]
     if canvas:
         tags += [(FULL_WIDTH, _LONG, 1, canvas[0], True), (FULL_HEIGHT, _LONG, 1, canvas[1], True)]
     tifffile.imwrite(

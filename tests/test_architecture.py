@@ -9,6 +9,8 @@ from pathlib import Path
 
 import pytest
 
+from hugin_abflow import chart, consistency, flow, geometry, hidden, intermediate, search
+
 ROOT = Path(__file__).resolve().parent.parent
 PACKAGE = ROOT / "hugin_abflow"
 MODULES = {path.stem for path in PACKAGE.glob("*.py")} - {"__init__"} | {"pto", "dropin", "batch"}
@@ -87,6 +89,26 @@ def test_architecture_names_every_module_and_kernel_and_no_other() -> None:
 @pytest.mark.parametrize("kernel", sorted(KERNELS - PARTS - {"common.cl"}))
 def test_kernel_file_belongs_to_the_module_of_its_name(kernel: str) -> None:
     assert kernel.removesuffix(".cl") in MODULES
+
+
+def test_modules_have_the_numbers_of_their_kernels() -> None:
+    """Else kernels would leave pixels out, or write beside their arrays."""
+    text = "\n".join((ROOT / "kernels" / name).read_text("utf-8") for name in sorted(KERNELS))
+    numbers = {name: float(value) for name, value in re.findall(r"#define (\w+) ([\d.e]+)f?\s", text)}
+    (values,) = re.findall(r"enum board_value \{(.*?)\}", text, re.DOTALL)
+    board = re.findall(r"\bBOARD_\w+", values)
+    assert board.index("BOARD_PLANES") == len(board) - 1 == flow._PLANES
+    for name, number in {
+        "CHART_CHUNK": chart._CHUNK,
+        "FLOW_CHUNK": search._MEDIAN_CHUNK,
+        "GEOMETRY_CHUNK": geometry._CHUNK,
+        "HIDDEN_CHUNK": hidden._CHUNK,
+        "INTERMEDIATE_CHUNK": intermediate._CHUNK,
+        "SEARCH_MARGIN": search._MARGIN,
+        "SEARCH_RADIUS": search._LARGEST_RADIUS,
+        "UNTOLD": consistency.UNTOLD,
+    }.items():
+        assert numbers[name] == number, name
 
 
 def test_no_file_is_longer_than_450_lines() -> None:

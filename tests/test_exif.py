@@ -141,6 +141,32 @@ def test_tiff_of_either_byte_order_and_many_pages(tmp_path: Path, order: str, bi
             np.testing.assert_array_equal(page.asarray(), expected)
 
 
+def test_values_that_are_too_long_for_jpeg_are_left_out_and_told(
+    exiftool: str, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """The longest ones, and not all because of them: 65,533 bytes are all that a segment holds."""
+    path, long = tmp_path / "a.jpg", {270: text("x" * 30_000), 33432: text("y" * 29_000)}
+    picture(path, metadata=Metadata(TAGS | {MAIN: TAGS[MAIN] | long}))
+    assert read_exif(path)[MAIN].keys() >= long.keys() and not caplog.records
+    picture(path, metadata=Metadata(TAGS | {MAIN: TAGS[MAIN] | long | {ARTIST: text("z" * 28_000)}}))
+    found = shown(exiftool, path)
+    assert found["IFD0:Make"] == "Acme" and len(found["IFD0:Artist"]) == 28_000
+    assert "IFD0:ImageDescription" not in found and len(found["IFD0:Copyright"]) == 29_000
+    assert "left out of the panorama, as too long for JPEG: EXIF tag 270 (30001 bytes)" in caplog.text
+
+
+@pytest.mark.parametrize("data", [b"", b"ab", b"abcde", b"abcdefghijk"])
+@pytest.mark.parametrize("replaced", [0, 2, 5])
+def test_what_is_put_into_a_file_may_be_shorter_than_what_was_there(
+    monkeypatch: pytest.MonkeyPatch, data: bytes, replaced: int
+) -> None:
+    monkeypatch.setattr(exif_module, "_BLOCK", 3)
+    content = bytes(range(20))
+    file = io.BytesIO(content)
+    exif_module._insert(file, 4, data, replaced)
+    assert file.getvalue() == content[:4] + data + content[4 + replaced :]
+
+
 def test_blocks_are_moved_piece_by_piece(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(exif_module, "_BLOCK", 100)
     path = tmp_path / "a.png"

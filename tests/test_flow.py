@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import pytest
 from grids import patches
@@ -14,6 +16,7 @@ from hugin_abflow import pyramid, search
 from hugin_abflow.flow import Board
 from hugin_abflow.opencl import Device
 from hugin_abflow.pyramid import Level
+from hugin_abflow.settings import MOST_WORKING_PIXELS
 
 GRIDS = {"plane": (77, 53, 0, 0), "cylinder": (78, 53, 1, 0), "odd cylinder": (77, 53, 1, 0)}
 
@@ -391,6 +394,17 @@ def test_graphics_cards_relax_small_boards_at_once(
     for width in (128, 129):
         Board.of(device, 1, (width, 128, 0, 0)).relax(device, 2, 1.5)
     assert started == ["flow_relax_small" if kind == "GPU" else "flow_relax", "flow_relax"]
+
+
+@pytest.mark.parametrize("height", [3000, 6708, 9487, 32_000])
+def test_the_largest_board_is_counted_in_32_bits(
+    device: Device, monkeypatch: pytest.MonkeyPatch, height: int
+) -> None:
+    """Its shape alone: nothing of it is made."""
+    asked = list[tuple[int, ...]]()
+    monkeypatch.setattr(device, "zeros", asked.append)
+    Board.of(device, 1, (MOST_WORKING_PIXELS // height, height, 0, 0))
+    assert 1.9e9 < math.prod(asked[0]) <= np.iinfo(np.int32).max
 
 
 @pytest.mark.parametrize("name", list(GRIDS))

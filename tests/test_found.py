@@ -9,15 +9,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from conftest import age, names_of, pixels_of, refuse, remap, same
+from conftest import age, names_of, pixels_of, refuse, remap, same, whole
 
 from hugin_abflow import nona as program
-from hugin_abflow.errors import (
-    ImageReadError,
-    LayersMissingError,
-    OutputError,
-    SettingsError,
-)
+from hugin_abflow.errors import ImageReadError, LayersMissingError, OutputError, SettingsError
 from hugin_abflow.found import find_layers
 from hugin_abflow.images import write_image
 from hugin_abflow.merge import merge_project
@@ -231,6 +226,26 @@ def test_layers_that_are_there_are_never_replaced_by_the_panorama(make_project, 
         age(pages, 60)
         assert merge_project(plan.file, Settings(flow=False)).name.startswith("pano_abflow")
         assert pages.read_bytes() == left
+
+
+@pytest.mark.parametrize("how", ["found", "named", "no nona"])
+def test_layers_whose_pixels_are_broken_can_be_made_again(make_project, nona, monkeypatch, how):
+    """They open, so that it shows only where they are decoded; whoever named them knows of no project's."""
+    plan = read_plan(make_project())
+    remap(plan, "pano")
+    layer = plan.folder / "pano0001.tif"
+    with layer.open("r+b") as file:
+        file.seek(300)
+        file.write(b"\0" * 1000)
+    named = {"prefix": "pano"} if how == "named" else {}
+    if how == "no nona":
+        monkeypatch.setenv("PATH", "")
+    with pytest.raises(ImageReadError) as error, open_layers(plan, **named) as layers:
+        whole(layers[1])
+    assert "pano0001.tif cannot be read (" in str(error.value)
+    assert ("--remap always" in str(error.value)) == (how == "found")
+    with pytest.raises(ImageReadError, match=r"^another$"), open_layers(plan):
+        raise ImageReadError("another")
 
 
 @pytest.mark.parametrize("without", ["photo", "nona"])

@@ -11,7 +11,14 @@ import pytest
 from pictures import expected_picture, masked, masks_of, merged, noise, one_device, pixel_places, texture
 
 from hugin_abflow import blend, merge, opencl
-from hugin_abflow.errors import DeviceError, LayersMismatchError, LayersMissingError, SettingsError
+from hugin_abflow.errors import (
+    CanvasError,
+    DeviceError,
+    GuideError,
+    LayersMismatchError,
+    LayersMissingError,
+)
+from hugin_abflow.guides import Guide
 from hugin_abflow.images import read_layer
 from hugin_abflow.layer import Box, Canvas, Layer
 from hugin_abflow.merge import merge_layers, merge_project
@@ -236,6 +243,29 @@ def test_no_layers():
 
 
 @pytest.mark.parametrize(
+    "crop", [(0, 0, 0, 0), (5, 9, 30, 9), (9, 5, 9, 30), (-1, 0, 20, 20), (0, 0, 302, 20), (0, 9, 20, 152)]
+)
+def test_crops_that_are_no_part_of_the_canvas(crop):
+    with pytest.raises(CanvasError, match=r"crop of columns .* canvas of 301x151; choose"):
+        merge_layers([Layer.from_array("a", noise(20, 20))], cropped(CANVASES["plane"], *crop))
+
+
+@pytest.mark.parametrize("a, b", [(0, 2), (2, 0), (-1, 0), (1, 1), (0.5, 1)])
+def test_guides_of_layers_that_are_none(a, b):
+    layers = [Layer.from_array(name, noise(20, 20)) for name in "ab"]
+    with pytest.raises(GuideError, match=rf"^one is about the layers {a} and {b}; .* of 0 to 1, "):
+        merge_layers(layers, CANVASES["plane"], guides=[Guide(a, b, (1, 1), (2, 2), "one")])
+
+
+@pytest.mark.parametrize("place", [(float("nan"), 1.0), (1.0, float("inf"))])
+def test_guides_of_places_that_are_none(place):
+    layers = [Layer.from_array(name, noise(20, 20)) for name in "ab"]
+    for ends in ((place, (1, 1)), ((1, 1), place)):
+        with pytest.raises(GuideError, match=r"guide is at .*; give canvas pixels"):
+            merge_layers(layers, CANVASES["plane"], guides=[Guide(1, 0, *ends)])
+
+
+@pytest.mark.parametrize(
     "other, message",
     [
         (
@@ -249,62 +279,6 @@ def test_no_layers():
 def test_layers_that_do_not_belong_together(other, message):
     with pytest.raises(LayersMismatchError, match=message):
         merge_layers([Layer.from_array("a", noise(20, 20)), other], CANVASES["plane"])
-
-
-@pytest.mark.parametrize(
-    "values",
-    [
-        {"softmax_sharpness": "10"},
-        {"softmax_sharpness": True},
-        {"softmax_sharpness": None},
-        {"softmax_sharpness": float("nan")},
-        {"softmax_sharpness": np.ones(2)},
-        {"flow_magnitude": 1j},
-        {"flow_magnitude": float("inf")},
-        {"working_pixels": 2e6},
-        {"threads": "1"},
-        {"band_rows": False},
-        {"merge": ["joint"]},
-        {"merge": np.array(["joint", "joint"])},
-        {"interpolation": None},
-        {"flow_quality": 2},
-        {"exposure": 1},
-        {"seam": "auto"},
-        {"flow": "off"},
-        {"guides": "off"},
-        {"large_motion": True},
-        {"exposure": "auto"},
-        {"device": 0},
-    ],
-)
-def test_settings_of_a_wrong_type(values):
-    with pytest.raises(SettingsError, match=next(iter(values))):
-        Settings(**values)
-
-
-def test_numbers_become_what_kernels_take():
-    """An integer's bits would be read as those of a tiny float."""
-    settings = Settings(softmax_sharpness=np.float32(3), flow_magnitude=7, working_pixels=np.int64(5000))
-    numbers = settings.softmax_sharpness, settings.flow_magnitude, settings.working_pixels
-    assert numbers == (3, 7, 5000) and list(map(type, numbers)) == [float, float, int]
-
-
-@pytest.mark.parametrize(
-    "values",
-    [
-        {"softmax_sharpness": -1},
-        {"flow_magnitude": 1e5},
-        {"working_pixels": 1},
-        {"flow_magnitude": float("nan")},
-        {"band_rows": -1},
-        {"merge": "average"},
-        {"interpolation": "sinc"},
-        {"flow_quality": "better"},
-    ],
-)
-def test_settings_out_of_range(values):
-    with pytest.raises(SettingsError, match=next(iter(values))):
-        Settings(**values)
 
 
 def test_threads_bound_reading_and_writing_as_well(tmp_path, monkeypatch):

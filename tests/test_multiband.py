@@ -78,7 +78,8 @@ def test_weights_and_finest_levels_equal_their_twins(device: Device, name: str, 
         )  # fmt: skip
         # a hundredth of a pixel's position, some tenth of full scale from one to the next
         assert_close(level.get(), found[0], 5 * TRIGONOMETRY, 2 * DECISIONS)
-        assert_close(share.get(), found[1], SUM, 2 * DECISIONS)
+        # and places of up to 78 columns are rounded to 4e-6, where they are not whole halves
+        assert_close(share.get(), found[1], 3 * SUM, 2 * DECISIONS)
         assert 0.2 < found[0][..., 3].mean() < 0.95
 
 

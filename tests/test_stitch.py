@@ -13,13 +13,20 @@ import OpenImageIO as oiio
 import pytest
 import tifffile
 from conftest import ProjectMaker, names_in, require_program
+from layer_files import RATIONAL, X_POSITION, Y_POSITION
 from pictures import one_device
 from test_exif import shown
 from test_hugin import CANVAS, NAME, stacked
 from test_metadata import shot
 
 from hugin_abflow import cli
-from hugin_abflow.errors import ExitCode, LayersMissingError, OutputError, ProgramFailedError
+from hugin_abflow.errors import (
+    ExitCode,
+    LayersMismatchError,
+    LayersMissingError,
+    OutputError,
+    ProgramFailedError,
+)
 from hugin_abflow.images import read_layer
 from hugin_abflow.merge import merge_project
 from hugin_abflow.outputs import Kind
@@ -221,6 +228,24 @@ def test_compression_that_enfuse_does_not_know(make_project: ProjectMaker, caplo
     assert caplog.text.count("enfuse knows no compression zstd; its files get LZW") == 1
 
 
+@pytest.mark.parametrize("pages", [3, 2])
+def test_layers_in_one_file_of_pages_are_refused(make_project: ProjectMaker, pages: int) -> None:
+    """As many as there are images, and fewer."""
+    project = make_project(panorama=CANVAS)
+    project.write_text(project.read_text() + asked(Kind.EXPOSURE_LAYERS))
+    with tifffile.TiffWriter(project.parent / "pano_exposure_layers_.tif") as writer:
+        for _ in range(pages):
+            tags = [(tag, RATIONAL, 1, (0, 150), True) for tag in (X_POSITION, Y_POSITION)]
+            pixels = np.full((20, 30, 4), 255, np.uint8)
+            writer.write(
+                pixels, photometric="rgb", extrasamples=["unassalpha"], subfiletype=2, extratags=tags,
+                resolution=(150, 150), resolutionunit="inch", metadata=None,
+            )  # fmt: skip
+    with pytest.raises(LayersMismatchError, match=r"pano_exposure_layers_\.tif holds .* --remap always"):
+        stitch_project(project, remap="never")
+    assert stitch_project(project, Settings(flow=False), remap="always")
+
+
 @pytest.mark.parametrize("disabled", [(), (0,)])
 def test_photo_is_never_replaced(make_project: ProjectMaker, disabled: tuple[int, ...]) -> None:
     project = make_project(panorama=CANVAS, photo="pano_stack_ldr_000{}.tif", disabled=disabled)
@@ -288,6 +313,14 @@ def test_dry_run_of_one_panorama(
     assert len(lines) == len(expected)
     for line, begin in zip(lines, expected, strict=True):
         assert line.startswith(begin.format(here=tmp_path))
+
+
+def test_dry_run_takes_what_the_run_takes_and_nothing_else(make_project: ProjectMaker) -> None:
+    project = make_project()
+    shown = show_project(project)
+    assert shown == show_project(project, Settings(), keep_layers=True, metadata=False)
+    with pytest.raises(TypeError, match="prefixes"):
+        show_project(project, prefixes="l")  # type: ignore[call-arg]
 
 
 def test_dry_run_says_how_to_blend(make_project: ProjectMaker, capsys: pytest.CaptureFixture[str]) -> None:

@@ -110,7 +110,7 @@ from hugin_abflow import __main__
 from hugin_abflow.batch import pool, run, task
 {merge}
 task.stitch_project = lambda path, **keywords: [merge(path, **keywords)]
-run.Pool = pool.Alone
+run.Pool = lambda jobs, *rest: pool.Alone(*rest)
 sys.exit(__main__.main())
 """
 

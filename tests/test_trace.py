@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 import errno
+import itertools
 import json
 import os
+import sys
 import threading
 import weakref
+from collections.abc import Callable
 from pathlib import Path
+from types import FrameType
 from typing import Any, TextIO
 
 import numpy as np
@@ -68,6 +72,54 @@ def test_spans_of_threads_have_lanes_of_their_own(tmp_path: Path) -> None:
     assert inside["args"] == {"rows": 7}
     assert inside["tid"] != outside["tid"]
     assert outside["ts"] <= inside["ts"] <= end(inside) <= end(outside)
+
+
+def test_each_event_that_is_taken_has_its_lanes_name() -> None:
+    """Also while other threads, in lanes of their own, go on."""
+    interval = sys.getswitchinterval()
+
+    def add(thread: int) -> None:
+        for number in range(2000):
+            trace.add("a", trace.FILE, 0, 1, f"{thread} {number}")
+
+    threads = [threading.Thread(target=add, args=(number,)) for number in range(2)]
+    named: set[int] = set()
+    sys.setswitchinterval(1e-6)
+    try:
+        with trace.collecting() as take:
+            for thread in threads:
+                thread.start()
+            while any(thread.is_alive() for thread in threads):
+                taken = take()
+                named.update(event["tid"] for event in taken if event["ph"] == "M")
+                assert named.issuperset(event["tid"] for event in taken)
+    finally:
+        sys.setswitchinterval(interval)
+        for thread in threads:
+            thread.join()
+
+
+@pytest.mark.parametrize("record", [lambda: trace.add("a", trace.FILE, 0, 1, "b"), lambda: trace.extend([])])
+def test_another_thread_may_end_the_recording_meanwhile(
+    record: Callable[[], None], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """After the first line: tracing does here what a thread can do."""
+
+    lines = itertools.count()
+
+    def end_recording(frame: FrameType, event: str, _: object) -> Callable[..., Any]:
+        if event == "line" and frame.f_globals is vars(trace) and next(lines):
+            monkeypatch.setattr(trace, "_recorder", None)
+        return end_recording
+
+    before = sys.gettrace()
+    with trace.collecting():
+        sys.settrace(end_recording)
+        try:
+            record()
+        finally:
+            sys.settrace(before)
+    assert next(lines) > 1
 
 
 def test_what_fails_is_recorded_too(tmp_path: Path) -> None:

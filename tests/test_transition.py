@@ -194,16 +194,11 @@ def test_wells_are_as_large_as_their_cells() -> None:
     flat = transition.wells(plane(8, 4), plane(80, 40), 0.5, unlike)
     assert flat[:2] == pytest.approx(100) and flat[2:, :4] == pytest.approx(100)
     assert not flat[2:, 4:6].any() and flat[2:, 6:] == pytest.approx(100)
+    coarse = transition.wells(plane(2, 1), plane(80, 40), 0.5, unlike)
+    assert coarse.tolist() == [[pytest.approx(1600), 0]]  # of three quarters of the second one they are alike
     curved = transition.wells(sphere(40, 20), sphere(400, 200), 0.5, np.zeros((1, 1), np.float32))
     latitudes = math.pi / 2 - (np.arange(20) + 0.5) * math.pi / 20
     assert curved == pytest.approx(np.repeat(100 * np.cos(latitudes)[:, None], 40, 1), rel=1e-5)
-
-
-@pytest.mark.parametrize("width", range(31, 41))
-def test_columns_that_wrap_can_be_parted_by_colour(width: int) -> None:
-    """Else the first and the last one of a row, of one colour, would read each other."""
-    assert transition._cells(plane(width, 20, wraps=True), 4).width % 2 == 0
-    assert transition._cells(plane(width, 20), 4) == plane(width, 20).coarser(4)
 
 
 def test_cells_that_no_layer_covers_whole_are_shared_by_those_that_reach_into_them() -> None:

@@ -294,6 +294,19 @@ def test_the_working_grid_is_bounded_and_covers_the_region(width: int, height: i
         assert grid.width % 2 == 0
 
 
+@pytest.mark.parametrize("pixels", [2, 3, 4, 16])
+def test_half_of_a_turn_is_whole_columns_of_coarser_grids(pixels: int) -> None:
+    """So far a row beyond a pole goes on; nor may sweeps over every other column meet at the border."""
+    for width in range(30, 60):
+        flat = grid_over(Box(0, 0, width, 20), width, 20)
+        cells = replace(flat, wraps=True).coarser(pixels)
+        assert cells.width % 2 == 0 and abs(cells.width - width / pixels) <= 1.5
+        assert flat.coarser(pixels).width == round(width / pixels)
+    sphere = working.full_grid(Canvas.sphere(2050, 1025), boxes((0, 0, 2050, 1025)))
+    assert (sphere.coarser(2).width, sphere.coarser(2).poles) == (1026, 3)
+    assert sphere.coarser(2).lens[1] * 1026 == pytest.approx(2 * math.pi)
+
+
 @pytest.mark.parametrize("size", [(100_000, 20), (20, 70_000), (100_000, 50_000), (300_000, 3)])
 def test_places_on_the_working_grid_are_found_in_32_bits(size: tuple[int, int]) -> None:
     full = grid_over(Box(0, 0, *size), *size, False)

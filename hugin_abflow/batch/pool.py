@@ -227,7 +227,7 @@ class Pool:
 class Alone:
     """The same in this process, one after the other: for one project, which needs no other."""
 
-    def __init__(self, jobs: int, level: int, watcher: Watcher) -> None:
+    def __init__(self, level: int, watcher: Watcher) -> None:
         self._level, self._watcher = level, watcher
 
     def __enter__(self) -> Alone:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, Literal
@@ -64,16 +63,6 @@ class Record:
         for file in values["inputs"] + values["outputs"]:
             file["file"] = str(Path(file["file"]).absolute())
         return {**values, "project": str(self.project), "exit_code": int(self.exit_code)}
-
-    @classmethod
-    def from_json(cls, values: Mapping[str, Any]) -> Record:
-        """What `to_json` gave. Raises KeyError, TypeError or ValueError for anything else."""
-        known = {
-            **values,
-            "project": Path(values["project"]),
-            "exit_code": ExitCode(values["exit_code"]),
-        }
-        return cls(**known)
 
 
 def write_json(path: Path, values: object) -> None:

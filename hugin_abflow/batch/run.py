@@ -117,9 +117,11 @@ def _performers(how: Run, count: int, lone: bool, display: Display) -> Alone | P
     level = logging.INFO if how.verbose or how.log or how.report or not lone else logging.WARNING
     if how.scheduler:
         return Cluster(how.scheduler, level, display)
+    if lone:
+        return Alone(level, display)
     jobs = how.jobs or default_jobs()
     # processes share the memory: there must be no more than have something to do
-    return (Alone if lone else Pool)(min(jobs, count) if count else jobs, level, display)
+    return Pool(min(jobs, count) if count else jobs, level, display)
 
 
 def _announced(tasks: Iterable[Task | None], running: set[Path], display: Display) -> Iterator[Task | None]:
