@@ -77,9 +77,9 @@ def complete(
     unlike: Unlike,
     shoulder: float,
 ) -> None:
-    """Replace, in place, how a layer differs from the weighted mean of all where they show different things.
+    """Replace, in place, how a layer differs from a mean of all where they show different things.
 
-    difference  float32 (height, width, 4) on a box of `grid`: colour, valid. share: its own of all weights.
+    difference  float32 (height, width, 4) on a box of `grid`: colour, valid. share: its own in the mean.
     mean        float32 (height, width, 4) on all of the grid. shoulder: of the exposure scale, 0: of floats.
     """
     if not _any(unlike, box, grid):  # of many layers nearly all

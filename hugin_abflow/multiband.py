@@ -2,10 +2,11 @@
 
 Burt and Adelson, "A multiresolution spline with application to image mosaics", 1983: each band of frequencies
 changes over as widely as its waves are long, so that neither steps of brightness nor doubled texture show.
-Blended are the layers' differences from their weighted mean, to which the blend is added: the same where all
-cover all, and nothing for layers that agree, however narrow their overlaps. What fits on half the working
-grid is calculated there; of finer bands the weighted mean of the full-resolution pass is the blend, and what
-is added to a layer before leaves them as they are.
+Blended are the layers' differences from a mean, to which the blend is added: the same where all cover all,
+and nothing for layers that agree, however narrow their overlaps. In that mean a layer has the less of a share
+the nearer its border is: beyond it goes on by what it differs by there, and a mean in which it ended would be
+a step. What fits on half the working grid is calculated there; of finer bands the weighted mean of the
+full-resolution pass is the blend, and what is added to a layer before leaves them as they are.
 
 Gains (colour.py) come before: an offset cannot restore contrast. Where layers show different things, what
 they differ by is told from beside (content.py).
@@ -15,8 +16,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
+import cv2
 import numpy as np
 import numpy.typing as npt
 
@@ -136,21 +138,49 @@ def _finest(
 def _differ(
     device: Device, finest: list[_Level], widths: Widths, unlike: Unlike | None, shoulder: float
 ) -> None:
-    """Have each entry be how it differs from the weighted mean of all."""
+    """Have each entry be how it differs from a mean of all in which none ends suddenly."""
     grid = finest[0].grid
     mean = device.zeros((*grid.shape, 4))
-    for level in finest:
-        _add(device, level, None, mean)
+    shown = [level.colours.get()[..., 3] > 0 for level in finest]
+    shares = [device.upload(one) for one in feathers(shown, [level.box for level in finest], grid)]
+    for level, share in zip(finest, shares, strict=True):
+        _add(device, replace(level, share=share), None, mean)
     _join(device, mean, grid, None, None)
-    for k, level in enumerate(finest):
+    for k, (level, share) in enumerate(zip(finest, shares, strict=True)):
         device.run(
             "multiband", "multiband_differ", level.box[2:], level.colours, level.box, grid.border, mean
         )
         if unlike is not None:
-            content.complete(device, level.colours, level.share, level.box, grid, mean, unlike, shoulder)
+            content.complete(device, level.colours, share, level.box, grid, mean, unlike, shoulder)
         finest[k] = _spread(device, level, widths)
         del level
         device.give_back(MUCH)
+
+
+def feathers(
+    shown: Sequence[npt.NDArray[np.bool_]], boxes: Sequence[Place], grid: Grid
+) -> list[npt.NDArray[np.float32]]:
+    """Shares of layers that sum to 1, each by the distance in px to where it ends and another one goes on.
+
+    shown       where each layer shows something, (height, width) on its box of `grid`, as the shares.
+    """
+    union, total = np.zeros(grid.shape, bool), np.zeros(grid.shape, np.float32)
+    parts = [np.s_[top : top + height, left : left + width] for left, top, width, height in boxes]
+    for part, mask in zip(parts, shown, strict=True):
+        union[part] |= mask
+    depths = []
+    for part, mask in zip(parts, shown, strict=True):
+        inside = (~union[part] | mask).astype(np.uint8)
+        by = mask.shape[1] // 2 if grid.wraps and mask.shape[1] == grid.width else 0
+        if inside.all():
+            depth = np.full(mask.shape, grid.width + grid.height, np.float32)
+        else:
+            around = np.pad(inside, ((0, 0), (by, by)), mode="wrap")
+            depth = cv2.distanceTransform(around, cv2.DIST_L2, 3)[:, by : by + mask.shape[1]]
+        depths.append((depth * mask).astype(np.float32))
+        total[part] += depths[-1]
+    total[total == 0] = 1
+    return [np.divide(depth, total[part]) for part, depth in zip(parts, depths, strict=True)]
 
 
 def _blend(

@@ -6,10 +6,15 @@
 #define CONTENT_BLACK 0.03f
 #define CONTENT_SEEN 0.15f
 
-/* How surely layers show the same at a place of a grid, 0..1. own, mean: what one shows and the mean of all. */
-static inline float content_same(float3 own, float3 mean, float2 place, __global const float *moved,
+/* Share of others of which nothing is told. */
+#define CONTENT_LITTLE 1e-3f
+
+/* How surely layers show the same at a place of a grid, 0..1. d: how one of them differs from the mean of all, of
+   which `rest` is the others' share. */
+static inline float content_same(float3 d, float3 mean, float rest, float2 place, __global const float *moved,
                                  __global const float *unlike, int4 cells, float shoulder) {
-    const float dark = (darker_channel(own, mean) - CONTENT_BLACK) / (CONTENT_SEEN - CONTENT_BLACK);
+    const float3 own = mean + d, others = own - d / GREATEST(rest, CONTENT_LITTLE);
+    const float dark = (darker_channel(own, others) - CONTENT_BLACK) / (CONTENT_SEEN - CONTENT_BLACK);
     const float seen = shoulder > 0.0f ? LIMITED(dark, 0.0f, 1.0f) : 1.0f;
     const float other = seen * bilinear_scalar(unlike, place, cells);
     return 1.0f - GREATEST(other, bilinear_scalar(moved, place, cells));
@@ -18,7 +23,7 @@ static inline float content_same(float3 own, float3 mean, float2 place, __global
 /* Sums for a fit, over the pixels of a cell: with d = (1 - share) e the difference of a layer from the mean of all, of
    which its own share is part, of w d (1 - share) / n and w (1 - share)^2 / n, w as surely as it shows the same. */
 __kernel void content_gather(__global const float4 *difference,  /* (box.w, box.z): colour, valid */
-                             __global const float *share,        /* (box.w, box.z), of all weights */
+                             __global const float *share,        /* (box.w, box.z), in the mean */
                              int4 box, int4 grid,                /* place; its grid */
                              __global const float4 *mean,        /* (grid.y, grid.x): colour, valid */
                              __global const float *moved,        /* (cells.y, cells.x), 0..1 */
@@ -40,7 +45,7 @@ __kernel void content_gather(__global const float4 *difference,  /* (box.w, box.
             const float3 d = difference[at].xyz, m = mean[y * grid.x + x].xyz;
             const float2 place = grid_place(x, y, grid, cells);
             const float rest = 1.0f - share[at];
-            const float w = rest * content_same(m + d, m, place, moved, unlike, cells, shoulder);
+            const float w = rest * content_same(d, m, rest, place, moved, unlike, cells, shoulder);
             sum += w * (float4)(d, rest);
         }
     const int n = (its.z - its.x) * (its.w - its.y);
@@ -59,9 +64,10 @@ __kernel void content_complete(__global float4 *difference, __global const float
         return;
     const float2 place = grid_place(x + box.x, y + box.y, grid, cells);
     const float3 d = difference[at].xyz, m = mean[(y + box.y) * grid.x + x + box.x].xyz;
-    const float same = content_same(m + d, m, place, moved, unlike, cells, shoulder);
+    const float rest = 1.0f - share[at];
+    const float same = content_same(d, m, rest, place, moved, unlike, cells, shoulder);
     if (same == 1.0f)
         return;
     const float4 e = bilinear_colour(told, place, cells);
-    difference[at].xyz = same * d + (1.0f - same) * (1.0f - share[at]) * e.xyz;
+    difference[at].xyz = same * d + (1.0f - same) * rest * e.xyz;
 }

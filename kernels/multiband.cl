@@ -1,5 +1,5 @@
 /* A multi-band blend of layers that are aligned, corrected and weighed: what is to be added to each for it. What is
-   blended is how the layers differ from their weighted mean: where they agree it is nothing. Levels of a layer are
+   blended is how the layers differ from a mean of them: where they agree it is nothing. Levels of a layer are
    arrays on a box of a grid, those of the blend on all of it; each grid covers the same region with half as many
    columns and rows as the one before. */
 
@@ -82,7 +82,7 @@ __kernel void multiband_finest(__global const float4 *layer, __global const floa
     share[y * place.z + x] = valid ? way.w : 0.0f;
 }
 
-/* How a layer differs from the weighted mean of all. */
+/* How a layer differs from a mean of all. */
 __kernel void multiband_differ(__global float4 *level,      /* (box.w, box.z): colour, valid; then difference */
                                int4 box, int4 grid,         /* place, run size; its grid */
                                __global const float4 *mean) /* (grid.y, grid.x): colour, valid */

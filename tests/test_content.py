@@ -58,7 +58,7 @@ def test_kernels_equal_their_twins(device: Device, name: str, part: int, shoulde
         other, cells.border, shoulder, sums,
     )  # fmt: skip
     same = twin.content_same(
-        difference, box, grid.border, mean, unlike.moved, unlike.other, cells.border, shoulder
+        difference, share, box, grid.border, mean, unlike.moved, unlike.other, cells.border, shoulder
     )
     expected = twin.content_gather(difference, share, same, box, grid.border, cells.border)
     assert (expected[..., 3] > 0).any()

@@ -11,10 +11,13 @@ from reference.multiband import place
 
 # The brightest channel of what may be anything, as dark as it is, and of what surely is something.
 BLACK, SEEN = 0.03, 0.15
+# Share of others of which nothing is told.
+LITTLE = 1e-3
 
 
 def content_same(
     difference: Array,
+    share: Array,
     box: Sequence[int],
     grid: Sequence[int],
     mean: Array,
@@ -23,10 +26,12 @@ def content_same(
     cells: Sequence[int],
     shoulder: float,
 ) -> Array:
-    """How surely a layer on a box shows the same as all, (height, width)."""
+    """How surely a layer on a box, with its share of the mean, shows the same as others, (height, width)."""
     left, top, width, height = box
     there = mean[top : top + height, left : left + width, :3].astype(np.float64)
-    darker = np.minimum(there.max(-1), (there + difference[..., :3]).max(-1))
+    own = there + difference[..., :3]
+    others = own - difference[..., :3] / np.maximum(1 - share.astype(np.float64), LITTLE)[..., None]
+    darker = np.minimum(others.max(-1), own.max(-1))
     seen = np.clip((darker - BLACK) / (SEEN - BLACK), 0, 1) if shoulder else np.ones(darker.shape)
     read = []
     for values in (moved, unlike):
