@@ -311,6 +311,7 @@ def _align(
                 device, layers, fields, owner, whole, unlike.anywhere, masks, grid, cells
             ):
                 reaches[k] = geometry.reach(device, layers[k], fields[k], grid)
+            seam.stay(device, layers, fields, owner, whole, grid, cells)
         else:
             last = hoped or gains(settings, None)
         return _Aligned(fields, reaches, last.result(), whole, unlike)

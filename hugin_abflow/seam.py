@@ -158,6 +158,27 @@ def yielded(whole: Cells, owner: npt.NDArray[np.intp], k: int, wraps: bool) -> n
     return np.ascontiguousarray(averaged((others | beyond).astype(np.float32), wraps))
 
 
+def stay(
+    device: Device,
+    layers: Sequence[WorkingLayer],
+    fields: Sequence[Buffer],
+    owner: npt.NDArray[np.intp],
+    whole: Cells,
+    grid: Grid,
+    cells: Grid,
+) -> None:
+    """Displace what is taken from a layer (fields[...].xyz, in place) only as far as it shows something: else
+    another layer would be seen along the border of the canvas. owner, whole: of `cut`.
+    """
+    for k, (layer, field) in enumerate(zip(layers, fields, strict=True)):
+        its = whole & (owner == k)
+        if its.any():  # of many layers nearly all
+            device.run(
+                "seam", "seam_stay", layer.box[2:], layer.pixels, field, layer.box, grid.border, grid.lens,
+                device.upload(its.astype(np.uint8)), cells.border,
+            )  # fmt: skip
+
+
 def divide(
     device: Device,
     layers: Sequence[WorkingLayer],

@@ -55,3 +55,34 @@ __kernel void seam_yield(__global float4 *field,        /* (box.w, box.z) of the
     const float left = keep * keep * keep * keep;
     field[y * box.z + x].w *= GREATEST(left, trace);
 }
+
+/* Parts of a displacement that are tried. */
+#define SEAM_PARTS 4
+
+/* Displace what is taken from a layer only as far as it shows something there, and a part farther: at full resolution
+   there are pixels beyond. */
+__kernel void seam_stay(__global const float4 *layer,  /* (box.w, box.z) */
+                        __global float4 *field,        /* the same; x, y, z are shortened */
+                        int4 box, int4 border,         /* place on the working grid, run size; working grid */
+                        float4 lens,
+                        __global const uchar *taken,   /* (cells.y, cells.x): the cells of what is taken from it */
+                        int4 cells)                    /* seam grid, over the same region */
+{
+    const int x = get_global_id(0), y = get_global_id(1), at = y * box.z + x;
+    if (x >= box.z || y >= box.w || layer[at].w == 0.0f)
+        return;
+    const float2 q = (float2)(x + box.x + 0.5f, y + box.y + 0.5f);
+    const int2 cell = convert_int2(q * (float2)((float)cells.x / border.x, (float)cells.y / border.y));
+    if (!taken[min(cell.y, cells.y - 1) * cells.x + min(cell.x, cells.x - 1)])
+        return;
+    const float4 own = field[at];
+    int part = SEAM_PARTS;
+    while (part > 0) {
+        const float3 farther = own.xyz * ((part + 1.0f) / SEAM_PARTS);
+        if (layer_sample(layer, box, layer_position(q, farther, lens), border).w != 0.0f)
+            break;
+        --part;
+    }
+    if (part < SEAM_PARTS)
+        field[at] = (float4)(own.xyz * ((float)part / SEAM_PARTS), own.w);
+}

@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 from grids import GRIDS, patches, plane, random_layer
 from labels import label
-from reference.seam import seam_difference, seam_yield
+from reference.common import layer_seen
+from reference.seam import seam_difference, seam_stay, seam_yield
 from scipy import ndimage
 from tolerances import POSITION, SUM, assert_close
 
@@ -104,6 +105,37 @@ def test_cells_read_what_lies_at_their_centres(size: tuple[int, int]) -> None:
         row, column = int((y + 0.5) / 18 * size[1]), int((x + 0.5) / 24 * size[0])
         assert found[:, y, x].tolist() == values[:, row, column].tolist()
     assert found.shape == (2, 18, 24)
+
+
+@pytest.mark.parametrize("name", list(GRIDS))
+def test_what_stays_equals_its_twin(device: Device, name: str) -> None:
+    """Of a layer with holes, displaced by up to some pixels, also beyond the canvas."""
+    grid = GRIDS[name]
+    cells = grid.resized(10, 7)
+    box = (5, 0, grid.width - 5, grid.height - 2)
+    layer = random_layer(20, box[2], box[3], 0.9)
+    field = ndimage.gaussian_filter(np.random.default_rng(3).normal(size=(box[3], box[2], 4)), (4, 4, 0))
+    field = (40 * field * (grid.lens[1] or 1)).astype(np.float32)
+    if not grid.lens[1]:
+        field[..., 2] = 0
+    taken = (patches(2, 10, 7, 0.7, 2) > 0).astype(np.uint8)
+    out = device.upload(field)
+    device.run(
+        "seam", "seam_stay", box[2:], device.upload(layer), out, box, grid.border, grid.lens,
+        device.upload(taken), cells.border,
+    )  # fmt: skip
+    expected = seam_stay(layer, field, box, grid.border, grid.lens, taken, cells.border)
+    assert_close(out.get(), expected, POSITION, decisions=0.02)
+    shorter = np.abs(expected[..., :3]).max(-1) < 0.9 * np.abs(field[..., :3]).max(-1)
+    assert 0.01 < shorter.mean() < 0.6
+    assert np.array_equal(out.get()[..., 3], field[..., 3])
+    rows, columns = np.mgrid[: box[3], 5 : 5 + box[2]]
+    its = (expected[..., :3] != field[..., :3]).any(-1)
+    seen = [
+        layer_seen(layer, one, box, columns, rows, grid.border, grid.lens)[..., 3][its] > 0
+        for one in (field, out.get())
+    ]
+    assert seen[0].mean() < 0.9 and seen[1].mean() > 0.98
 
 
 # Residuals

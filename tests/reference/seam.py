@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from reference.common import Array, Numbers, bilinear, cell_parts, layer_look, pixels
+from reference.common import Array, Numbers, bilinear, cell_parts, layer_look, layer_seen, pixels
 
 
 def seam_difference(
@@ -59,4 +59,30 @@ def seam_yield(
     given, share = bilinear(yields, cells, x, y)
     result = field.astype(np.float64)
     result[..., 3] *= np.maximum((1 - given / share) ** 4, trace)
+    return result
+
+
+def seam_stay(
+    layer: Array,
+    field: Array,
+    box: Sequence[int],
+    border: Sequence[int],
+    lens: Numbers,
+    taken: Array,
+    cells: Sequence[int],
+) -> Array:
+    """The field with displacements shortened by quarters, until a layer shows something a quarter farther as
+    well; in the cells that are taken from it."""
+    columns, rows = pixels(box[2], box[3], box[0], box[1])
+    cell = (np.floor((n + 0.5) * cells[k] / border[k]).astype(int) for k, n in enumerate((columns, rows)))
+    x, y = (np.minimum(n, cells[k] - 1) for k, n in enumerate(cell))
+    result = field.astype(np.float64)
+    undecided = (layer[..., 3] > 0) & (taken[y, x] > 0)
+    for part in (4, 3, 2, 1, 0):
+        farther = field.copy()
+        farther[..., :3] *= (part + 1) / 4
+        shown = layer_seen(layer, farther, box, columns, rows, border, lens)[..., 3] > 0
+        ends = undecided & (shown if part else True)
+        result[ends, :3] *= part / 4
+        undecided &= ~ends
     return result
