@@ -52,6 +52,7 @@ _LOADING = "loading "  # and at its beginning
 # What libtiff and libjpeg say of a photo that nona remaps as if it were whole: pixels are missing; or may
 # be missing: some cameras leave out no more than the mark of the end.
 _LOSS, _DOUBTS = ": Read error on ", ("Premature end of JPEG file", "Corrupt JPEG data")
+_START, _SCAN, _END = b"\xff\xd8", b"\xff\xda", b"\xff\xd9"  # of JPEG
 _INSTALL = (
     "nona is not in PATH; install Hugin (Debian, Ubuntu: apt install hugin-tools; Fedora: dnf install hugin; "
     "macOS, Windows: put the folder of Hugin's programs into PATH)"
@@ -249,7 +250,7 @@ def _run(
     except FileNotFoundError:
         raise NonaMissingError(f"{_INSTALL}; or name layers that exist with --prefix or --layers") from None
     lines: deque[str] = deque(maxlen=_LAST_LINES)
-    photo, doubtful = plan.file, set[Path]()
+    photo, doubts = plan.file, set[str]()
     with process:  # closes the pipe and waits
         try:
             assert process.stdout is not None
@@ -265,13 +266,26 @@ def _run(
                     raise ImageReadError(
                         f"{photo} is damaged ({line.strip()}); copy it from the camera again"
                     )
-                elif photo not in doubtful and any(mark in line for mark in _DOUBTS):
-                    doubtful.add(photo)
-                    log.warning("%s may be damaged (%s); look at the panorama", photo, line.strip())
+                elif any(mark in line for mark in _DOUBTS):
+                    doubts.add(line.strip())
         except BaseException:
             stop(process)
             raise
+    if doubts:
+        # libjpeg names no file, and what it says overtakes what nona does
+        cut = ", ".join(str(image.photo) for image in plan.images if _is_cut(image.photo))
+        doubtful = cut or "one of the photos"
+        log.warning("%s may be damaged (%s); look at the panorama", doubtful, "; ".join(sorted(doubts)))
     return process.returncode, list(lines)
+
+
+def _is_cut(photo: Path) -> bool:
+    """Whether a JPEG file lacks the mark of its end; its pixels hold no marks, a thumbnail comes before."""
+    try:
+        content = photo.read_bytes()
+    except OSError:
+        return False
+    return content.startswith(_START) and content.rfind(_END) < content.rfind(_SCAN)
 
 
 def remapping(plan: Plan, options: Sequence[str], prefix: str, project: str) -> list[str]:
