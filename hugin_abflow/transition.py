@@ -185,10 +185,12 @@ def links(price: npt.NDArray[np.float64], union: Mask, cells: Grid) -> tuple[Val
 
 def wells(cells: Grid, grid: Grid, strain: float, unlike: Values) -> Values:
     """(2 strain)^2 times the area of each cell, in squared working px, (height, width); 0 where layers are
-    unlike, anywhere in a cell.
+    unlike.
     """
+    rows, columns = np.arange(cells.height), np.arange(cells.width)
     area = grid.width / cells.width * grid.height / cells.height * _narrowing(cells)
-    alike = 1 - on_cells(unlike[None], cells, np.maximum)[0]
+    height, width = unlike.shape
+    alike = 1 - unlike[rows * height // cells.height][:, columns * width // cells.width]
     prices: Values = ((2 * strain) ** 2 * area[:, None] * alike).astype(np.float32)
     return prices
 
