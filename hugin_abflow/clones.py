@@ -9,7 +9,7 @@ what two aligned, corrected layers show in a cell p, and d the cells from one of
 
 is large, < > the mean of 3 x 3 cells. What is behind him is alike at both places as well, and gives the same
 for -d; but unlike it he ends where his outline is. Of his two places, the one without which the energy is
-less is taken from the other layer, unless that would cost more than showing him twice.
+less is taken from the other layer, unless he reaches beyond that one, and a part of him would stay.
 """
 
 from __future__ import annotations
@@ -23,6 +23,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
+from hugin_abflow.cells import grown
 from hugin_abflow.colour import Correction
 from hugin_abflow.geometry import Pair
 from hugin_abflow.layer import Box
@@ -46,8 +47,10 @@ _TRIED = 12
 _SHOWN = 0.3
 # What it costs to show him in a cell where he shall not be: more than all cuts around it.
 _UNWANTED = 5.0
+# Cells beside him in which a part of him may be that they do not tell.
+_BESIDE = 2
 # Energy that showing him once may cost, by how much he differs (of the place where he differs less): what the
-# softmax favours costs once that, and the rest is left for a cut through his feet, or beside a border.
+# softmax favours costs once that, and the rest is left for cuts beside a border, which are dear.
 _DEARER = 1.75
 # Cells narrower than that, of the equator's width, are not looked at: what moves there is turned as well.
 _NARROW = 0.5
@@ -106,17 +109,20 @@ def owners(
     for clone in sorted(clones, key=lambda one: -one.told):
         if any(differs[at & (owner == k)].sum() < _SHOWN * differs[at].sum() for k, at in clone.places):
             continue
-        without = []
-        for k, at in clone.places:
+        options = []
+        for (k, at), (other, _) in (clone.places, clone.places[::-1]):
+            if (grown(at, _BESIDE, cells.wraps) & choice.cover[k] & ~choice.cover[other]).any():
+                continue  # a part of him may be where that layer is alone
             prices = np.zeros(choice.cover.shape) if unwanted is None else unwanted.copy()
             prices[k][at] += _UNWANTED
-            without.append(prices)
-        found = [choice.owners(prices) for prices in without]
-        best = min((0, 1), key=lambda place: found[place][1])
-        if found[best][1] - energy <= _DEARER * min(differs[at].sum() for _, at in clone.places):
-            (owner, energy), unwanted = found[best], without[best]
-            here, there = (layers[clone.places[place][0]].layer.name for place in (best, 1 - best))
-            _log.info("%s and %s show the same at two places; it is taken from the latter alone", here, there)
+            options.append((*choice.owners(prices), prices, k, other))
+        best = min(options, key=lambda one: one[1], default=None)
+        if best and best[1] <= energy + _DEARER * min(differs[at].sum() for _, at in clone.places):
+            owner, energy, unwanted, k, other = best
+            _log.info(
+                "%s and %s show the same at two places; it is taken from the latter alone",
+                layers[k].layer.name, layers[other].layer.name,
+            )  # fmt: skip
     return owner
 
 

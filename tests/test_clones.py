@@ -195,6 +195,15 @@ def test_nobody_is_cut_to_be_shown_once(
         assert first == 0 and second == 1
 
 
+@pytest.mark.parametrize(("ends", "shown"), [((20, WIDTH), (1, 0)), ((0, 38), (0, 1)), ((20, 38), (1, 1))])
+def test_who_touches_a_border_stays_there(
+    monkeypatch: pytest.MonkeyPatch, ends: tuple[int, int], shown: tuple[int, int]
+) -> None:
+    """Where one layer goes on alone a finger of him may be, which no cell tells."""
+    once, _, _ = chosen(monkeypatch, ends, favour=0.1)
+    assert ((once[8:19, 20:25] == 0).mean(), (once[8:19, 33:38] == 1).mean()) == shown
+
+
 def test_layers_are_not_looked_at_where_one_shows_all(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(clones, "_LEAST", 1e6)
     once, twice, asked = chosen(monkeypatch)
@@ -211,7 +220,7 @@ def test_somebody_who_walks_on_is_in_a_panorama_once(wraps: bool) -> None:
     wall = texture(y, x, np.uint8, canvas.width if wraps else 0)
     wall[..., :3] = 96 + wall[..., :3] // 2
     layers = []
-    for place, mask in ((250, (x >= 40) & (x < 430)), (390, (x >= 210) & (x < 600))):
+    for place, mask in ((250, (x >= 40) & (x < 450)), (390, (x >= 190) & (x < 600))):
         picture = wall.copy()
         picture[(np.abs(x - place) < 24) & (y > 60) & (y < 190), :3] = 24, 16, 12
         layers.append(masked(np.roll(picture, turn, 1), np.roll(mask, turn, 1)))
