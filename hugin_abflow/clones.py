@@ -7,9 +7,10 @@ what two aligned, corrected layers show in a cell p, and d the cells from one of
 
     sum_p max(0, <(|a(p) - b(p)|^2 + |a(p + d) - b(p + d)|^2) / 2 - l |a(p) - b(p + d)|^2>)
 
-is large, < > the mean of 3 x 3 cells. What is behind him is alike at both places as well, and gives the same
-for -d; but unlike it he ends where his outline is. Of his two places, the one without which the energy is
-less is taken from the other layer, unless he reaches beyond that one, and a part of him would stay.
+is large, < > the mean of 3 x 3 cells, over cells in which it is positive. What is behind him is alike at both
+places as well, and gives the same for -d; but unlike it he ends where his outline is. Of his two places, the
+one without which the energy is less is taken from the other layer, unless he reaches beyond that one, and a
+part of him would stay. What stands still and repeats, such as windows, is found as far away again.
 """
 
 from __future__ import annotations
@@ -28,17 +29,22 @@ from hugin_abflow.colour import Correction
 from hugin_abflow.geometry import Pair
 from hugin_abflow.layer import Box
 from hugin_abflow.opencl import Buffer, Device
-from hugin_abflow.regions import Cells, Choice
+from hugin_abflow.regions import Cells, Choice, Gone, Prices
 from hugin_abflow.working import Grid, WorkingLayer, cells_under, connected
 
 # l: how unlike his two images may be, against how unlike he is to what is behind him.
-_UNLIKE = 2.0
-# Squared difference, summed over r, g, b, of a cell in which two layers show different things.
+_UNLIKE = 3.0
+# Squared difference, summed over r, g, b, from which on two cells show different things.
 _DIFFERS = 0.02
 # Cells between his places, at least, and at most across and down; people keep to the ground.
 _NEAR, _ACROSS, _DOWN = 2, 48, 6
-# The sum, and cells of the equator's size, that tell of somebody.
+# The least sum that tells of somebody, and the least of him, in cells of the equator's size.
 _TOLD, _LEAST = 0.5, 8.0
+# The share of what differs at one place, or at both, that has to be found at the other, and that of its cells
+# in which both are alike: two people may wear the same trousers.
+_MOSTLY, _ALIKE = 0.6, 0.6
+# The share of a look that may be found as far away again: what repeats stands still.
+_REPEATS = 0.6
 # How much more he has to differ from what is around him than what is behind him does.
 _OUTLINED = 1.2
 # Displacements of a pair of layers that are looked at.
@@ -92,14 +98,15 @@ def owners(
     grid: Grid,
     cells: Grid,
     choice: Choice,
-) -> npt.NDArray[np.intp]:
-    """The layer of each cell, as `choice.owners`, but that nobody is there twice if it can be helped.
+) -> tuple[npt.NDArray[np.intp], Gone]:
+    """The layer of each cell, as `choice.owners`, but that nobody is there twice if it can be helped; and by
+    layers the cells in which each showed somebody who is there no longer.
 
     fields      of geometry.py.
     cells       the seam grid, over the region of `grid`.
     """
     owner, energy = choice.owners()
-    differs, unwanted = choice.residual.mean, None
+    differs, gone = choice.residual.mean, dict[int, Cells]()
     look = lru_cache(_KEPT)(partial(_look, device, layers, fields, correction, grid, cells))
     clones = list[Clone]()
     for pair in pairs:
@@ -113,17 +120,24 @@ def owners(
         for (k, at), (other, _) in (clone.places, clone.places[::-1]):
             if (grown(at, _BESIDE, cells.wraps) & choice.cover[k] & ~choice.cover[other]).any():
                 continue  # a part of him may be where that layer is alone
-            prices = np.zeros(choice.cover.shape) if unwanted is None else unwanted.copy()
-            prices[k][at] += _UNWANTED
-            options.append((*choice.owners(prices), prices, k, other))
+            without = gone | {k: at | gone.get(k, False)}
+            options.append((*choice.owners(_prices(without, choice)), without, k, other))
         best = min(options, key=lambda one: one[1], default=None)
         if best and best[1] <= energy + _DEARER * min(differs[at].sum() for _, at in clone.places):
-            owner, energy, unwanted, k, other = best
+            owner, energy, gone, k, other = best
             _log.info(
                 "%s and %s show the same at two places; it is taken from the latter alone",
                 layers[k].layer.name, layers[other].layer.name,
             )  # fmt: skip
-    return owner
+    return owner, gone
+
+
+def _prices(gone: Gone, choice: Choice) -> Prices:
+    """What it costs to show each layer, (layers, height, width), that nobody is where he shall not be."""
+    prices = np.zeros(choice.cover.shape)
+    for k, at in gone.items():
+        prices[k][at] = _UNWANTED
+    return prices
 
 
 def find(pair: Pair, a: Look, b: Look, both: Cells, cells: Grid) -> Iterator[Clone]:
@@ -182,7 +196,7 @@ class _Search:
             if any(max(abs(move[0] - y), abs(move[1] - x)) <= _NEAR for y, x in refused):
                 continue
             first, second = self._places(move)
-            if self._is_somebody(first, second):
+            if self._is_somebody(first, second) and not self._repeats(first, second, move):
                 self._open &= ~(first | second)
                 yield first, second, told[move]
             else:
@@ -193,8 +207,8 @@ class _Search:
         cells, and those where they lead.
         """
         here, there = self._part(-move[0], -move[1]), self._part(*move)
-        gain = (self._off[here] + self._off[there]) / 2
-        gain -= _UNLIKE * np.square(self._a[here] - self._b[there]).sum(-1)
+        apart = np.square(self._a[here] - self._b[there]).sum(-1)
+        gain = (self._off[here] + self._off[there]) / 2 - _UNLIKE * apart
         gain *= self._open[here] & self._open[there]
         mean = cv2.blur(gain, (3, 3), borderType=cv2.BORDER_CONSTANT)
         return np.where(gain > 0, np.maximum(mean, 0), 0), here, there
@@ -217,15 +231,35 @@ class _Search:
         return places[0], places[1]
 
     def _is_somebody(self, first: Cells, second: Cells) -> bool:
-        """Whether what a shows at the first place, and b at the second, is large enough, and ends there,
-        unlike what the other one shows.
+        """Whether what a shows at the first place, and b at the second, is large enough, all that is to be
+        seen at one of them, and ends there, unlike what the other one shows.
         """
         if (self._widths * first).sum() < _LEAST:
+            return False
+        things = connected(self._open, wraps=False)
+        if self._alike(self._a[first], self._b[second]).mean() < _ALIKE:
+            return False
+        places = first, second, first | second
+        if all(at.sum() < _MOSTLY * np.isin(things, np.unique(things[at])).sum() for at in places):
             return False
         sides = ((first, self._a, self._b), (second, self._b, self._a))
         return all(
             self._outline(its, at) > _OUTLINED * self._outline(behind, at) for at, its, behind in sides
         )
+
+    def _repeats(self, first: Cells, second: Cells, move: tuple[int, int]) -> bool:
+        """Whether a layer shows the same again, as far from one of the places but in the other direction."""
+        for look, place, (down, across) in ((self._a, first, (-move[0], -move[1])), (self._b, second, move)):
+            here, there = self._part(-down, -across), self._part(down, across)
+            again = self._alike(look[here], look[there])[place[here] & self._compared[there]]
+            if np.count_nonzero(again) > _REPEATS * np.count_nonzero(place):
+                return True
+        return False
+
+    @staticmethod
+    def _alike(one: npt.NDArray[np.float32], other: npt.NDArray[np.float32]) -> npt.NDArray[np.bool_]:
+        """Which cells of two looks, (..., 3), show the same."""
+        return np.asarray(np.square(one - other).sum(-1) < _DIFFERS)
 
     def _outline(self, look: npt.NDArray[np.float32], place: Cells) -> float:
         """Mean difference of a look across the outline of a place, r, g and b together."""

@@ -302,11 +302,12 @@ def _align(
             highlights.regain(device, layers, fields, further, whole, grid)
             cells = seam.seam_grid(grid)
             each_once = partial(clones.owners, device, layers, fields, pairs, strict, grid, cells)
-            owner = seam.cut(
+            owner, gone = seam.cut(
                 device, layers, fields, residual, whole, masks, grid, once, lost,
                 choose=each_once if settings.clones else None,
             )  # fmt: skip
-            unlike = Unlike.of(cells, residual.mean, whole, once)
+            moved = [] if once is None else [once]
+            unlike = Unlike.of(cells, residual.mean, whole, np.any([*moved, *gone.values(), 0 * whole], 0))
             for k in membrane.stretch(
                 device, layers, fields, owner, whole, unlike.anywhere, masks, grid, cells
             ):

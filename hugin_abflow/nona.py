@@ -51,8 +51,10 @@ _STEPS = ("remapping ", "saving ")  # what nona -v says at the end of a photo's 
 _LOADING = "loading "  # and at its beginning
 # What libtiff and libjpeg say of a photo that nona remaps as if it were whole: pixels are missing; or may
 # be missing: some cameras leave out no more than the mark of the end.
-_LOSS, _DOUBTS = ": Read error on ", ("Premature end of JPEG file", "Corrupt JPEG data")
-_START, _SCAN, _END = b"\xff\xd8", b"\xff\xda", b"\xff\xd9"  # of JPEG
+_LOSS, _CUT = ": Read error on ", "Premature end of JPEG file"
+_DOUBTS = (_CUT, "Corrupt JPEG data")
+# A JPEG file's first bytes; any mark but restarts, which lie within what is coded; the mark of the end.
+_JPEG, _MARK, _END = b"\xff\xd8", re.compile(rb"\xff([^\x00\xff\xd0-\xd7])", re.DOTALL), 0xD9
 _INSTALL = (
     "nona is not in PATH; install Hugin (Debian, Ubuntu: apt install hugin-tools; Fedora: dnf install hugin; "
     "macOS, Windows: put the folder of Hugin's programs into PATH)"
@@ -168,7 +170,7 @@ def _make_all(plan: Plan, folder: Path, keep: bool, progress: Progress) -> Found
     for image in plan.images:
         _require_photo(plan, image)
     with progress("remap", len(_STEPS) * len(plan.images)) as advance:
-        code, lines = _run(plan, folder, [], advance)
+        code, lines = _run(plan, plan.images, folder, [], advance)
     made = _made(plan, folder)
     if code:
         raise _failure(plan, plan.images, folder, code, lines)
@@ -191,7 +193,7 @@ def _make_missing(plan: Plan, folder: Path, found: Found, keep: bool, progress: 
         _refuse_to_keep(found.prefix)
     with progress("remap", len(_STEPS) * len(missing)) as advance:
         for image in missing:
-            code, lines = _run(plan, folder, ["-i", str(image.index)], advance)
+            code, lines = _run(plan, [image], folder, ["-i", str(image.index)], advance)
             if code and f"image with number {image.index}" in " ".join(lines):
                 # nona does not count an image outside the crop as one of the project's
                 log.info("image %d (%s) misses the crop: it has no layer", image.index, image.name)
@@ -228,7 +230,11 @@ def _require_photo(plan: Plan, image: PlannedImage) -> None:
 
 
 def _run(
-    plan: Plan, folder: Path, options: list[str], advance: Callable[[int], None]
+    plan: Plan,
+    images: Sequence[PlannedImage],
+    folder: Path,
+    options: list[str],
+    advance: Callable[[int], None],
 ) -> tuple[int, list[str]]:
     """Run nona as Hugin does; its exit code and last lines. It does not outlive an exception.
 
@@ -271,21 +277,31 @@ def _run(
         except BaseException:
             stop(process)
             raise
-    if doubts:
+    for doubt in sorted(doubts):
         # libjpeg names no file, and what it says overtakes what nona does
-        cut = ", ".join(str(image.photo) for image in plan.images if _is_cut(image.photo))
-        doubtful = cut or "one of the photos"
-        log.warning("%s may be damaged (%s); look at the panorama", doubtful, "; ".join(sorted(doubts)))
+        cut = [str(image.photo) for image in images if doubt.startswith(_CUT) and _is_cut(image.photo)]
+        log.warning(
+            "%s may be damaged (%s); look at the panorama", ", ".join(cut) or "one of the photos", doubt
+        )
     return process.returncode, list(lines)
 
 
 def _is_cut(photo: Path) -> bool:
-    """Whether a JPEG file lacks the mark of its end; its pixels hold no marks, a thumbnail comes before."""
+    """Whether a JPEG file ends before the mark of its image's end; there may be other things behind that."""
     try:
-        content = photo.read_bytes()
+        with photo.open("rb") as file:
+            if file.read(2) != _JPEG:
+                return False
+            content = file.read()
     except OSError:
         return False
-    return content.startswith(_START) and content.rfind(_END) < content.rfind(_SCAN)
+    at = 0
+    while mark := _MARK.search(content, at):
+        if mark[1][0] == _END:
+            return False
+        length = int.from_bytes(content[mark.end() : mark.end() + 2])
+        at = mark.end() + length  # what is coded comes behind the last segment, up to the next mark
+    return True
 
 
 def remapping(plan: Plan, options: Sequence[str], prefix: str, project: str) -> list[str]:

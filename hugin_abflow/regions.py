@@ -37,6 +37,7 @@ _MOSTLY = 0.5
 
 Cells = npt.NDArray[np.bool_]  # (height, width) on the seam grid
 Prices = npt.NDArray[np.float64]  # (layers, height, width) on the seam grid
+Gone = dict[int, Cells]  # by layers, where each showed somebody who is there no longer
 
 
 @dataclass(frozen=True)

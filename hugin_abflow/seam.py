@@ -27,7 +27,7 @@ from hugin_abflow.colour import Correction, clipping
 from hugin_abflow.geometry import Pair
 from hugin_abflow.layer import Box
 from hugin_abflow.opencl import Buffer, Device
-from hugin_abflow.regions import Cells, Choice, Prices, Residuals, completed, find
+from hugin_abflow.regions import Cells, Choice, Gone, Prices, Residuals, completed, find
 from hugin_abflow.working import Grid, Place, WorkingLayer, shared_cells
 
 # Working pixels per cell of the seam grid.
@@ -130,23 +130,25 @@ def cut(
     grid: Grid,
     once: Cells | None = None,
     lost: Prices | None = None,
-    choose: Callable[[Choice], npt.NDArray[np.intp]] | None = None,
-) -> npt.NDArray[np.intp]:
+    choose: Callable[[Choice], tuple[npt.NDArray[np.intp], Gone]] | None = None,
+) -> tuple[npt.NDArray[np.intp], Gone]:
     """Give each cell of the regions `whole` to one layer: the others lose their colour weight there
     (fields[...].w, in place). A region is cut in two only if that is clearly better, one that has cells of
     `once` if it is much better. lost: what each layer costs in a cell besides. choose: in place of the least
     energy.
 
     Returns the layer of each cell, (height, width) on the seam grid, elsewhere that which weighs most, -1
-    where none covers it.
+    where none covers it; and who is gone, as `choose` says.
     """
     cells = seam_grid(grid)
     dearer = np.full(whole.shape, _WHOLE) if once is None else np.where(once, _ONCE, _WHOLE)
     choice = _choice(layers, fields, residual, whole, masks, grid, cells, _CUT, dearer, lost)
-    owner = choose(choice) if choose else choice.owners()[0]
+    owner, gone = choose(choice) if choose else (choice.owners()[0], Gone())
     yields = [yielded(whole, owner, k, cells.wraps) for k in range(len(layers))]
+    for k, at in gone.items():  # wholly: beside a border the softmax hardly knows another layer
+        yields[k] = np.maximum(yields[k], grown(at, 1, cells.wraps) & (owner != k))
     _yield(device, layers, fields, yields, grid, cells)
-    return owner
+    return owner, gone
 
 
 def yielded(whole: Cells, owner: npt.NDArray[np.intp], k: int, wraps: bool) -> npt.NDArray[np.float32]:
@@ -167,8 +169,8 @@ def stay(
     grid: Grid,
     cells: Grid,
 ) -> None:
-    """Displace what is taken from a layer (fields[...].xyz, in place) only as far as it shows something: else
-    another layer would be seen along the border of the canvas. owner, whole: of `cut`.
+    """Displace what is taken from a layer (fields[...].xyz, in place) only as far as the canvas goes, and
+    the layer: else another one would be seen along the border. owner, whole: of `cut`.
     """
     for k, (layer, field) in enumerate(zip(layers, fields, strict=True)):
         its = whole & (owner == k)

@@ -56,17 +56,17 @@ __kernel void seam_yield(__global float4 *field,        /* (box.w, box.z) of the
     field[y * box.z + x].w *= GREATEST(left, trace);
 }
 
-/* Parts of a displacement that are tried. */
-#define SEAM_PARTS 4
+/* Halvings in which it is found how far a displacement leads to what a layer shows. */
+#define SEAM_HALVINGS 5
 
-/* Displace what is taken from a layer only as far as it shows something there, and a part farther: at full resolution
-   there are pixels beyond. */
-__kernel void seam_stay(__global const float4 *layer,  /* (box.w, box.z) */
-                        __global float4 *field,        /* the same; x, y, z are shortened */
-                        int4 box, int4 border,         /* place on the working grid, run size; working grid */
+/* Displace what is taken from a layer only as far as the centre of the canvas's last pixel, where that ends, and only
+   as far as the layer shows something. */
+__kernel void seam_stay(__global const float4 *layer, /* (box.w, box.z) */
+                        __global float4 *field,       /* the same; x, y, z change */
+                        int4 box, int4 border,        /* place on the working grid, run size; working grid */
                         float4 lens,
-                        __global const uchar *taken,   /* (cells.y, cells.x): the cells of what is taken from it */
-                        int4 cells)                    /* seam grid, over the same region */
+                        __global const uchar *taken,  /* (cells.y, cells.x): the cells of what is taken from it */
+                        int4 cells)                   /* seam grid, over the same region */
 {
     const int x = get_global_id(0), y = get_global_id(1), at = y * box.z + x;
     if (x >= box.z || y >= box.w || layer[at].w == 0.0f)
@@ -76,13 +76,27 @@ __kernel void seam_stay(__global const float4 *layer,  /* (box.w, box.z) */
     if (!taken[min(cell.y, cells.y - 1) * cells.x + min(cell.x, cells.x - 1)])
         return;
     const float4 own = field[at];
-    int part = SEAM_PARTS;
-    while (part > 0) {
-        const float3 farther = own.xyz * ((part + 1.0f) / SEAM_PARTS);
-        if (layer_sample(layer, box, layer_position(q, farther, lens), border).w != 0.0f)
-            break;
-        --part;
+    float2 there = layer_position(q, own.xyz, lens);
+    if (lens.y != 0.0f) { /* longitudes jump where they go once around */
+        const float around = 2.0f * M_PI_F / lens.y;
+        there.x -= around * floor_int((there.x - q.x) / around + 0.5f);
     }
-    if (part < SEAM_PARTS)
-        field[at] = (float4)(own.xyz * ((float)part / SEAM_PARTS), own.w);
+    float2 inside = there;
+    if (!border.z)
+        inside.x = LIMITED(there.x, 0.5f, border.x - 0.5f);
+    if (!(border.w & 1))
+        inside.y = GREATEST(there.y, 0.5f);
+    if (!(border.w & 2))
+        inside.y = LEAST(inside.y, border.y - 0.5f);
+    float3 d = own.xyz;
+    if (inside.x != there.x || inside.y != there.y)
+        d = canvas_point(inside, lens) - canvas_point(q, lens);
+    if (layer_sample(layer, box, layer_position(q, d, lens), border).w == 0.0f) {
+        float part = 0.0f, step = 0.5f;
+        for (int i = 0; i < SEAM_HALVINGS; ++i, step *= 0.5f)
+            if (layer_sample(layer, box, layer_position(q, (part + step) * d, lens), border).w != 0.0f)
+                part += step;
+        d *= part;
+    }
+    field[at] = (float4)(d, own.w);
 }

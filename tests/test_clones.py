@@ -93,7 +93,7 @@ def test_somebody_is_found_at_both_places(name: str, turn: int, first: int, seco
         expected[8:19, column : column + 5] = True
         place = np.roll(place, -turn, 1)
         assert not (place & ~expected).any()
-        assert (place & expected).sum() > 0.75 * expected.sum()
+        assert (place & expected).sum() > 0.65 * expected.sum()
 
 
 def test_two_people_are_found_each() -> None:
@@ -106,16 +106,24 @@ def test_two_people_are_found_each() -> None:
     assert found[1].first[10:17, 46:48].all() and found[1].second[10:17, 37:39].all()
 
 
-@pytest.mark.parametrize("what", ["another", "one", "small", "outside", "equal", "wall"])
+@pytest.mark.parametrize(
+    "what", ["another", "trousers", "one", "small", "outside", "equal", "wall", "windows"]
+)
 def test_what_is_not_there_twice_is_not_found(what: str) -> None:
-    """Somebody else, somebody who left, a thing of a few cells, what stands where one layer ends, layers that
-    are equal, and a wall behind two people who have little in common.
+    """Somebody else, also one who wears the same trousers, somebody who left, a thing of a few cells, what
+    stands where one layer ends, layers that are equal, a wall behind two people who have little in common,
+    and windows, before which somebody stands in each layer.
     """
     body = somebody(2, 3) if what == "small" else somebody()
     a, b, both = walked("plane", 20, 33, body)
     if what in ("another", "wall"):
         coat = 0.45 if what == "wall" else 0.0
         b[8:19, 33:38, :3] = [0.1 + coat, 0.2 + coat, 0.9]
+    elif what == "trousers":
+        b[8:15, 33:38, :3] = [0.1, 0.5, 0.2]
+    elif what == "windows":
+        a[8:19, 7:12], b[8:19, 46:51] = a[8:19, 20:25], b[8:19, 33:38]
+        a[8:19, 46:51], b[8:19, 7:12] = b[8:19, 46:51], a[8:19, 7:12]
     elif what == "one":
         b[8:19, 33:38] = b[8:19, 43:48]
     elif what == "outside":
@@ -162,7 +170,8 @@ def chosen(
     asked: list[int] = []
     monkeypatch.setattr(clones, "_look", lambda *given: asked.append(given[-1]) or (a, b)[given[-1]])
     layers = [SimpleNamespace(layer=SimpleNamespace(name=name)) for name in ("left.tif", "right.tif")]
-    found = clones.owners(None, layers, [], [Pair(0, 1)], None, None, grid_of("plane"), choice)
+    found, gone = clones.owners(None, layers, [], [Pair(0, 1)], None, None, grid_of("plane"), choice)
+    assert all((found[at] != k).all() for k, at in gone.items())
     return found, choice.owners()[0], asked
 
 
@@ -179,20 +188,14 @@ def test_somebody_is_shown_once(
     assert [message for message in caplog.messages if "left.tif" in message and "right.tif" in message]
 
 
-@pytest.mark.parametrize(("ends", "kept"), [((22, WIDTH), "both"), ((21, 36), "both"), ((0, 36), "first")])
+@pytest.mark.parametrize(("ends", "shown"), [((22, WIDTH), (1, 0)), ((21, 36), (1, 1)), ((0, 36), (0, 1))])
 def test_nobody_is_cut_to_be_shown_once(
-    monkeypatch: pytest.MonkeyPatch, ends: tuple[int, int], kept: str
+    monkeypatch: pytest.MonkeyPatch, ends: tuple[int, int], shown: tuple[int, int]
 ) -> None:
     """Where only one layer covers a part of him he is not taken away; if that is so at both places, both
     stay."""
     once, _, _ = chosen(monkeypatch, ends)
-    first, second = (once[8:19, 20:25] == 0).mean(), (once[8:19, 33:38] == 1).mean()
-    if kept == "both" and ends[1] == WIDTH:
-        assert first == 1 and second == 0
-    elif kept == "both":
-        assert first == second == 1
-    else:
-        assert first == 0 and second == 1
+    assert ((once[8:19, 20:25] == 0).mean(), (once[8:19, 33:38] == 1).mean()) == shown
 
 
 @pytest.mark.parametrize(("ends", "shown"), [((20, WIDTH), (1, 0)), ((0, 38), (0, 1)), ((20, 38), (1, 1))])
@@ -212,8 +215,11 @@ def test_layers_are_not_looked_at_where_one_shows_all(monkeypatch: pytest.Monkey
 
 @pytest.mark.usefixtures(one_device.__name__)
 @pytest.mark.parametrize("wraps", [False, True])
-def test_somebody_who_walks_on_is_in_a_panorama_once(wraps: bool) -> None:
-    """He stands in the left half of the overlap in the left photo, and in the right half in the right one."""
+@pytest.mark.parametrize(("exposure", "shade"), [(False, 10), (True, 16)])
+def test_somebody_who_walks_on_is_in_a_panorama_once(wraps: bool, exposure: bool, shade: int) -> None:
+    """He stands in the left half of the overlap in the left photo, and in the right half in the right one. He
+    leaves nothing behind, though he is nearly black.
+    """
     canvas = Canvas.plane(640, 240, wraps=wraps)
     turn = 320 if wraps else 0  # then the overlap lies across the border
     y, x = pixel_places(canvas.height, canvas.width)
@@ -226,10 +232,12 @@ def test_somebody_who_walks_on_is_in_a_panorama_once(wraps: bool) -> None:
         layers.append(masked(np.roll(picture, turn, 1), np.roll(mask, turn, 1)))
     seen = []
     for once in (True, False):
-        result = np.roll(merged(layers, canvas, exposure=False, clones=once), -turn, 1)
+        result = np.roll(merged(layers, canvas, exposure=exposure, clones=once), -turn, 1)
         dark = result[80:170, :, :3].max(-1) < 64
         seen.append([dark[:, place - 16 : place + 16].mean() for place in (250, 390)])
         off = np.abs(result[..., :3].astype(int) - wall[..., :3]).max(-1)
-        assert off[:, 290:350].max() <= 8 and off[:, 40:200].max() <= 8
+        assert off[:, 290:350].max() <= shade and off[:, 40:200].max() <= shade
+        if once:
+            assert min(off[:, place - 40 : place + 40].max() for place in (250, 390)) <= shade
     assert sorted(seen[0]) == [0, 1]
     assert seen[1] == [1, 1]

@@ -206,7 +206,7 @@ def test_one_layer_may_cost_more_where_something_moved(
     fields = [SimpleNamespace(get=lambda s=s: np.stack([0 * s] * 3 + [s], -1)) for s in (share, 1 - share)]
     residual = np.where(region, 0.3, 0.0)
     residual[:, 14:16] = 0
-    found = seam.cut(
+    found, _ = seam.cut(
         None, [SimpleNamespace(box=(0, 0, 240, 96))] * 2, fields, Residuals(residual, residual), region,
         SimpleNamespace(host=np.ones((2, 12, 30), bool)), grid, once,
     )  # fmt: skip

@@ -6,7 +6,17 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from reference.common import Array, Numbers, bilinear, cell_parts, layer_look, layer_seen, pixels
+from reference.common import (
+    Array,
+    Numbers,
+    bilinear,
+    canvas_point,
+    canvas_position,
+    cell_parts,
+    layer_look,
+    layer_seen,
+    pixels,
+)
 
 
 def seam_difference(
@@ -71,18 +81,35 @@ def seam_stay(
     taken: Array,
     cells: Sequence[int],
 ) -> Array:
-    """The field with displacements shortened by quarters, until a layer shows something a quarter farther as
-    well; in the cells that are taken from it."""
+    """The field, in the cells that are taken, with displacements that end at the centres of the grid's last
+    pixels, where it ends, and, found by five halvings, where the layer shows something."""
     columns, rows = pixels(box[2], box[3], box[0], box[1])
-    cell = (np.floor((n + 0.5) * cells[k] / border[k]).astype(int) for k, n in enumerate((columns, rows)))
-    x, y = (np.minimum(n, cells[k] - 1) for k, n in enumerate(cell))
+    x, y = columns + 0.5, rows + 0.5
+    its = taken[
+        np.minimum(np.floor(y * cells[1] / border[1]).astype(int), cells[1] - 1),
+        np.minimum(np.floor(x * cells[0] / border[0]).astype(int), cells[0] - 1),
+    ]
+    own = canvas_point(x, y, lens)
+    there_x, there_y = canvas_position(own + field[..., :3], lens)
+    if lens[1]:
+        around = 2 * np.pi / lens[1]
+        there_x = there_x - around * np.round((there_x - x) / around)
+    inside_x = there_x if border[2] else there_x.clip(0.5, border[0] - 0.5)
+    top, bottom = -np.inf if border[3] & 1 else 0.5, np.inf if border[3] & 2 else border[1] - 0.5
+    inside_y = there_y.clip(top, bottom)
+    its = (its > 0) & (layer[..., 3] > 0)
+    moved = its & ((inside_x != there_x) | (inside_y != there_y))
     result = field.astype(np.float64)
-    undecided = (layer[..., 3] > 0) & (taken[y, x] > 0)
-    for part in (4, 3, 2, 1, 0):
-        farther = field.copy()
-        farther[..., :3] *= (part + 1) / 4
-        shown = layer_seen(layer, farther, box, columns, rows, border, lens)[..., 3] > 0
-        ends = undecided & (shown if part else True)
-        result[ends, :3] *= part / 4
-        undecided &= ~ends
+    result[moved, :3] = (canvas_point(inside_x, inside_y, lens) - own)[moved]
+
+    def shown(part: Array) -> Array:
+        there = np.concatenate([part[..., None] * result[..., :3], result[..., 3:]], -1).astype(np.float32)
+        return layer_seen(layer, there, box, columns, rows, border, lens)[..., 3] > 0
+
+    part = np.ones(its.shape)
+    short = its & ~shown(part)
+    part[short] = 0
+    for n in range(1, 6):
+        part += 0.5**n * (short & shown(part + 0.5**n))
+    result[..., :3] *= part[..., None]
     return result
