@@ -44,7 +44,7 @@ from hugin_abflow.chart import Chart
 from hugin_abflow.coefficient import Masks
 from hugin_abflow.colour import Correction
 from hugin_abflow.content import Unlike
-from hugin_abflow.errors import DeviceError, SettingsError
+from hugin_abflow.errors import SettingsError
 from hugin_abflow.geometry import Pair, PairFlow
 from hugin_abflow.guides import Guide, by_pair
 from hugin_abflow.layer import Canvas, Layer
@@ -217,7 +217,9 @@ def _making_ready(device: Device, first: Layer, settings: Settings) -> Iterator[
 
     def load() -> None:
         for step in steps:
-            with suppress(DeviceError):  # told where the kernel is needed
+            with suppress(
+                Exception
+            ):  # told where it is needed; imports fail if another thread's is interrupted
                 if not done.is_set():
                     step()
 

@@ -276,8 +276,9 @@ def test_weights_outside_the_regions_stay(device: Device, monkeypatch: pytest.Mo
 
     def remember(device, layers, fields, *rest, original=seam.cut, **named):
         seen["before"], seen["regions"] = [f.get() for f in fields], rest[1]
-        original(device, layers, fields, *rest, **named)
+        result = original(device, layers, fields, *rest, **named)
         seen["after"] = [f.get() for f in fields]
+        return result
 
     monkeypatch.setattr(seam, "cut", remember)
     layers, canvas, *_ = scene("across the border", 0)
