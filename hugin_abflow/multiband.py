@@ -180,7 +180,9 @@ def feathers(
         depths.append((depth * mask).astype(np.float32))
         total[part] += depths[-1]
     total[total == 0] = 1
-    return [np.divide(depth, total[part]) for part, depth in zip(parts, depths, strict=True)]
+    for part, depth in zip(parts, depths, strict=True):
+        depth /= total[part]
+    return depths
 
 
 def _blend(
