@@ -80,8 +80,8 @@ class Chart:
         return places
 
 
-def _gap(columns: npt.NDArray[np.bool_]) -> tuple[int, int]:
-    """The longest periodic run of False: (first column after it, its length)."""
+def widest_gap(columns: npt.NDArray[np.bool_]) -> tuple[int, int]:
+    """The longest periodic run of False, where any is True: (first column after it, its length)."""
     used = np.flatnonzero(columns)
     gaps = np.diff(np.append(used, used[0] + columns.size)) - 1
     widest = int(np.argmax(gaps))
@@ -102,7 +102,7 @@ def _plane(overlap: npt.NDArray[np.bool_], grid: Grid) -> Chart:
         transform[11:13] = -left, -top
         return Chart(transform, int(right - left), int(bottom - top), False)
     transform[14] = grid.width
-    first, gap = _gap(columns)
+    first, gap = widest_gap(columns)
     if gap > 2 * _MARGIN:
         transform[11:13] = _MARGIN - first, -top
         return Chart(transform, width - gap + 2 * _MARGIN, int(bottom - top), False)
@@ -157,7 +157,7 @@ def _sphere(overlap: npt.NDArray[np.bool_], mask_grid: Grid, scale: float) -> Ch
     used[((chart_lon / (2 * math.pi) + 0.5) * steps).astype(int) % steps] = True
     south = max(lowest - margin, -math.pi / 2)
     north = min(highest + margin, math.pi / 2)
-    first, gap = _gap(used)
+    first, gap = widest_gap(used)
     wraps = gap * 2 * math.pi / steps < 2 * margin + 4 * math.pi / steps
     if wraps:
         width = max(1, round(2 * math.pi * scale / _WRAP_MULTIPLE)) * _WRAP_MULTIPLE

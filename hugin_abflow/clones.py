@@ -25,6 +25,7 @@ import numpy as np
 import numpy.typing as npt
 
 from hugin_abflow.cells import grown
+from hugin_abflow.chart import widest_gap
 from hugin_abflow.colour import Correction
 from hugin_abflow.geometry import Pair
 from hugin_abflow.layer import Box
@@ -106,7 +107,7 @@ def owners(
     cells       the seam grid, over the region of `grid`.
     """
     owner, energy = choice.owners()
-    differs, gone = choice.residual.mean, dict[int, Cells]()
+    differs, gone = choice.residual.mean, Gone()
     look = lru_cache(_KEPT)(partial(_look, device, layers, fields, correction, grid, cells))
     clones = list[Clone]()
     for pair in pairs:
@@ -147,7 +148,8 @@ def find(pair: Pair, a: Look, b: Look, both: Cells, cells: Grid) -> Iterator[Clo
     """
     if not both.any():
         return
-    turn = _turn(both) if cells.wraps else 0
+    # what goes once around begins behind its widest gap
+    turn = -widest_gap(np.logical_or.reduce(both, 0))[0] if cells.wraps else 0
     both = np.roll(both, turn, 1)
     rows, columns = (np.flatnonzero(both.any(axis)) for axis in (1, 0))
     # a cell more to each side, where outlines end
@@ -161,11 +163,9 @@ def find(pair: Pair, a: Look, b: Look, both: Cells, cells: Grid) -> Iterator[Clo
         yield Clone(pair.a, pair.b, first, second, told)
 
 
-def _turn(mask: Cells) -> int:
-    """By how many columns to roll what goes once around for its widest gap to be at the border."""
-    columns = np.flatnonzero(mask.any(0))
-    gaps = np.diff(np.append(columns, columns[0] + mask.shape[1]))
-    return -int(columns[(int(gaps.argmax()) + 1) % columns.size])
+def _apart(one: npt.NDArray[np.float32], other: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
+    """Squared difference of two looks' r, g, b, (..., 3), summed."""
+    return np.asarray(np.square(one - other).sum(-1))
 
 
 class _Search:
@@ -174,7 +174,7 @@ class _Search:
     def __init__(self, a: Look, b: Look, both: Cells, widths: npt.NDArray[np.float64]) -> None:
         self._a, self._b, self._widths = a[..., :3], b[..., :3], widths
         self._compared = (a[..., 3] > 0) & (b[..., 3] > 0)
-        self._off = np.square(self._a - self._b).sum(-1)
+        self._off = _apart(self._a, self._b)
         # where somebody may be who was not found yet
         self._open = both & self._compared & (self._off > _DIFFERS) & (widths > _NARROW)
 
@@ -207,8 +207,7 @@ class _Search:
         cells, and those where they lead.
         """
         here, there = self._part(-move[0], -move[1]), self._part(*move)
-        apart = np.square(self._a[here] - self._b[there]).sum(-1)
-        gain = (self._off[here] + self._off[there]) / 2 - _UNLIKE * apart
+        gain = (self._off[here] + self._off[there]) / 2 - _UNLIKE * _apart(self._a[here], self._b[there])
         gain *= self._open[here] & self._open[there]
         mean = cv2.blur(gain, (3, 3), borderType=cv2.BORDER_CONSTANT)
         return np.where(gain > 0, np.maximum(mean, 0), 0), here, there
@@ -236,9 +235,9 @@ class _Search:
         """
         if (self._widths * first).sum() < _LEAST:
             return False
-        things = connected(self._open, wraps=False)
-        if self._alike(self._a[first], self._b[second]).mean() < _ALIKE:
+        if (_apart(self._a[first], self._b[second]) < _DIFFERS).mean() < _ALIKE:
             return False
+        things = connected(self._open, wraps=False)
         places = first, second, first | second
         if all(at.sum() < _MOSTLY * np.isin(things, np.unique(things[at])).sum() for at in places):
             return False
@@ -251,15 +250,11 @@ class _Search:
         """Whether a layer shows the same again, as far from one of the places but in the other direction."""
         for look, place, (down, across) in ((self._a, first, (-move[0], -move[1])), (self._b, second, move)):
             here, there = self._part(-down, -across), self._part(down, across)
-            again = self._alike(look[here], look[there])[place[here] & self._compared[there]]
+            again = _apart(look[here], look[there]) < _DIFFERS
+            again &= place[here] & self._compared[there]
             if np.count_nonzero(again) > _REPEATS * np.count_nonzero(place):
                 return True
         return False
-
-    @staticmethod
-    def _alike(one: npt.NDArray[np.float32], other: npt.NDArray[np.float32]) -> npt.NDArray[np.bool_]:
-        """Which cells of two looks, (..., 3), show the same."""
-        return np.asarray(np.square(one - other).sum(-1) < _DIFFERS)
 
     def _outline(self, look: npt.NDArray[np.float32], place: Cells) -> float:
         """Mean difference of a look across the outline of a place, r, g and b together."""

@@ -308,8 +308,8 @@ def _align(
                 device, layers, fields, residual, whole, masks, grid, once, lost,
                 choose=each_once if settings.clones else None,
             )  # fmt: skip
-            moved = [] if once is None else [once]
-            unlike = Unlike.of(cells, residual.mean, whole, np.any([*moved, *gone.values(), 0 * whole], 0))
+            moved = [*gone.values()] + ([] if once is None else [once])
+            unlike = Unlike.of(cells, residual.mean, whole, np.any(moved, 0) if moved else None)
             for k in membrane.stretch(
                 device, layers, fields, owner, whole, unlike.anywhere, masks, grid, cells
             ):

@@ -93,13 +93,52 @@ class Choice:
         total = 0.0
         for region in parts(self.whole, self.wraps):
             rows, columns = np.nonzero(region)
-            more = None if self.dearer is None else float(self.dearer[region].max())
-            owner[rows, columns], its = label(
-                rows, columns, self.residual, self.shares, self.cover, self.wraps, self.cut_price, more,
-                self.lost, unwanted,
-            )  # fmt: skip
+            owner[rows, columns], its = self.label(rows, columns, unwanted)
             total += its
         return owner, total
+
+    def label(
+        self, rows: npt.NDArray[np.intp], columns: npt.NDArray[np.intp], unwanted: Prices | None = None
+    ) -> tuple[npt.NDArray[np.intp], float]:
+        """Which layer each cell (rows, columns) of a region is taken from, and the energy of that: the least
+        found.
+
+        One layer is taken, as far as it goes, if that costs no more than `dearer`: somebody may stand there
+        twice, and a cut between his two places, or where these overlap, is as cheap as one beside him.
+        """
+        candidates = np.flatnonzero(self.cover[:, rows, columns].any(1))
+        if candidates.size < 2:
+            return np.full(rows.size, candidates[0] if candidates.size else 0), 0.0
+        weight, rough = self.residual.mean[rows, columns], self.residual.rms[rows, columns]
+        present = self.cover[candidates][:, rows, columns]
+        price = np.where(present, weight * (1 - self.shares[candidates][:, rows, columns]), _FORBIDDEN)
+        if self.lost is not None:
+            price += self.lost[candidates][:, rows, columns]
+        number = np.full(self.residual.mean.shape, -1)
+        number[rows, columns] = np.arange(rows.size)
+        links = []
+        for down, right in ((0, 1), (1, 0), (0, -1), (-1, 0)):
+            inside, there = neighbours(rows + down, columns + right, self.residual.mean.shape, self.wraps)
+            # a layer's own border is a cut as well, where the union goes on
+            ends = inside & self.cover[:, *there].any(0) & ~self.cover[candidates][:, *there]
+            price += self.cut_price * rough * ends
+            if down + right > 0:
+                linked = np.flatnonzero(inside & (number[there] >= 0))
+                links.append(np.stack([linked, number[there][linked]]))
+        first, second = np.concatenate(links, 1)
+        cuts = self.cut_price * (rough[first] + rough[second]) / 2
+        plain = Graph(rows, columns, price, present, first, second, cuts)
+        wanted = plain
+        if unwanted is not None:
+            wanted = replace(plain, price=price + unwanted[candidates][:, rows, columns])
+        labels = least(wanted)
+        if self.dearer is not None:
+            dearer = self.dearer[rows, columns].max()
+            alone = [np.where(one, k, labels) for k, one in enumerate(present) if one.mean() > _MOSTLY]
+            energies = [_energy(wanted, one) for one in (labels, *alone)]
+            if alone and min(energies[1:]) <= dearer * energies[0]:
+                labels = alone[int(np.argmin(energies[1:]))]
+        return candidates[labels], _energy(plain, labels)
 
 
 def find(residual: Residuals, cells: Grid, once: Cells) -> list[Cells]:
@@ -144,61 +183,6 @@ def completed(residual: Residuals, cover: npt.NDArray[np.bool_], wraps: bool) ->
         return filled[:, by : filled.shape[1] - by]
 
     return Residuals(whole(residual.mean), whole(residual.rms))
-
-
-def label(
-    rows: npt.NDArray[np.intp],
-    columns: npt.NDArray[np.intp],
-    residual: Residuals,
-    shares: npt.NDArray[np.float64],
-    cover: npt.NDArray[np.bool_],
-    wraps: bool,
-    cut_price: float,
-    dearer: float | None = None,
-    lost: Prices | None = None,
-    unwanted: Prices | None = None,
-) -> tuple[npt.NDArray[np.intp], float]:
-    """Which layer each cell (rows, columns) of a region is taken from, and the energy of that: the least
-    found.
-
-    shares, cover: shares of the softmax and coverage (layers, height, width).
-    cut_price: of a cut, in cells.
-    lost: what each layer costs in a cell besides (layers, height, width).
-    dearer: one layer is taken, as far as it goes, if that costs no more than so many times as much (None: it
-    is not asked). Somebody may stand there twice, and a cut between his two places, or where these overlap,
-    is as cheap as one beside him.
-    """
-    candidates = np.flatnonzero(cover[:, rows, columns].any(1))
-    if candidates.size < 2:
-        return np.full(rows.size, candidates[0] if candidates.size else 0), 0.0
-    weight, rough = residual.mean[rows, columns], residual.rms[rows, columns]
-    present = cover[candidates][:, rows, columns]
-    price = np.where(present, weight * (1 - shares[candidates][:, rows, columns]), _FORBIDDEN)
-    if lost is not None:
-        price += lost[candidates][:, rows, columns]
-    number = np.full(residual.mean.shape, -1)
-    number[rows, columns] = np.arange(rows.size)
-    links = []
-    for down, right in ((0, 1), (1, 0), (0, -1), (-1, 0)):
-        inside, there = neighbours(rows + down, columns + right, residual.mean.shape, wraps)
-        # a layer's own border is a cut as well, where the union goes on
-        price += cut_price * rough * (inside & cover[:, *there].any(0) & ~cover[candidates][:, *there])
-        if down + right > 0:
-            linked = np.flatnonzero(inside & (number[there] >= 0))
-            links.append(np.stack([linked, number[there][linked]]))
-    first, second = np.concatenate(links, 1)
-    cuts = cut_price * (rough[first] + rough[second]) / 2
-    plain = Graph(rows, columns, price, present, first, second, cuts)
-    wanted = (
-        plain if unwanted is None else replace(plain, price=price + unwanted[candidates][:, rows, columns])
-    )
-    labels = least(wanted)
-    if dearer is not None:
-        alone = [np.where(one, k, labels) for k, one in enumerate(present) if one.mean() > _MOSTLY]
-        energies = [_energy(wanted, one) for one in (labels, *alone)]
-        if alone and min(energies[1:]) <= dearer * energies[0]:
-            labels = alone[int(np.argmin(energies[1:]))]
-    return candidates[labels], _energy(plain, labels)
 
 
 def _energy(graph: Graph, labels: Labels) -> float:

@@ -13,9 +13,13 @@ from hugin_abflow import regions
 CUT = 10.0
 
 
-def label(rows, columns, residual, shares, cover, wraps, dearer=None, lost=None, unwanted=None) -> np.ndarray:
+def label(rows, columns, residual, shares, cover, wraps, dearer=None, lost=None) -> np.ndarray:
     """The layers of a region's cells, with cuts of that price."""
-    return regions.label(rows, columns, residual, shares, cover, wraps, CUT, dearer, lost, unwanted)[0]
+    shape = residual.mean.shape
+    more = None if dearer is None else np.full(shape, dearer)
+    whole = np.zeros(shape, bool)
+    whole[rows, columns] = True
+    return regions.Choice(whole, residual, shares, cover, wraps, CUT, more, lost).label(rows, columns)[0]
 
 
 def energies(labels, rows, columns, residual, shares, cover, wraps) -> np.ndarray:
