@@ -18,9 +18,9 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-import cv2
 import numpy as np
 import numpy.typing as npt
+import scipy
 
 from hugin_abflow import content
 from hugin_abflow.colour import NEGLIGIBLE, Correction
@@ -170,14 +170,17 @@ def feathers(
         union[part] |= mask
     depths = []
     for part, mask in zip(parts, shown, strict=True):
-        inside = (~union[part] | mask).astype(np.uint8)
+        inside = ~union[part] | mask
         by = mask.shape[1] // 2 if grid.wraps and mask.shape[1] == grid.width else 0
         if inside.all():
             depth = np.full(mask.shape, grid.width + grid.height, np.float32)
         else:
             around = np.pad(inside, ((0, 0), (by, by)), mode="wrap")
-            depth = cv2.distanceTransform(around, cv2.DIST_L2, 3)[:, by : by + mask.shape[1]]
-        depths.append((depth * mask).astype(np.float32))
+            depth = scipy.ndimage.distance_transform_edt(around)[:, by : by + mask.shape[1]].astype(
+                np.float32
+            )
+        depth *= mask
+        depths.append(depth)
         total[part] += depths[-1]
     total[total == 0] = 1
     for part, depth in zip(parts, depths, strict=True):
