@@ -23,6 +23,7 @@ import numpy.typing as npt
 import scipy
 
 from hugin_abflow import content
+from hugin_abflow.chart import widest_gap
 from hugin_abflow.colour import NEGLIGIBLE, Correction
 from hugin_abflow.content import Unlike
 from hugin_abflow.opencl import MUCH, Buffer, Device
@@ -170,22 +171,25 @@ def feathers(
         union[part] |= mask
     depths = []
     for part, mask in zip(parts, shown, strict=True):
-        inside = ~union[part] | mask
-        by = mask.shape[1] // 2 if grid.wraps and mask.shape[1] == grid.width else 0
-        if inside.all():
-            depth = np.full(mask.shape, grid.width + grid.height, np.float32)
-        else:
-            around = np.pad(inside, ((0, 0), (by, by)), mode="wrap")
-            depth = scipy.ndimage.distance_transform_edt(around)[:, by : by + mask.shape[1]].astype(
-                np.float32
-            )
-        depth *= mask
-        depths.append(depth)
+        depths.append(_depth(mask, ~union[part] | mask, grid))
         total[part] += depths[-1]
     total[total == 0] = 1
     for part, depth in zip(parts, depths, strict=True):
         depth /= total[part]
     return depths
+
+
+def _depth(mask: npt.NDArray[np.bool_], inside: npt.NDArray[np.bool_], grid: Grid) -> npt.NDArray[np.float32]:
+    """The distance in px of each pixel of a mask on `grid` from what is not inside, both (height, width)."""
+    if inside.all():
+        return np.asarray(mask * np.float32(grid.width + grid.height))
+    wraps = grid.wraps and mask.shape[1] == grid.width
+    # what goes once around, and has a gap, is cut open there; without one it is continued
+    first, gap = widest_gap(np.logical_or.reduce(mask, 0)) if wraps and mask.any() else (0, 0)
+    by = mask.shape[1] // 2 if wraps and gap < 2 else 0
+    around = np.pad(np.roll(inside, gap // 2 - first, 1), ((0, 0), (by, by)), mode="wrap")
+    depth = scipy.ndimage.distance_transform_edt(around)[:, by : by + mask.shape[1]]
+    return np.asarray(np.roll(depth, first - gap // 2, 1).astype(np.float32) * mask)
 
 
 def _blend(
