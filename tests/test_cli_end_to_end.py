@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import signal
 import subprocess
@@ -18,6 +19,7 @@ import tifffile
 from shoots import HEIGHT, PROJECT, WIDTH, textured, write_project
 
 from hugin_abflow import cli
+from hugin_abflow.batch import state
 from hugin_abflow.errors import ExitCode
 from hugin_abflow.project import read_plan
 
@@ -325,8 +327,11 @@ def test_interruption_leaves_nothing(folder: Path, number: signal.Signals, line:
     _, messages = child.communicate(timeout=60)
     assert child.returncode == ExitCode.INTERRUPTED, messages
     assert messages.splitlines()[-1] == "hugin-abflow: interrupted" and "Traceback" not in messages
-    for name in names(folder) - before:  # whole, if a project was done before the signal
+    made = names(folder) - before - {state.FOLDER}
+    for name in made:  # whole, if a project was done before the signal
         assert read(folder / name).shape == (HEIGHT, WIDTH, 4)
+    for record in folder.glob(f"{state.FOLDER}/*"):  # as what is told of it
+        assert json.loads(record.read_text("utf-8"))
     assert len(names(folder) - before) < 90
 
 
