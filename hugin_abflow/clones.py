@@ -11,13 +11,16 @@ is large, < > the mean of 3 x 3 cells, over cells in which it is positive. What 
 places as well, and gives the same for -d; but unlike it he ends where his outline is. Of his two places, the
 one without which the energy is less is taken from the other layer, unless he reaches beyond that one, and a
 part of him would stay. What stands still and repeats, such as windows, is found as far away again.
+
+Where one layer was taken for all of a region, which is dearer than a cut, lest somebody is there twice, a cut
+that shows him once is better: what else the region has is taken from whichever layer suits it.
 """
 
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
 from functools import lru_cache, partial
 
 import cv2
@@ -30,7 +33,7 @@ from hugin_abflow.colour import Correction
 from hugin_abflow.geometry import Pair
 from hugin_abflow.layer import Box
 from hugin_abflow.opencl import Buffer, Device
-from hugin_abflow.regions import Cells, Choice, Gone, Prices
+from hugin_abflow.regions import Cells, Choice, Gone, Prices, parts
 from hugin_abflow.working import Grid, WorkingLayer, cells_under, connected
 
 # l: how unlike his two images may be, against how unlike he is to what is behind him.
@@ -112,25 +115,47 @@ def owners(
     clones = list[Clone]()
     for pair in pairs:
         both = choice.whole & choice.cover[pair.a] & choice.cover[pair.b]
-        if all(np.count_nonzero(both & (owner == k)) >= _LEAST for k in (pair.a, pair.b)):
+        if np.count_nonzero(both & np.isin(owner, (pair.a, pair.b))) >= 2 * _LEAST:
             clones += find(pair, look(pair.a), look(pair.b), both, cells)
     for clone in sorted(clones, key=lambda one: -one.told):
-        if any(differs[at & (owner == k)].sum() < _SHOWN * differs[at].sum() for k, at in clone.places):
+        twice = _twice(clone, owner, differs)
+        its_choice = choice if twice else _cut(choice, clone, look)
+        if its_choice is None:
             continue
+        more = _DEARER * min(differs[at].sum() for _, at in clone.places) if twice else 0.0
         options = []
         for (k, at), (other, _) in (clone.places, clone.places[::-1]):
             if (grown(at, _BESIDE, cells.wraps) & choice.cover[k] & ~choice.cover[other]).any():
                 continue  # a part of him may be where that layer is alone
             without = gone | {k: at | gone.get(k, False)}
-            options.append((*choice.owners(_prices(without, choice)), without, k, other))
+            options.append((*its_choice.owners(_prices(without, choice)), without, its_choice))
         best = min(options, key=lambda one: one[1], default=None)
-        if best and best[1] <= energy + _DEARER * min(differs[at].sum() for _, at in clone.places):
-            owner, energy, gone, k, other = best
+        if best and best[1] <= energy + more:
+            owner, energy, gone, choice = best
             _log.info(
-                "%s and %s show the same at two places; it is taken from the latter alone",
-                layers[k].layer.name, layers[other].layer.name,
+                "%s and %s show the same at two places; it is shown once",
+                layers[clone.a].layer.name, layers[clone.b].layer.name,
             )  # fmt: skip
     return owner, gone
+
+
+def _twice(clone: Clone, owner: npt.NDArray[np.intp], differs: npt.NDArray[np.float64]) -> bool:
+    """Whether somebody is there at both of his places."""
+    return all(differs[at & (owner == k)].sum() >= _SHOWN * differs[at].sum() for k, at in clone.places)
+
+
+def _cut(choice: Choice, clone: Clone, look: Callable[[int], Look]) -> Choice | None:
+    """The same, but with cuts, whatever one layer costs, in regions in which little differs but him; None:
+    there are none.
+    """
+    if choice.dearer is None:
+        return None
+    at, both = clone.first | clone.second, choice.cover[clone.a] & choice.cover[clone.b]
+    off = both & (_apart(look(clone.a)[..., :3], look(clone.b)[..., :3]) > _DIFFERS)
+    his = np.zeros(choice.whole.shape, bool)
+    for region in parts(choice.whole, choice.wraps):
+        his |= region & ((at & off & region).sum() > _MOSTLY * (off & region).sum())
+    return replace(choice, dearer=np.where(his, 0.0, choice.dearer)) if his.any() else None
 
 
 def _prices(gone: Gone, choice: Choice) -> Prices:
@@ -207,8 +232,10 @@ class _Search:
         cells, and those where they lead.
         """
         here, there = self._part(-move[0], -move[1]), self._part(*move)
-        gain = (self._off[here] + self._off[there]) / 2 - _UNLIKE * _apart(self._a[here], self._b[there])
-        gain *= self._open[here] & self._open[there]
+        both = self._open[here] & self._open[there]  # a few cells of thousands
+        off = (self._off[here][both] + self._off[there][both]) / 2
+        gain = np.zeros(both.shape, np.float32)
+        gain[both] = off - _UNLIKE * _apart(self._a[here][both], self._b[there][both])
         mean = cv2.blur(gain, (3, 3), borderType=cv2.BORDER_CONSTANT)
         return np.where(gain > 0, np.maximum(mean, 0), 0), here, there
 
@@ -223,10 +250,10 @@ class _Search:
     def _places(self, move: tuple[int, int]) -> tuple[Cells, Cells]:
         """The largest connected part of what a and b show `move` apart, where a shows it, and b."""
         told, here, there = self._told(move)
-        parts = connected(told > 0, wraps=False)
-        sizes = np.bincount(parts[parts > 0], minlength=2)
+        labels = connected(told > 0, wraps=False)
+        sizes = np.bincount(labels[labels > 0], minlength=2)
         places = np.zeros((2, *self._off.shape), bool)
-        places[0][here] = places[1][there] = parts == max(1, int(sizes.argmax()))
+        places[0][here] = places[1][there] = labels == max(1, int(sizes.argmax()))
         return places[0], places[1]
 
     def _is_somebody(self, first: Cells, second: Cells) -> bool:

@@ -150,20 +150,31 @@ def test_nothing_is_found_in_no_region() -> None:
 
 
 def chosen(
-    monkeypatch: pytest.MonkeyPatch, ends: tuple[int, int] = (0, WIDTH), favour: float = 0.3
+    monkeypatch: pytest.MonkeyPatch,
+    ends: tuple[int, int] = (0, WIDTH),
+    favour: float = 0.3,
+    favour_second: float | None = None,
+    beside: int = 0,
 ) -> tuple[np.ndarray, np.ndarray, list[int]]:
     """Whose each cell is where somebody stands in both layers at another place, with clones shown once and as
     the energy has it, and the layers that were looked at.
 
-    ends: the columns from which, and before which, both layers lie.
+    ends        the columns from which, and before which, both layers lie.
+    favour      how much the softmax favours the first layer at his first place, and, unless it is said, the
+                second one at his second.
+    beside      columns of something beside him that the second layer alone shows, in one region with him.
     """
     a, b, both = walked("plane", 20, 33, somebody())
+    b[8:19, 41 : 41 + beside, :3] = 0.1
     covers = np.ones((2, HEIGHT, WIDTH), bool)
     covers[1, :, : ends[0]] = covers[0, :, ends[1] :] = False
     off = np.abs(a - b)[..., :3].max(-1).astype(np.float64)
-    share = np.where(np.arange(WIDTH) < 29, 0.5 + favour, 0.5 - favour) * np.ones((HEIGHT, 1))
+    second = favour if favour_second is None else favour_second
+    share = np.where(np.arange(WIDTH) < 29, 0.5 + favour, 0.5 - second) * np.ones((HEIGHT, 1))
     whole = np.zeros(both.shape, bool)
     whole[7:20, 19:26] = whole[7:20, 32:39] = True
+    if beside:
+        whole[7:20, 19 : 42 + beside] = True
     choice = Choice(
         whole, Residuals(off, off), np.stack([share, 1 - share]), covers, False, 10.0, 1.65 * whole
     )
@@ -207,7 +218,18 @@ def test_who_touches_a_border_stays_there(
     assert ((once[8:19, 20:25] == 0).mean(), (once[8:19, 33:38] == 1).mean()) == shown
 
 
-def test_layers_are_not_looked_at_where_one_shows_all(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize(("beside", "theirs"), [(2, 1), (7, 0)])
+def test_one_layer_is_not_taken_where_a_cut_shows_him_once(
+    monkeypatch: pytest.MonkeyPatch, beside: int, theirs: int
+) -> None:
+    """But where much else differs, somebody else may be there twice."""
+    once, before, _ = chosen(monkeypatch, favour=0.3, favour_second=0.1, beside=beside)
+    assert (before[8:19, 19 : 42 + beside] == 0).all()
+    assert (once[8:19, 20:25] == 0).all() and (once[8:19, 33:38] == 0).all()
+    assert (once[8:19, 41 : 41 + beside] == theirs).all()
+
+
+def test_layers_are_not_looked_at_where_regions_are_small(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(clones, "_LEAST", 1e6)
     once, twice, asked = chosen(monkeypatch)
     assert np.array_equal(once, twice) and asked == []
