@@ -197,7 +197,7 @@ def _bands(
     fields = [(layer.box, layer.field) for layer in layers]
     gains = [None if layer.gain is None else (whole, layer.gain) for layer in layers]
     offsets = [layer.offset for layer in layers]
-    longitudes = _turn(device, full.lens[0], full.lens[1], crop.left - region.left, crop.width)
+    longitudes = _turn(device, full.lonlat[0], full.lonlat[1], crop.left - region.left, crop.width)
     plan = _plan(layers, full, grid, crop, height)
     ways, gained, added = (
         _Slices(device, arrays, coarse, plan)
@@ -226,11 +226,11 @@ def _bands(
             used = [k for k, (start, end) in enumerate(band.rows) if start < end]
             touched = device.upload(table[used])
             marks = _mark(device, store.rows, touched, ways.values, full, grid, part, options)
-            latitudes = _turn(device, full.lens[2], -full.lens[3], part.top, part.height)
+            latitudes = _turn(device, full.lonlat[2], -full.lonlat[3], part.top, part.height)
             out = device.empty((part.height, part.width, first.channels + 1), device_dtype(first))
             device.run(
                 "blend", "blend_band", groups, store.rows, touched, len(used), ways.values, gained.values,
-                added.values, longitudes, latitudes, full.border, full.lens, grid.border, gain_grid.border,
+                added.values, longitudes, latitudes, full.border, full.lonlat, grid.border, gain_grid.border,
                 offset_grid.border, (part.left, part.top, *size), (region.left, region.top), shoulder,
                 int(settings.interpolation == "nearest"), share, marks, marks.shape[-1], out, options=options,
             )  # fmt: skip

@@ -143,7 +143,7 @@ def _axes(points: npt.NDArray[np.float64], weights: npt.NDArray[np.float64]) -> 
 
 
 def _sphere(overlap: npt.NDArray[np.bool_], mask_grid: Grid, scale: float) -> Chart:
-    lon0, dlon = mask_grid.lens[:2]
+    lon0, dlon = mask_grid.lonlat[:2]
     lon = lon0 + (np.arange(mask_grid.width, dtype=np.float64) + 0.5) * dlon
     rows, columns = np.nonzero(overlap)
     points = directions(lon, mask_grid.latitudes, columns, rows)
@@ -181,8 +181,8 @@ def pair_chart(overlap: npt.NDArray[np.bool_], mask_grid: Grid, grid: Grid, coar
 
     It is as fine as the working grid, or half as fine if `coarse` is 2; the mask is not empty.
     """
-    if grid.lens[1]:
-        found = _sphere(overlap, mask_grid, 1 / (coarse * grid.lens[1]))
+    if grid.spherical:
+        found = _sphere(overlap, mask_grid, 1 / (coarse * grid.lonlat[1]))
     else:
         height, width = (max(1, round(n / coarse)) for n in grid.shape)
         rows = np.arange(height) * mask_grid.height // height
@@ -198,7 +198,7 @@ def sample(device: Device, layer: WorkingLayer, grid: Grid, chart: Chart) -> Lev
     chunks = (-(-chart.width // _CHUNK), chart.height)
     level = Level(device.empty(size[::-1]), device.empty(size[::-1]), chart.wraps)
     device.run(
-        "chart", "chart_sample", chunks, layer.pixels, layer.box, grid.border, grid.lens,
+        "chart", "chart_sample", chunks, layer.pixels, layer.box, grid.border, grid.lonlat,
         chart.transform, size, chart.coarse, _FLOOR, level.image, level.mask,
     )  # fmt: skip
     return level

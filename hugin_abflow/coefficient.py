@@ -89,9 +89,9 @@ def masks(device: Device, layers: Sequence[WorkingLayer], grid: Grid) -> Masks:
 def _table(grid: Grid) -> npt.NDArray[np.float32]:
     """Parts of the distance between two pixels of the mask grid, as coefficient.cl takes them."""
     rows, columns = np.arange(grid.height), np.arange(grid.width)
-    if not grid.lens[1]:
+    if not grid.spherical:
         return np.concatenate([rows, columns, np.ones(grid.height)]).astype(np.float32)
-    _, dlon, _, dlat = grid.lens
+    _, dlon, _, dlat = grid.lonlat
     parts = [np.sin(rows * dlat / 2), np.sin(columns * dlon / 2), grid.row_widths]
     return np.concatenate(parts).astype(np.float32)
 
@@ -112,13 +112,12 @@ def distance(device: Device, masks_: Masks, index: int, cover: Buffer, working: 
     for jump in [*steps, 2, 1]:
         device.run("coefficient", "coefficient_flood", size, seed, grid.border, table, jump, flooded)
         seed, flooded = flooded, seed
-    spherical = working.lens[1] > 0
-    unit = 1 / working.lens[1] if spherical else working.width / grid.width
-    furthest = math.pi / working.lens[1] if spherical else math.hypot(*working.shape)
+    unit = 1 / working.lonlat[1] if working.spherical else working.width / grid.width
+    furthest = math.pi / working.lonlat[1] if working.spherical else math.hypot(*working.shape)
     result = device.empty(grid.shape)
     device.run(
         "coefficient", "coefficient_distance", size,
-        seed, mask, grid.border, table, int(spherical), unit, furthest, result,
+        seed, mask, grid.border, table, int(working.spherical), unit, furthest, result,
     )  # fmt: skip
     return result
 

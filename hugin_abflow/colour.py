@@ -160,7 +160,7 @@ class _Overlap:
         """What both kernels begin with."""
         pairs = [(self.layers[k], self.fields[k]) for k in (self.pair.a, self.pair.b)]
         sides = [value for layer, field in pairs for value in (layer.pixels, field, layer.box)]
-        return [*sides, self.grid.border, self.grid.lens, self.cells.border, self._part.place]
+        return [*sides, self.grid.border, self.grid.lonlat, self.cells.border, self._part.place]
 
     @cached_property
     def _part(self) -> Box:

@@ -115,7 +115,7 @@ def solve(
     blocks = _blocks(inside)
     smooth_blocks = blocks.T @ smooth @ blocks / _BLOCK
     own_area = np.broadcast_to(area, inside.shape)[inside]
-    round_ = cells.circumference / (cells.lens[1] or 1.0)  # cells
+    round_ = cells.circumference / (cells.lonlat[1] or 1.0)  # cells
     solution, solver, rough_solver = np.zeros((count, 3)), _Solver(), _Solver()
     rounds = _STRICT if strict else _ROUNDS
     for data, limit in rounds:

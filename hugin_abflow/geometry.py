@@ -105,7 +105,7 @@ def _displacement(
         other = pair.b if index == pair.a else pair.a
         device.run(
             "geometry", "geometry_add", chunks, coefficients[other], layers[other].box, layer.pixels,
-            layer.box, grid.border, grid.lens, pair.between(other), pair.chart.border, pair.chart.transform,
+            layer.box, grid.border, grid.lonlat, pair.between(other), pair.chart.border, pair.chart.transform,
             number == 0, field,
         )  # fmt: skip
     return field
@@ -138,23 +138,23 @@ def reach(device: Device, layer: WorkingLayer, field: Buffer, grid: Grid) -> lis
     beside it, or at the box's rim, the row lies that is sampled there.
     """
     found = device.empty((layer.box[3], 2))
-    device.run("geometry", "geometry_reach", (layer.box[3], 1), field, layer.box, grid.lens, found)
+    device.run("geometry", "geometry_reach", (layer.box[3], 1), field, layer.box, grid.lonlat, found)
     longest, furthest = found.get().astype(np.float64).T
     rows: list[float] = furthest.tolist()
-    if not grid.lens[1]:
+    if not grid.spherical:
         return rows
     # a vector of length v, added to a unit vector, turns it by asin(v) at most
     angles = np.where(longest < 1, np.arcsin(np.minimum(longest, 1)), math.pi)
     latitudes = np.abs(grid.latitudes[layer.box[1] :][: len(longest)])
     # but most lead to the side. Displacements of pixels are added to places beside them, too, and their means
-    changes = furthest * grid.lens[3] + (1 + 2 * longest) * max(grid.lens[1], grid.lens[3])
+    changes = furthest * grid.lonlat[3] + (1 + 2 * longest) * max(grid.lonlat[1], grid.lonlat[3])
     far_from_poles = 2 * longest < np.cos(latitudes)
     aside = np.where(far_from_poles, longest / np.cos(latitudes), 0)  # sine of the change of longitude
     beyond = np.maximum(_beyond(latitudes + changes, aside), _beyond(changes - latitudes, aside))
     angles = np.where(far_from_poles, np.minimum(angles, changes + beyond), angles)
     # a row beyond a pole is seen where its directions are, on the pole's other side
-    angles += 2 * np.maximum(latitudes + 1.5 * grid.lens[3] - math.pi / 2, 0)
-    rows = (angles / grid.lens[3]).tolist()
+    angles += 2 * np.maximum(latitudes + 1.5 * grid.lonlat[3] - math.pi / 2, 0)
+    rows = (angles / grid.lonlat[3]).tolist()
     return rows
 
 

@@ -47,7 +47,7 @@ def settle(
         share, chunks = device.empty((height, width)), (-(-width // _CHUNK), height)
         device.run(
             "intermediate", "intermediate_share", chunks, coefficients[pair.a], a.box,
-            coefficients[pair.b], b.box, grid.border, grid.lens, pair.chart.border, pair.chart.transform,
+            coefficients[pair.b], b.box, grid.border, grid.lonlat, pair.chart.border, pair.chart.transform,
             share,
         )  # fmt: skip
         flows[number] = _passing(device, pair, share)

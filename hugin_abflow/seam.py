@@ -176,7 +176,7 @@ def stay(
         its = whole & (owner == k)
         if its.any():  # of many layers nearly all
             device.run(
-                "seam", "seam_stay", layer.box[2:], layer.pixels, field, layer.box, grid.border, grid.lens,
+                "seam", "seam_stay", layer.box[2:], layer.pixels, field, layer.box, grid.border, grid.lonlat,
                 device.upload(its.astype(np.uint8)), cells.border,
             )  # fmt: skip
 
@@ -268,7 +268,7 @@ def _differences(
         for k in (pair.a, pair.b):
             sides += [layers[k].pixels, fields[k], layers[k].box, correction.gains[k] or none]
         device.run(
-            "seam", "seam_difference", (part.width, part.height), *sides, grid.border, grid.lens,
+            "seam", "seam_difference", (part.width, part.height), *sides, grid.border, grid.lonlat,
             correction.grid.border, cells.border, part.place, correction.shoulder, clipped[pair.a],
             clipped[pair.b], difference, square,
         )  # fmt: skip

@@ -138,7 +138,7 @@ def _price(
         device.run(
             "transition", "transition_parallax", cells.border[:2], flow.forward, flow.backward,
             chart.border, chart.transform, masks.buffers[flow.a],
-            masks.buffers[flow.b], masks.grid.border, grid.border, grid.lens, cells.border, squared,
+            masks.buffers[flow.b], masks.grid.border, grid.border, grid.lonlat, cells.border, squared,
         )  # fmt: skip
     several = (cover.sum(0) > 1).astype(np.float64)
     modes = ("nearest", "wrap" if cells.wraps else "nearest")
@@ -164,8 +164,8 @@ def links(price: npt.NDArray[np.float64], union: Mask, cells: Grid) -> tuple[Val
     By how long the border between them is over how far they lie apart, and the harmonic mean of the price.
     """
     rows = np.arange(cells.height)
-    if cells.lens[1]:
-        _, across, latitude, down = cells.lens
+    if cells.spherical:
+        _, across, latitude, down = cells.lonlat
         heights = down / (across * _narrowing(cells))
         widths = across / down * np.maximum(np.cos(latitude - (rows + 1) * down), 0.0)
     else:

@@ -54,7 +54,7 @@ class Grid:
     region      full-resolution canvas pixels that it covers.
     width, height    of the grid.
     wraps, poles     border rules (kernels/common.cl); poles: bit 0 at the top, bit 1 at the bottom.
-    lens        (lon of x = 0, radians per column, lat of y = 0, radians per row); zeros on a plane.
+    lonlat      (longitude of x = 0, radians per column, latitude of y = 0, radians per row); plane: zeros.
     canvas_width    of the whole canvas, full-resolution px; 0: the region's.
     eye         of a plane, on the whole canvas; None: not known.
     """
@@ -64,7 +64,7 @@ class Grid:
     height: int
     wraps: bool
     poles: int
-    lens: tuple[float, float, float, float]
+    lonlat: tuple[float, float, float, float]
     canvas_width: int = 0
     eye: Eye | None = None
 
@@ -79,6 +79,16 @@ class Grid:
         return self.width, self.height, int(self.wraps), self.poles
 
     @property
+    def lens(self) -> tuple[float, float, float, float]:
+        """Old name of `lonlat`."""
+        return self.lonlat
+
+    @property
+    def spherical(self) -> bool:
+        """Whether it is of a sphere."""
+        return self.lonlat[1] > 0
+
+    @property
     def row_height(self) -> float:
         """Of a row of the grid, full-resolution px."""
         return self.region.height / self.height
@@ -86,7 +96,7 @@ class Grid:
     @property
     def latitudes(self) -> npt.NDArray[np.float64]:
         """Of the middles of rows; 0 on a plane."""
-        _, _, top, down = self.lens
+        _, _, top, down = self.lonlat
         rows = np.arange(self.height, dtype=np.float64)
         return top - (rows + 0.5) * down
 
@@ -99,25 +109,25 @@ class Grid:
     @property
     def circumference(self) -> float:
         """The whole canvas's width: radians on a sphere (2 pi if it wraps), grid px on a plane."""
-        if self.lens[1] and self.wraps:
+        if self.spherical and self.wraps:
             return 2 * math.pi
         share = self.canvas_width / self.region.width if self.canvas_width else 1.0
-        return share * self.width * (self.lens[1] or 1.0)
+        return share * self.width * (self.lonlat[1] or 1.0)
 
     def points(self, places: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
         """Points (n, 3) in the scene (kernels/common.cl) of canvas positions (n, 2), full-resolution px."""
         x, y = ((places - (self.region.left, self.region.top)) * self.ratios).T
-        if not self.lens[1]:
+        if not self.spherical:
             return np.stack([x, y, np.zeros_like(x)], 1)
-        lon, lat = self.lens[0] + x * self.lens[1], self.lens[2] - y * self.lens[3]
+        lon, lat = self.lonlat[0] + x * self.lonlat[1], self.lonlat[2] - y * self.lonlat[3]
         return directions(lon, lat)
 
     def places(self, points: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
         """The inverse of `points`; points on a sphere may have any length but 0."""
         x, y, z = points.T
-        if self.lens[1]:
+        if self.spherical:
             lon, lat = np.arctan2(x, y), np.arctan2(z, np.hypot(x, y))
-            x, y = (lon - self.lens[0]) / self.lens[1], (self.lens[2] - lat) / self.lens[3]
+            x, y = (lon - self.lonlat[0]) / self.lonlat[1], (self.lonlat[2] - lat) / self.lonlat[3]
         return np.stack([x, y], 1) / self.ratios + (self.region.left, self.region.top)
 
     @property
@@ -138,9 +148,9 @@ class Grid:
 
     def resized(self, width: int, height: int) -> Grid:
         """The same region on another number of pixels."""
-        lon, dlon, lat, dlat = self.lens
-        lens = (lon, dlon * self.width / width, lat, dlat * self.height / height)
-        return replace(self, width=width, height=height, lens=lens)
+        lon, dlon, lat, dlat = self.lonlat
+        lonlat = (lon, dlon * self.width / width, lat, dlat * self.height / height)
+        return replace(self, width=width, height=height, lonlat=lonlat)
 
 
 def connected(mask: npt.NDArray[np.bool_], wraps: bool) -> npt.NDArray[np.int32]:
@@ -202,17 +212,17 @@ def full_grid(canvas: Canvas, layers: Sequence[Layer]) -> Grid:
     region = bounding_box(layers)
     if canvas.wraps:
         region = replace(region, left=0, right=canvas.width)
-    lens, poles, eye = (0.0, 0.0, 0.0, 0.0), 0, None
+    lonlat, poles, eye = (0.0, 0.0, 0.0, 0.0), 0, None
     if canvas.spherical:
         step = math.radians(canvas.hfov) / canvas.width
         left, top = region.left - canvas.width / 2, canvas.height / 2 - region.top
-        lens = (left * step, step, top * step, step)
+        lonlat = (left * step, step, top * step, step)
         if canvas.wraps and canvas.width % 2 == 0:
-            poles += abs(lens[2] - math.pi / 2) < step / 2
-            poles += 2 * (abs(lens[2] - region.height * step + math.pi / 2) < step / 2)
+            poles += abs(lonlat[2] - math.pi / 2) < step / 2
+            poles += 2 * (abs(lonlat[2] - region.height * step + math.pi / 2) < step / 2)
     else:
         eye = Eye.of(canvas.projection, canvas.width, canvas.height, canvas.hfov)
-    return Grid(region, region.width, region.height, canvas.wraps, poles, lens, canvas.width, eye)
+    return Grid(region, region.width, region.height, canvas.wraps, poles, lonlat, canvas.width, eye)
 
 
 def working_grid(full: Grid, settings: Settings) -> Grid:

@@ -95,10 +95,10 @@ static inline blend_real blend_angles(blend_real y, blend_real x) {
 
 /* Where a layer is sampled for pixels at (px, py): the field's displacements d carried to full resolution.
    sl, cl, sp, cp: sine and cosine of the pixels' longitudes and latitude. */
-static inline void blend_positions(blend_real px, float py, blend_samples d, float2 scale, float4 lens, blend_real sl,
+static inline void blend_positions(blend_real px, float py, blend_samples d, float2 scale, float4 lonlat, blend_real sl,
                                    blend_real cl, float sp, float cp, blend_real *x, blend_real *y) {
     const blend_real dx = d.REDS, dy = d.GREENS, dz = d.BLUES;
-    if (lens.y == 0.0f) {
+    if (lonlat.y == 0.0f) {
         *x = px + dx * scale.x;
         *y = py + dy * scale.y;
         return;
@@ -108,8 +108,8 @@ static inline void blend_positions(blend_real px, float py, blend_samples d, flo
     const blend_real north = sp + dz, squared = east * east + out * out;
 #define BLEND_ROOT(n, i) ROOT(squared.i)
     const blend_real level = (blend_real)(BLEND_LIST(BLEND_ROOT));
-    *x = px + blend_angles(east, out) / lens.y;
-    *y = py - blend_angles(north * cp - level * sp, level * cp + north * sp) / lens.w;
+    *x = px + blend_angles(east, out) / lonlat.y;
+    *y = py - blend_angles(north * cp - level * sp, level * cp + north * sp) / lonlat.w;
 }
 
 /* The fractions above which r, g, b are rounded up at canvas pixels from (x, y) on: uniform in 0..1, so that
@@ -225,7 +225,7 @@ __kernel void blend_band(
     __global const float4 *offsets,      /* per layer with offsets, (offset.w, offset.z) */
     __global const float2 *columns,      /* (band.z) sine and cosine of longitude; plane: not used */
     __global const float2 *lines,        /* (band.w) sine and cosine of latitude; plane: not used */
-    int4 border, float4 lens,            /* full-resolution grid of the region */
+    int4 border, float4 lonlat,          /* full-resolution grid of the region */
     int4 field_border, int4 gain_border, int4 offset_border, /* working grid; colour grid; grid of offsets */
     int4 band,                           /* its place: left, top, width, height; run size: columns / PIXELS, rows */
     int2 origin,                         /* the region's place on the canvas */
@@ -261,7 +261,7 @@ __kernel void blend_band(
         const blend_between column = blend_split(px / scale.x);
         blend_real sl = (blend_real)(0.0f), cl = sl;
         float sp = 0.0f, cp = 0.0f;
-        if (lens.y != 0.0f) {
+        if (lonlat.y != 0.0f) {
             const int last = band.z - 1;
 #define BLEND_SINE(n, i) columns[LEAST(x + n, last)].x
 #define BLEND_COSINE(n, i) columns[LEAST(x + n, last)].y
@@ -294,7 +294,7 @@ __kernel void blend_band(
                 const blend_int moved = seen & blend_any(way);
                 if (BLEND_SOME(moved)) {
                     blend_real qx, qy;
-                    blend_positions(px, py, way, scale, lens, sl, cl, sp, cp, &qx, &qy);
+                    blend_positions(px, py, way, scale, lonlat, sl, cl, sp, cp, &qx, &qy);
                     blend_sample_all(stored, layers + k, qx, qy, moved, border, nearest, &c);
                 }
                 /* a sample that falls outside its layer counts smoothly less */

@@ -72,7 +72,7 @@ static float chart_brightness(__global const float4 *layer, int4 box, int4 borde
 /* Log brightness of a layer on a chart; 0 where there is none. */
 __kernel void chart_sample(__global const float4 *layer, /* (box.w, box.z) r, g, b, valid */
                            int4 box,                     /* place of `layer` on the canvas grid */
-                           int4 border, float4 lens,     /* canvas grid */
+                           int4 border, float4 lonlat,   /* canvas grid */
                            float16 chart, int2 size,     /* run size: size.x by CHART_CHUNK, rounded up, size.y */
                            int coarse,                   /* pixels of the canvas grid per pixel, 1 or 2 */
                            float floor_value,            /* added before the logarithm: dark noise */
@@ -84,7 +84,7 @@ __kernel void chart_sample(__global const float4 *layer, /* (box.w, box.z) r, g,
         return;
     const float4 u = convert_float4(i + (int4)(0, 1, 2, 3)) + 0.5f;
     float4 py;
-    const float4 px = chart_places(u, (float4)(j + 0.5f), &chart, lens, &py);
+    const float4 px = chart_places(u, (float4)(j + 0.5f), &chart, lonlat, &py);
     const float2 places[CHART_CHUNK] = {(float2)(px.x, py.x), (float2)(px.y, py.y), (float2)(px.z, py.z),
                                         (float2)(px.w, py.w)};
     for (int k = 0; k < CHART_CHUNK && i + k < size.x; ++k) {

@@ -22,7 +22,7 @@ static inline float colour_tells(float4 a, float4 b, float shoulder) {
    most of the cell: the other has to be raised by that much at least. And how far both are seen, by their weights. */
 __kernel void colour_difference(__global const float4 *layer_a, __global const float4 *field_a, int4 box_a,
                                 __global const float4 *layer_b, __global const float4 *field_b, int4 box_b,
-                                int4 border, float4 lens,   /* working grid */
+                                int4 border, float4 lonlat, /* working grid */
                                 int4 cells, int4 part,      /* colour grid; its cells that are compared, run size */
                                 float shoulder,             /* of the exposure scale */
                                 float4 clipped_a, float4 clipped_b, /* brighter samples may have been any brighter */
@@ -41,7 +41,7 @@ __kernel void colour_difference(__global const float4 *layer_a, __global const f
         for (int x = its.x; x < its.z; x += 2) {
             tried += 1.0f;
             float4 a, b;
-            if (!layer_pair(layer_a, field_a, box_a, layer_b, field_b, box_b, (int2)(x, y), border, lens, &a, &b))
+            if (!layer_pair(layer_a, field_a, box_a, layer_b, field_b, box_b, (int2)(x, y), border, lonlat, &a, &b))
                 continue;
             const float s = field_a[box_index((int2)(x, y), box_a)].w;
             const float t = field_b[box_index((int2)(x, y), box_b)].w;
@@ -81,7 +81,7 @@ __kernel void colour_difference(__global const float4 *layer_a, __global const f
    the mean square, of full scale, of what one gain for the cell leaves of it. */
 __kernel void colour_misfit(__global const float4 *layer_a, __global const float4 *field_a, int4 box_a,
                             __global const float4 *layer_b, __global const float4 *field_b, int4 box_b,
-                            int4 border, float4 lens,  /* working grid */
+                            int4 border, float4 lonlat,  /* working grid */
                             int4 cells, int4 part,     /* colour grid; its cells that are compared, run size */
                             float4 shoulders,
                             float4 clipped_a, float4 clipped_b, /* brighter samples are not used */
@@ -99,7 +99,7 @@ __kernel void colour_misfit(__global const float4 *layer_a, __global const float
         for (int x = its.x; x < its.z; x += 4) {
             tried += 1.0f;
             float4 a, b;
-            if (!layer_pair(layer_a, field_a, box_a, layer_b, field_b, box_b, (int2)(x, y), border, lens, &a, &b) ||
+            if (!layer_pair(layer_a, field_a, box_a, layer_b, field_b, box_b, (int2)(x, y), border, lonlat, &a, &b) ||
                 colour_clips(a, clipped_a) || colour_clips(b, clipped_b))
                 continue;
             const float p[3] = {a.x, a.y, a.z}, q[3] = {b.x, b.y, b.z};

@@ -199,8 +199,8 @@ static inline int box_index(int2 p, int4 box) {
 ANGLES()
 ANGLES(4)
 
-/* The lens of a canvas grid: lens = (lon of x = 0, radians per column, lat of y = 0, radians per row);
-   radians per column 0 means a plane.
+/* Longitudes and latitudes of a canvas grid: lonlat = (longitude of x = 0, radians per column, latitude of y = 0,
+   radians per row); 0 radians per column mean a plane.
 
    A chart is the flat grid on which one pair's flow lives. Sphere: an equirectangular projection about an
    axis of its own; s0-2, s3-5, s6-8 are the rows of the rotation from the scene to the chart's axes.
@@ -214,15 +214,15 @@ ANGLES(4)
     typedef struct {                                                                                               \
         float##n x, y, z;                                                                                          \
     } points##n;                                                                                                   \
-    static inline points##n canvas_sphere##n(float##n x, float##n y, float4 lens) {                                \
+    static inline points##n canvas_sphere##n(float##n x, float##n y, float4 lonlat) {                              \
         float##n cl, cp;                                                                                           \
-        const float##n sl = angle_sincos##n(lens.x + x * lens.y, &cl);                                             \
-        const float##n sp = angle_sincos##n(lens.z - y * lens.w, &cp);                                             \
+        const float##n sl = angle_sincos##n(lonlat.x + x * lonlat.y, &cl);                                         \
+        const float##n sp = angle_sincos##n(lonlat.z - y * lonlat.w, &cp);                                         \
         return (points##n){cp * sl, cp * cl, sp};                                                                  \
     }                                                                                                              \
-    static inline float##n canvas_sphere_position##n(points##n q, float4 lens, float##n *y) {                      \
-        *y = (lens.z - angle_of##n(q.z, root##n(q.x * q.x + q.y * q.y))) / lens.w;                                 \
-        return (angle_of##n(q.x, q.y) - lens.x) / lens.y;                                                          \
+    static inline float##n canvas_sphere_position##n(points##n q, float4 lonlat, float##n *y) {                    \
+        *y = (lonlat.z - angle_of##n(q.z, root##n(q.x * q.x + q.y * q.y))) / lonlat.w;                             \
+        return (angle_of##n(q.x, q.y) - lonlat.x) / lonlat.y;                                                      \
     }                                                                                                              \
     static inline points##n chart_sphere##n(float##n u, float##n v, const float16 *chart) {                        \
         float##n cl, cp;                                                                                           \
@@ -243,18 +243,18 @@ ANGLES(4)
 SPHERE()
 SPHERE(4)
 
-static inline float3 canvas_point(float2 p, float4 lens) {
-    if (lens.y == 0.0f)
+static inline float3 canvas_point(float2 p, float4 lonlat) {
+    if (lonlat.y == 0.0f)
         return (float3)(p.x, p.y, 0.0f);
-    const points q = canvas_sphere(p.x, p.y, lens);
+    const points q = canvas_sphere(p.x, p.y, lonlat);
     return (float3)(q.x, q.y, q.z);
 }
 
-static inline float2 canvas_position(float3 q, float4 lens) {
-    if (lens.y == 0.0f)
+static inline float2 canvas_position(float3 q, float4 lonlat) {
+    if (lonlat.y == 0.0f)
         return q.xy;
     float y;
-    const float x = canvas_sphere_position((points){q.x, q.y, q.z}, lens, &y);
+    const float x = canvas_sphere_position((points){q.x, q.y, q.z}, lonlat, &y);
     return (float2)(x, y);
 }
 
@@ -271,12 +271,12 @@ static inline float2 chart_position(float3 q, const float16 *chart) {
 }
 
 /* Where four positions of a chart lie on the canvas grid: x, and by its address y. */
-static inline float4 chart_places(float4 u, float4 v, const float16 *chart, float4 lens, float4 *y) {
-    if (lens.y == 0.0f) {
+static inline float4 chart_places(float4 u, float4 v, const float16 *chart, float4 lonlat, float4 *y) {
+    if (lonlat.y == 0.0f) {
         *y = (v - chart->sc) / chart->sa;
         return (u - chart->sb) / chart->s9;
     }
-    return canvas_sphere_position4(chart_sphere4(u, v, chart), lens, y);
+    return canvas_sphere_position4(chart_sphere4(u, v, chart), lonlat, y);
 }
 
 /* Weights of the four pixels from `corner` on, to read between them at the fraction t, and their indices; weight
@@ -362,29 +362,29 @@ static inline float4 layer_sample(__global const float4 *layer, int4 box, float2
 }
 
 /* Where a layer is sampled for position q of the working grid. */
-static inline float2 layer_position(float2 q, float3 d, float4 lens) {
+static inline float2 layer_position(float2 q, float3 d, float4 lonlat) {
     if (d.x == 0.0f && d.y == 0.0f && d.z == 0.0f)
         return q;
-    return canvas_position(canvas_point(q, lens) + d, lens);
+    return canvas_position(canvas_point(q, lonlat) + d, lonlat);
 }
 
 /* What an aligned layer shows for working pixel p; false where it shows nothing. */
 static inline bool layer_shown(__global const float4 *layer, __global const float4 *field, int4 box, int2 p,
-                               int4 border, float4 lens, float4 *c) {
+                               int4 border, float4 lonlat, float4 *c) {
     const int at = box_index(p, box);
     if (at < 0 || layer[at].w == 0.0f)
         return false;
     const float2 q = (float2)(p.x + 0.5f, p.y + 0.5f);
-    *c = layer_sample(layer, box, layer_position(q, field[at].xyz, lens), border);
+    *c = layer_sample(layer, box, layer_position(q, field[at].xyz, lonlat), border);
     return c->w != 0.0f;
 }
 
 /* What two aligned layers show for working pixel p; false where they do not both show something. */
 static inline bool layer_pair(__global const float4 *layer_a, __global const float4 *field_a, int4 box_a,
                               __global const float4 *layer_b, __global const float4 *field_b, int4 box_b,
-                              int2 p, int4 border, float4 lens, float4 *a, float4 *b) {
-    return layer_shown(layer_a, field_a, box_a, p, border, lens, a) &&
-           layer_shown(layer_b, field_b, box_b, p, border, lens, b);
+                              int2 p, int4 border, float4 lonlat, float4 *a, float4 *b) {
+    return layer_shown(layer_a, field_a, box_a, p, border, lonlat, a) &&
+           layer_shown(layer_b, field_b, box_b, p, border, lonlat, b);
 }
 
 /* The scale on which exposure differences are smooth fields, c in 0..1 of full scale: log odds of shoulder * c.

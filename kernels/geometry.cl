@@ -47,7 +47,7 @@ __kernel void geometry_add(__global const float *blend_j,   /* (box_j.w, box_j.z
                            __global const float4 *layer_k,  /* (box_k.w, box_k.z) r, g, b, valid */
                            int4 box_k,                      /* place on the working grid; run size, its columns
                                                                by GEOMETRY_CHUNK, rounded up */
-                           int4 border, float4 lens,        /* working grid */
+                           int4 border, float4 lonlat,      /* working grid */
                            __global const float2 *flow,     /* chart grid, px: F_jk */
                            int4 grid, float16 chart,        /* chart */
                            int first,                       /* 1: nothing is in the field yet */
@@ -68,7 +68,7 @@ __kernel void geometry_add(__global const float *blend_j,   /* (box_j.w, box_j.z
         return;
     const float4 px = convert_float4(x + (int4)(0, 1, 2, 3) + box_k.x) + 0.5f;
     const float4 py = (float4)(y + box_k.y + 0.5f);
-    const points4 q = lens.y == 0.0f ? (points4){px, py, (float4)(0.0f)} : canvas_sphere4(px, py, lens);
+    const points4 q = lonlat.y == 0.0f ? (points4){px, py, (float4)(0.0f)} : canvas_sphere4(px, py, lonlat);
     int4 moves;
     const points4 d = geometry_ways(q, flow, grid, &chart, &moves);
     const float3 way[GEOMETRY_CHUNK] = {(float3)(d.x.x, d.y.x, d.z.x), (float3)(d.x.y, d.y.y, d.z.y),
@@ -120,7 +120,7 @@ __kernel void geometry_softmax(__global float4 *field,       /* (box.w, box.z); 
    beyond its own. */
 __kernel void geometry_reach(__global const float4 *field, /* (box.w, box.z) */
                              int4 box,                     /* place on the working grid; run size: (box.w, 1) */
-                             float4 lens,                  /* working grid */
+                             float4 lonlat,                /* working grid */
                              __global float2 *reach)       /* (box.w) in units of the field; working px */
 {
     const int y = get_global_id(0);
@@ -139,9 +139,9 @@ __kernel void geometry_reach(__global const float4 *field, /* (box.w, box.z) */
         if (most == 0.0f)
             continue; /* as most of a layer */
         float4 to = py + way.y;
-        if (lens.y != 0.0f) {
-            const points4 q = canvas_sphere4(convert_float4(x + box.x + (int4)(0, 1, 2, 3)) + 0.5f, py, lens);
-            canvas_sphere_position4((points4){q.x + way.x, q.y + way.y, q.z + way.z}, lens, &to);
+        if (lonlat.y != 0.0f) {
+            const points4 q = canvas_sphere4(convert_float4(x + box.x + (int4)(0, 1, 2, 3)) + 0.5f, py, lonlat);
+            canvas_sphere_position4((points4){q.x + way.x, q.y + way.y, q.z + way.z}, lonlat, &to);
         }
         const float4 rows = length > 0.0f ? MAGNITUDE(to - py) : (float4)(0.0f);
         longest = GREATEST(longest, most);

@@ -37,7 +37,7 @@ static inline float intermediate_coefficient(__global const float *blend, int4 b
 /* The share of layer b in what both show; a half where none of them shows anything. */
 __kernel void intermediate_share(__global const float *blend_a, int4 box_a, /* (box_a.w, box_a.z) w_a, its place */
                                  __global const float *blend_b, int4 box_b, /* (box_b.w, box_b.z) w_b, its place */
-                                 int4 border, float4 lens,                  /* working grid */
+                                 int4 border, float4 lonlat,                /* working grid */
                                  int4 grid, float16 chart,                  /* chart; run size, its columns by
                                                                                INTERMEDIATE_CHUNK, rounded up */
                                  __global float *share)                     /* (grid.y, grid.x) */
@@ -46,7 +46,8 @@ __kernel void intermediate_share(__global const float *blend_a, int4 box_a, /* (
     if (x >= grid.x || y >= grid.y)
         return;
     float4 py;
-    const float4 px = chart_places(convert_float4(x + (int4)(0, 1, 2, 3)) + 0.5f, (float4)(y + 0.5f), &chart, lens, &py);
+    const float4 u = convert_float4(x + (int4)(0, 1, 2, 3)) + 0.5f;
+    const float4 px = chart_places(u, (float4)(y + 0.5f), &chart, lonlat, &py);
     const float2 places[INTERMEDIATE_CHUNK] = {(float2)(px.x, py.x), (float2)(px.y, py.y), (float2)(px.z, py.z),
                                                (float2)(px.w, py.w)};
     for (int k = 0; k < INTERMEDIATE_CHUNK && x + k < grid.x; ++k) {

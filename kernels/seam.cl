@@ -6,7 +6,7 @@ __kernel void seam_difference(__global const float4 *layer_a, __global const flo
                               __global const float4 *gain_a, /* (colours.y, colours.x) */
                               __global const float4 *layer_b, __global const float4 *field_b, int4 box_b,
                               __global const float4 *gain_b, /* (colours.y, colours.x) */
-                              int4 border, float4 lens,    /* working grid */
+                              int4 border, float4 lonlat,  /* working grid */
                               int4 colours, int4 cells,    /* grid of the gains; seam grid */
                               int4 part,                   /* cells that are compared, run size */
                               float shoulder,              /* of the exposure scale */
@@ -26,10 +26,12 @@ __kernel void seam_difference(__global const float4 *layer_a, __global const flo
         for (int x = its.x; x < its.z; x += 2) {
             tried += 1.0f;
             float4 a, b;
-            if (!layer_pair(layer_a, field_a, box_a, layer_b, field_b, box_b, (int2)(x, y), border, lens, &a, &b) ||
+            const int2 p = (int2)(x, y);
+            if (!layer_pair(layer_a, field_a, box_a, layer_b, field_b, box_b, p, border, lonlat, &a, &b) ||
                 any(a.xyz > clipped_a.xyz) || any(b.xyz > clipped_b.xyz))
                 continue;
-            const float3 d = exposure_look(a.xyz, gain_a[g].xyz, shoulder) - exposure_look(b.xyz, gain_b[g].xyz, shoulder);
+            const float3 d =
+                exposure_look(a.xyz, gain_a[g].xyz, shoulder) - exposure_look(b.xyz, gain_b[g].xyz, shoulder);
             sum += d;
             squares += d * d;
             n += 1.0f;
@@ -64,7 +66,7 @@ __kernel void seam_yield(__global float4 *field,        /* (box.w, box.z) of the
 __kernel void seam_stay(__global const float4 *layer, /* (box.w, box.z) */
                         __global float4 *field,       /* the same; x, y, z change */
                         int4 box, int4 border,        /* place on the working grid, run size; working grid */
-                        float4 lens,
+                        float4 lonlat,
                         __global const uchar *taken,  /* (cells.y, cells.x): the cells of what is taken from it */
                         int4 cells)                   /* seam grid, over the same region */
 {
@@ -76,9 +78,9 @@ __kernel void seam_stay(__global const float4 *layer, /* (box.w, box.z) */
     if (!taken[min(cell.y, cells.y - 1) * cells.x + min(cell.x, cells.x - 1)])
         return;
     const float4 own = field[at];
-    float2 there = layer_position(q, own.xyz, lens);
-    if (lens.y != 0.0f) { /* longitudes jump where they go once around */
-        const float around = 2.0f * M_PI_F / lens.y;
+    float2 there = layer_position(q, own.xyz, lonlat);
+    if (lonlat.y != 0.0f) { /* longitudes jump where they go once around */
+        const float around = 2.0f * M_PI_F / lonlat.y;
         there.x -= around * floor_int((there.x - q.x) / around + 0.5f);
     }
     float2 inside = there;
@@ -90,11 +92,11 @@ __kernel void seam_stay(__global const float4 *layer, /* (box.w, box.z) */
         inside.y = LEAST(inside.y, border.y - 0.5f);
     float3 d = own.xyz;
     if (inside.x != there.x || inside.y != there.y)
-        d = canvas_point(inside, lens) - canvas_point(q, lens);
-    if (layer_sample(layer, box, layer_position(q, d, lens), border).w == 0.0f) {
+        d = canvas_point(inside, lonlat) - canvas_point(q, lonlat);
+    if (layer_sample(layer, box, layer_position(q, d, lonlat), border).w == 0.0f) {
         float part = 0.0f, step = 0.5f;
         for (int i = 0; i < SEAM_HALVINGS; ++i, step *= 0.5f)
-            if (layer_sample(layer, box, layer_position(q, (part + step) * d, lens), border).w != 0.0f)
+            if (layer_sample(layer, box, layer_position(q, (part + step) * d, lonlat), border).w != 0.0f)
                 part += step;
         d *= part;
     }

@@ -17,14 +17,14 @@ __kernel void transition_parallax(__global const float2 *flow,   /* chart grid, 
                                   __global const uchar *mask_a,  /* (masks.y, masks.x) */
                                   __global const uchar *mask_b,  /* (masks.y, masks.x) */
                                   int4 masks,                    /* mask grid */
-                                  int4 border, float4 lens,      /* working grid */
+                                  int4 border, float4 lonlat,    /* working grid */
                                   int4 cells,                    /* run size */
                                   __global float *parallax)      /* (cells.y, cells.x) that of no pair before is less */
 {
     const int x = get_global_id(0), y = get_global_id(1);
     if (x >= cells.x || y >= cells.y)
         return;
-    const float2 size = (float2)(border.x, border.y), unit = (float2)(lens.y == 0.0f ? 1.0f : 1.0f / lens.y);
+    const float2 size = (float2)(border.x, border.y), unit = (float2)(lonlat.y == 0.0f ? 1.0f : 1.0f / lonlat.y);
     const float2 per_pixel = unit / (float2)(chart.s9, chart.sa);
     float longest = parallax[y * cells.x + x];
     for (int part = 0; part < 4; ++part) {
@@ -33,7 +33,7 @@ __kernel void transition_parallax(__global const float2 *flow,   /* chart grid, 
         const int2 m = floor_int2(share * (float2)(masks.x, masks.y));
         if (!mask_a[m.y * masks.x + m.x] || !mask_b[m.y * masks.x + m.x])
             continue;
-        const float2 u = chart_position(canvas_point(share * size, lens), &chart);
+        const float2 u = chart_position(canvas_point(share * size, lonlat), &chart);
         longest = GREATEST(longest, square2(bilinear_flow(flow, u, grid) * per_pixel));
         longest = GREATEST(longest, square2(bilinear_flow(back, u, grid) * per_pixel));
     }

@@ -30,8 +30,8 @@ def field_of(seed: int, grid: Grid, box: Sequence[int], strength: float) -> np.n
     random = np.random.default_rng(seed)
     noise = ndimage.gaussian_filter(random.normal(size=(box[3], box[2], 4)), (3, 3, 0))
     noise /= np.abs(noise).max((0, 1))
-    field = noise * strength * (grid.lens[1] or 1)
-    if not grid.lens[1]:
+    field = noise * strength * (grid.lonlat[1] or 1)
+    if not grid.lonlat[1]:
         field[..., 2] = 0
     field[:4, :, :3] = 0  # some do not move
     field[..., 3] = np.maximum(noise[..., 3] + 0.5, 0)

@@ -23,9 +23,9 @@ def sphere(width: int = 78, height: int = 39, rows: tuple[int, int] | None = Non
     """Rows of an equirectangular canvas of 360 x 180 degrees, with poles where the rows reach them."""
     top, bottom = rows or (0, height)
     step = 2 * math.pi / width, math.pi / height
-    lens = (-math.pi, step[0], math.pi / 2 - top * step[1], step[1])
+    lonlat = (-math.pi, step[0], math.pi / 2 - top * step[1], step[1])
     poles = (int(top == 0) + 2 * int(bottom == height)) if width % 2 == 0 else 0
-    return Grid(Box(0, top, width, bottom), width, bottom - top, True, poles, lens)
+    return Grid(Box(0, top, width, bottom), width, bottom - top, True, poles, lonlat)
 
 
 def window(width: int = WIDTH, height: int = HEIGHT) -> Grid:

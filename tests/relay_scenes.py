@@ -38,9 +38,9 @@ class Scene:
 
     def _moved(self, points: np.ndarray, by: float) -> np.ndarray:
         """Points of the scene, to the right."""
-        if not self.canvas.lens[1]:
+        if not self.canvas.lonlat[1]:
             return points + np.array([by, 0, 0])
-        turn = by * self.canvas.lens[1]
+        turn = by * self.canvas.lonlat[1]
         x, y, z = np.moveaxis(points, -1, 0)
         return np.stack(
             [x * math.cos(turn) + y * math.sin(turn), y * math.cos(turn) - x * math.sin(turn), z], -1
@@ -60,13 +60,13 @@ class Scene:
     def _brightness(self, layer: int, chart: Chart) -> np.ndarray:
         x, y = np.meshgrid(np.arange(chart.width) + 0.5, np.arange(chart.height) + 0.5)
         points = self._moved(common.chart_point(x, y, chart.transform), -self.shifts[layer])
-        scale = 0.7 if not self.canvas.lens[1] else 0.7 / self.canvas.lens[1]
+        scale = 0.7 if not self.canvas.lonlat[1] else 0.7 / self.canvas.lonlat[1]
         waves = np.sin(scale * points @ [1.0, 0.31, 0.17]) + np.cos(scale * points @ [-0.23, 0.9, 0.71])
         # periods that the cylinder's are not matter little
         brightness = 1 + self.texture * waves
         if self.shown is not None:
             px, py = common.canvas_position(
-                common.chart_point(x, y, chart.transform), np.asarray(self.canvas.lens)
+                common.chart_point(x, y, chart.transform), np.asarray(self.canvas.lonlat)
             )
             column = np.clip(px.astype(int), 0, self.canvas.width - 1)
             row = np.clip(py.astype(int), 0, self.canvas.height - 1)

@@ -79,11 +79,11 @@ def test_twin_of_field_reading_is_scipys() -> None:
 
 def test_twin_of_position_turns_by_an_angle() -> None:
     """Half a pixel of longitude is half a pixel; over the pole the way goes on, half a turn further."""
-    lens = sphere(402, 201).lens
+    lonlat = sphere(402, 201).lonlat
     x, y = np.array([10.5, 200.5, 401.9, 33.0]), np.array([100.5, 3.0, 100.5, 2.0])
     there = np.array([11.0, 200.5, 402.4, 33.0]), np.array([100.5, 9.0, 100.0, -3.0])
-    way = common.canvas_point(*there, lens) - common.canvas_point(x, y, lens)
-    u, v = twin.position(x, y, way, (1, 1), lens)
+    way = common.canvas_point(*there, lonlat) - common.canvas_point(x, y, lonlat)
+    u, v = twin.position(x, y, way, (1, 1), lonlat)
     assert np.allclose(np.mod(u, 402), [11.0, 200.5, 0.4, 33 + 201])
     assert np.allclose(v, [100.5, 9.0, 100.0, 3.0])
     assert np.allclose(
@@ -139,7 +139,7 @@ def test_a_band_of_three_layers_equals_its_twin(
         for rows, ring, turn in zip(stored, rings, turns, strict=True)
     ]
     x, y = (a + 0.5 for a in (np.arange(2, 2 + width), np.arange(1, 37)))
-    angles = full.lens[0] + x * full.lens[1], full.lens[2] - y * full.lens[3]
+    angles = full.lonlat[0] + x * full.lonlat[1], full.lonlat[2] - y * full.lonlat[3]
     axes = [device.upload(np.stack([np.sin(a), np.cos(a)], -1).astype(np.float32)) for a in angles]
     out = device.zeros((37, width, channels + 1), dtype)  # a row more than is made
     packed = [
@@ -163,14 +163,14 @@ def test_a_band_of_three_layers_equals_its_twin(
     for given in marked:
         device.run(
             "blend", "blend_band", (-(-width // together), band[3]), rows, touched, 3, lines, factors,
-            summands, *axes, full.border, full.lens, grid.border, cells.border, halves.border, band, origin,
+            summands, *axes, full.border, full.lonlat, grid.border, cells.border, halves.border, band, origin,
             shoulder, nearest, share, device.upload(given.astype(np.uint32)), 1, out, options=options,
         )  # fmt: skip
         made.append(out.get())
     assert np.array_equal(*made)  # what is not marked changes nothing
     raised = [(spans[0], offsets[0]), None, (spans[1], offsets[1])]
     expected = twin.blend_band(
-        stored, places, ways, boxes, gains, raised, full.border, full.lens, grid.border, cells.border,
+        stored, places, ways, boxes, gains, raised, full.border, full.lonlat, grid.border, cells.border,
         halves.border, band, origin, shoulder, nearest, share, white,
     )  # fmt: skip
     result, beyond = np.split(made[0], [36])

@@ -31,7 +31,7 @@ def check_on_canvas(grid: Grid, at: int) -> None:
     found = Whole(first, second).on_canvas(chart, cells)
     assert found.shape == cells.shape
     x, y = (n + 0.5 for n in common.pixels(cells.width, cells.height))
-    u, v = common.chart_position(common.canvas_point(x, y, cells.lens), chart.transform)
+    u, v = common.chart_position(common.canvas_point(x, y, cells.lonlat), chart.transform)
     u, v = np.floor(u / CELL).astype(int), np.floor(v / CELL).astype(int)
     inside = (u >= 0) & (u < empty.shape[1]) & (v >= 0) & (v < empty.shape[0])
     there = np.zeros(cells.shape, bool)
@@ -44,20 +44,20 @@ def check_on_canvas(grid: Grid, at: int) -> None:
     assert not Whole(empty, empty).on_canvas(chart, cells).any()
 
 
-LENS = (-np.pi, CANVAS.lens[1], np.pi / 2 - 90 * CANVAS.lens[3], CANVAS.lens[3])
+LONLAT = (-np.pi, CANVAS.lonlat[1], np.pi / 2 - 90 * CANVAS.lonlat[3], CANVAS.lonlat[3])
 
 
 @pytest.mark.parametrize("longitude", [0.0, *np.linspace(2.8, 3.5, 9)])
 def test_cells_of_the_canvas_are_told_by_what_they_show(longitude: float) -> None:
     """Of a canvas that is larger than its working grid and whose rows begin below its top, across its border
     as well."""
-    grid = replace(CANVAS, region=Box(0, 225, 1800, 675), height=180, poles=0, lens=LENS)
-    check_on_canvas(grid, int(360 + longitude / grid.lens[1]) % 720)
+    grid = replace(CANVAS, region=Box(0, 225, 1800, 675), height=180, poles=0, lonlat=LONLAT)
+    check_on_canvas(grid, int(360 + longitude / grid.lonlat[1]) % 720)
 
 
 def test_cells_are_those_of_a_region_of_the_canvas() -> None:
-    region, lens = Box(500, 225, 1250, 675), (0.1, *LENS[1:])
-    check_on_canvas(Grid(region, 300, 180, False, 0, lens, 1800), 170)
+    region, lonlat = Box(500, 225, 1250, 675), (0.1, *LONLAT[1:])
+    check_on_canvas(Grid(region, 300, 180, False, 0, lonlat, 1800), 170)
 
 
 def test_around_the_canvas_every_cell_has_one_of_the_chart() -> None:

@@ -25,10 +25,10 @@ FLOOR = 0.05
 def disc(grid: Grid, x: float, y: float, radius: float) -> np.ndarray:
     """An overlap: pixels within a radius (columns) of a place, on the sphere by angle."""
     columns, rows = common.pixels(grid.width, grid.height)
-    points = common.canvas_point(columns + 0.5, rows + 0.5, grid.lens)
-    centre = common.canvas_point(np.array(x), np.array(y), grid.lens)
-    if grid.lens[1]:
-        return np.arccos(np.clip(points @ centre, -1, 1)) < radius * grid.lens[1]
+    points = common.canvas_point(columns + 0.5, rows + 0.5, grid.lonlat)
+    centre = common.canvas_point(np.array(x), np.array(y), grid.lonlat)
+    if grid.lonlat[1]:
+        return np.arccos(np.clip(points @ centre, -1, 1)) < radius * grid.lonlat[1]
     dx = np.abs(points[..., 0] - x)
     return np.hypot(np.minimum(dx, grid.width - dx) if grid.wraps else dx, points[..., 1] - y) < radius
 
@@ -83,10 +83,10 @@ def test_twins_of_the_transforms_are_scipys_rotation() -> None:
 def test_twins_of_the_canvas_transforms_are_inverse(name: str) -> None:
     grid = GRIDS[name]
     x, y = (places + 0.3 for places in common.pixels(grid.width, grid.height))
-    point = common.canvas_point(x, y, grid.lens)
-    assert np.allclose(common.canvas_position(point, grid.lens), [x, y])
-    if grid.lens[1]:
-        lon, lat = grid.lens[0] + x * grid.lens[1], grid.lens[2] - y * grid.lens[3]
+    point = common.canvas_point(x, y, grid.lonlat)
+    assert np.allclose(common.canvas_position(point, grid.lonlat), [x, y])
+    if grid.lonlat[1]:
+        lon, lat = grid.lonlat[0] + x * grid.lonlat[1], grid.lonlat[2] - y * grid.lonlat[3]
         back = Rotation.from_euler("ZX", np.stack([-lon.ravel(), lat.ravel()], 1))
         assert np.allclose(back.apply([0, 1, 0]).reshape(point.shape), point)
 
@@ -98,7 +98,7 @@ def test_a_chart_holds_its_overlap_with_a_margin(overlap: tuple[Grid, np.ndarray
     columns, rows = common.pixels(grid.width, grid.height)
     near = ndimage.binary_dilation(mask, iterations=3) if not grid.wraps else mask
     u, v = common.chart_position(
-        common.canvas_point(columns[near] + 0.5, rows[near] + 0.5, grid.lens), found.transform
+        common.canvas_point(columns[near] + 0.5, rows[near] + 0.5, grid.lonlat), found.transform
     )
     assert (u >= 0).all()
     assert (u <= found.width).all()
@@ -115,12 +115,12 @@ def test_a_chart_has_hardly_any_stretch(name: str, coarse: int) -> None:
     grid, mask = OVERLAPS[name]
     found = pair_chart(mask, grid, grid, coarse)
     columns, rows = common.pixels(grid.width, grid.height)
-    point = common.canvas_point(columns[mask] + 0.5, rows[mask] + 0.5, grid.lens)
+    point = common.canvas_point(columns[mask] + 0.5, rows[mask] + 0.5, grid.lonlat)
     _, v = common.chart_position(point, found.transform)
     stretch = 1 / np.cos((found.transform[12] - v) / found.transform[10])
     assert stretch.max() < 1.5
     # chart px per working px along the chart's meridians
-    assert found.transform[10] * grid.lens[1] == pytest.approx(1 / coarse)
+    assert found.transform[10] * grid.lonlat[1] == pytest.approx(1 / coarse)
 
 
 @pytest.mark.parametrize("name", ["sphere ring", "everything", "cylinder ring"])
@@ -156,7 +156,7 @@ def test_a_finer_chart_shows_the_same_places(name: str) -> None:
     assert (fine.width, fine.height, fine.wraps) == (2 * coarse.width, 2 * coarse.height, coarse.wraps)
     assert (coarse.coarse, fine.coarse) == (2, 1)
     columns, rows = common.pixels(grid.width, grid.height)
-    points = common.canvas_point(columns + 0.5, rows + 0.5, grid.lens)[mask]
+    points = common.canvas_point(columns + 0.5, rows + 0.5, grid.lonlat)[mask]
     assert np.allclose(fine.positions(points), 2 * coarse.positions(points), atol=1e-4)
     assert fine.around(grid) == pytest.approx(2 * coarse.around(grid))
     if coarse.eye:
@@ -169,8 +169,8 @@ def test_a_wrapped_plane_has_one_copy_of_each_point() -> None:
     grid, mask = OVERLAPS["cylinder border"]
     found = pair_chart(mask, grid, grid)
     x = np.linspace(-70, 150, 441)
-    here = common.canvas_point(x, np.full_like(x, 20.0), grid.lens)
-    there = common.canvas_point(x + 77, np.full_like(x, 20.0), grid.lens)
+    here = common.canvas_point(x, np.full_like(x, 20.0), grid.lonlat)
+    there = common.canvas_point(x + 77, np.full_like(x, 20.0), grid.lonlat)
     u = common.chart_position(here, found.transform)[0]
     assert np.allclose(u, common.chart_position(there, found.transform)[0])
     assert u.min() >= 0
@@ -210,7 +210,7 @@ def test_twin_of_sample_is_bicubic() -> None:
     transform = np.zeros(16)
     transform[9:13] = 1.3, 1.2, -11.7, -9.1
     image, mask = chart_sample(
-        layer, (0, 0, 77, 53), plane().border, plane().lens, transform, (59, 31), FLOOR
+        layer, (0, 0, 77, 53), plane().border, plane().lonlat, transform, (59, 31), FLOOR
     )
     assert mask.all()
     for j, i in np.ndindex(31, 59):
@@ -247,7 +247,7 @@ def test_sample_equals_its_twin(device: Device, overlap: tuple[Grid, np.ndarray,
     level = chart.sample(device, on_device(device, pixels), grid, found)
     size = (found.width, found.height)
     image, mask = chart_sample(
-        pixels, (0, 0, grid.width, grid.height), grid.border, grid.lens, found.transform, size, FLOOR,
+        pixels, (0, 0, grid.width, grid.height), grid.border, grid.lonlat, found.transform, size, FLOOR,
         found.coarse,
     )  # fmt: skip
     assert level.grid == (*size, int(found.wraps), 0)
@@ -265,7 +265,7 @@ def test_sample_of_a_layer_with_a_box_equals_its_twin(device: Device) -> None:
     pixels = random_layer(2, 41, 23, 0.9)
     level = chart.sample(device, on_device(device, pixels, 9, 0), grid, found)
     image, expected = chart_sample(
-        pixels, (9, 0, 41, 23), grid.border, grid.lens, found.transform, (found.width, found.height), FLOOR
+        pixels, (9, 0, 41, 23), grid.border, grid.lonlat, found.transform, (found.width, found.height), FLOOR
     )
     same = level.mask.get() == expected
     assert (~same).mean() <= DECISIONS
@@ -304,7 +304,7 @@ def test_over_a_pole_a_chart_is_smooth(device: Device) -> None:
     """A scene that is smooth on the sphere is smooth on a chart over its pole: every tap was right."""
     grid = sphere(402, 201)
     columns, rows = common.pixels(grid.width, grid.height)
-    point = common.canvas_point(columns + 0.5, rows + 0.5, grid.lens)
+    point = common.canvas_point(columns + 0.5, rows + 0.5, grid.lonlat)
     brightness = 0.5 + 0.2 * point[..., 0] - 0.15 * point[..., 1] + 0.1 * point[..., 2]
     pixels = np.stack([brightness] * 3 + [np.ones_like(brightness)], -1).astype(np.float32)
     for y in (2, 199):

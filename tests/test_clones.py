@@ -32,8 +32,8 @@ def test_look_equals_its_twin(device: Device, name: str, shoulder: float) -> Non
     cells, colours = grid.resized(10, 7).border, grid.resized(5, 3).border
     box, part = (9, 1, grid.width - 9, grid.height - 1), (2, 1, 7, 5)
     field = ndimage.gaussian_filter(np.random.default_rng(1).normal(size=(box[3], box[2], 4)), (4, 4, 0))
-    field = (3 * field * (grid.lens[1] or 1)).astype(np.float32)
-    if not grid.lens[1]:
+    field = (3 * field * (grid.lonlat[1] or 1)).astype(np.float32)
+    if not grid.lonlat[1]:
         field[..., 2] = 0
     given = random_layer(20, box[2], box[3], 0.9), field, box
     gain = np.random.default_rng(9).normal(size=(3, 5, 4)).astype(np.float32)
@@ -41,9 +41,9 @@ def test_look_equals_its_twin(device: Device, name: str, shoulder: float) -> Non
     layer, field, gains = (device.upload(one) for one in (given[0], given[1], gain))
     device.run(
         "clones", "clones_look", part[2:],
-        layer, field, box, gains, grid.border, grid.lens, colours, cells, part, shoulder, out,
+        layer, field, box, gains, grid.border, grid.lonlat, colours, cells, part, shoulder, out,
     )  # fmt: skip
-    expected = clones_look(*given, gain, grid.border, grid.lens, colours, cells, shoulder)[1:6, 2:9]
+    expected = clones_look(*given, gain, grid.border, grid.lonlat, colours, cells, shoulder)[1:6, 2:9]
     assert (expected[..., 3] > 0).mean() > 0.4 and (expected[..., 3] < 1).any()
     # a pixel more or less at a mask's rim is one of some ten of a cell
     assert_close(out.get(), expected, 10 * POSITION, decisions=0.05)

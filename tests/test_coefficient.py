@@ -31,8 +31,8 @@ def brute_force(mask: np.ndarray, cover: np.ndarray, grid: Grid) -> np.ndarray:
     """Distance from every covered pixel to every seed, the nearest taken; in columns."""
     seeds = np.argwhere((cover > 0) & (mask == 0))
     pixels = np.argwhere(mask > 0)
-    if grid.lens[1]:
-        lon0, across, lat0, down = grid.lens
+    if grid.lonlat[1]:
+        lon0, across, lat0, down = grid.lonlat
 
         def vectors(places: np.ndarray) -> np.ndarray:
             lon, lat = lon0 + (places[:, 1] + 0.5) * across, lat0 - (places[:, 0] + 0.5) * down
@@ -57,7 +57,7 @@ def kernel_distance(device: Device, masks: list[np.ndarray], index: int, grid: G
 
 def unit(grid: Grid) -> float:
     """Columns per unit of distance, which is the radian on a sphere."""
-    return 1 / grid.lens[1] if grid.lens[1] else 1.0
+    return 1 / grid.lonlat[1] if grid.lonlat[1] else 1.0
 
 
 def table(device: Device, grid: Grid) -> Buffer:
@@ -94,9 +94,9 @@ def test_twin_of_distance_is_brute_force(name: str) -> None:
     assert np.array_equal(seed >= 0, (cover > 0) & (masks[0] == 0))
     everything = seed[seed >= 0]
     columns, rows = np.meshgrid(np.arange(grid.width), np.arange(grid.height))
-    far = np.stack([twin.between(columns, rows, s, grid.border, grid.lens) for s in everything])
+    far = np.stack([twin.between(columns, rows, s, grid.border, grid.lonlat) for s in everything])
     nearest = everything[far.argmin(0)]
-    result = twin.coefficient_distance(nearest, masks[0], grid.border, grid.lens, unit(grid), 1e9)
+    result = twin.coefficient_distance(nearest, masks[0], grid.border, grid.lonlat, unit(grid), 1e9)
     assert np.allclose(result, brute_force(masks[0], cover, grid), atol=1e-6)
 
 
@@ -113,14 +113,14 @@ def test_flood_equals_its_twin(device: Device, name: str, step: int) -> None:
         "coefficient", "coefficient_flood", grid.border[:2],
         device.upload(seed), grid.border, table(device, grid), step, flooded,
     )  # fmt: skip
-    kernel, expected = flooded.get(), twin.coefficient_flood(seed, grid.border, grid.lens, step)
+    kernel, expected = flooded.get(), twin.coefficient_flood(seed, grid.border, grid.lonlat, step)
     assert np.array_equal(kernel < 0, expected < 0)
     assert 0.05 < (kernel >= 0).mean() < 1
-    if not grid.lens[1]:
+    if not grid.lonlat[1]:
         assert np.array_equal(kernel, expected)
     full = np.ones(grid.shape)
     seeds = (kernel, expected)
-    far = [twin.coefficient_distance(s, full, grid.border, grid.lens, unit(grid), 0.0) for s in seeds]
+    far = [twin.coefficient_distance(s, full, grid.border, grid.lonlat, unit(grid), 0.0) for s in seeds]
     assert_close(far[0], far[1], TRIGONOMETRY)
 
 
@@ -148,13 +148,13 @@ def test_distance_equals_its_twin(device: Device, name: str) -> None:
     result = device.empty(grid.shape)
     device.run(
         "coefficient", "coefficient_distance", grid.border[:2],
-        device.upload(seed), device.upload(mask), grid.border, table(device, grid), int(grid.lens[1] > 0),
+        device.upload(seed), device.upload(mask), grid.border, table(device, grid), int(grid.lonlat[1] > 0),
         unit(grid), 321.5, result,
     )  # fmt: skip
-    expected = twin.coefficient_distance(seed, mask, grid.border, grid.lens, unit(grid), 321.5)
+    expected = twin.coefficient_distance(seed, mask, grid.border, grid.lonlat, unit(grid), 321.5)
     assert 321.5 in expected
     # opposite points of the sphere: their chord's square is all but 1, where asin magnifies rounding
-    opposite = (expected > 3 * unit(grid)) & (expected < 321) & (grid.lens[1] > 0)
+    opposite = (expected > 3 * unit(grid)) & (expected < 321) & (grid.lonlat[1] > 0)
     assert opposite.mean() < 0.1
     assert_close(result.get()[~opposite], expected[~opposite], TRIGONOMETRY)
     assert np.allclose(result.get()[opposite], expected[opposite], rtol=1e-3)
@@ -175,7 +175,7 @@ def test_furthest_where_nothing_lies_outside(device: Device, name: str) -> None:
     grid = GRIDS[name]
     mask = patches(5, grid.width, grid.height, 0.8).astype(np.uint8)
     kernel = kernel_distance(device, [mask, mask], 0, grid)
-    furthest = math.pi / grid.lens[1] if grid.lens[1] else math.hypot(grid.width, grid.height)
+    furthest = math.pi / grid.lonlat[1] if grid.lonlat[1] else math.hypot(grid.width, grid.height)
     assert np.allclose(kernel, mask * furthest, rtol=1e-6)
 
 
@@ -318,7 +318,7 @@ def test_turning_a_sphere_turns_the_distances(device: Device, shift: int) -> Non
 def test_rows_beyond_a_pole_are_half_a_turn_further() -> None:
     """The twin of the border rule, against the sphere: the pixel beyond is where the direction leads."""
     grid = sphere(78, 39)
-    lon0, across, lat0, down = grid.lens
+    lon0, across, lat0, down = grid.lonlat
     x, y = np.meshgrid(np.arange(-80, 160), np.r_[-39:0, 39:78])
     columns, rows, inside = grid_border(x, y, grid.border)
     assert inside.all()

@@ -35,8 +35,8 @@ def smooth_layer(seed: int, width: int, height: int, share: float = 0.85) -> np.
 def displacement(seed: int, box: tuple[int, int, int, int], grid: Grid) -> np.ndarray:
     random = np.random.default_rng(seed)
     field = ndimage.gaussian_filter(random.normal(size=(box[3], box[2], 4)), (4, 4, 0))
-    field *= 2 * (grid.lens[1] or 1) / np.abs(field).max()
-    if not grid.lens[1]:
+    field *= 2 * (grid.lonlat[1] or 1) / np.abs(field).max()
+    if not grid.lonlat[1]:
         field[..., 2] = 0
     field[: box[3] // 3, :, :3] = 0
     return field.astype(np.float32)
@@ -72,9 +72,9 @@ def test_difference_equals_its_twin(device: Device, name: str, shoulder: float, 
     results = [device.empty(shape) for shape in ((2, 5, 4), (2, 5, 4), (2, 5))]
     device.run(
         "colour", "colour_difference", (5, 2), *uploaded(device, sides),
-        grid.border, grid.lens, cells.border, PART, shoulder, *clipped, SPREAD, *results,
+        grid.border, grid.lonlat, cells.border, PART, shoulder, *clipped, SPREAD, *results,
     )  # fmt: skip
-    expected = colour_difference(*sides, grid.border, grid.lens, cells.border, shoulder, *clipped, SPREAD)
+    expected = colour_difference(*sides, grid.border, grid.lonlat, cells.border, shoulder, *clipped, SPREAD)
     if lamps:
         assert set(np.sign(expected[1][..., 3]).ravel()) >= {-1, 1}
     else:
@@ -92,9 +92,9 @@ def test_misfit_equals_its_twin(device: Device, name: str) -> None:
     result = device.empty((2, 5, 4))
     device.run(
         "colour", "colour_misfit", (5, 2), *uploaded(device, sides),
-        grid.border, grid.lens, cells.border, PART, shoulders, *CLIPPED, result,
+        grid.border, grid.lonlat, cells.border, PART, shoulders, *CLIPPED, result,
     )  # fmt: skip
-    expected = colour_misfit(*sides, grid.border, grid.lens, cells.border, shoulders, *CLIPPED)
+    expected = colour_misfit(*sides, grid.border, grid.lonlat, cells.border, shoulders, *CLIPPED)
     assert (expected > 1e-3).mean() > 0.4
     assert_close(result.get(), expected[OF_PART], 10 * POSITION, decisions=0.1)
 

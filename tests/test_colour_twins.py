@@ -20,7 +20,7 @@ def test_twin_of_misfit_knows_the_scale(shoulder: float) -> None:
     b[..., :3] = common.exposure_shift(a[..., :3], np.array([0.4, 0.2, 0.3]), shoulder)
     still, box, shoulders = np.zeros_like(a), (0, 0, 77, 53), (1.0, 0.75, 0.5, 0.25)
     sides = [a, still, box, b, still, box]
-    misfit = colour_misfit(*sides, grid.border, grid.lens, (7, 3, 0, 0), shoulders, *NEVER).sum((0, 1))
+    misfit = colour_misfit(*sides, grid.border, grid.lonlat, (7, 3, 0, 0), shoulders, *NEVER).sum((0, 1))
     right = shoulders.index(shoulder)
     assert misfit[right] < 1e-9
     assert (np.delete(misfit, right) > 1e-4).all()
@@ -38,7 +38,7 @@ def test_twin_of_difference_measures_a_gain(shoulder: float) -> None:
     still = np.zeros_like(a)
     box = (0, 0, 77, 53)
     result, *_ = colour_difference(
-        a, still, box, b, still, box, grid.border, grid.lens, (7, 3, 0, 0), shoulder, *NEVER, SPREAD
+        a, still, box, b, still, box, grid.border, grid.lonlat, (7, 3, 0, 0), shoulder, *NEVER, SPREAD
     )
     known = result[..., 3] > 0
     assert known.mean() > 0.8

@@ -392,9 +392,9 @@ def test_place_of_what_moved_does_not_get_what_touches_it(device: Device) -> Non
 def disc(grid: Grid, x: float, y: float, radius: float) -> np.ndarray:
     """Pixels within a radius (columns) of a place, on the sphere by angle."""
     columns, rows = common.pixels(grid.width, grid.height)
-    points = common.canvas_point(columns + 0.5, rows + 0.5, grid.lens)
-    middle = common.canvas_point(np.array(x), np.array(y), grid.lens)
-    if grid.lens[1]:
-        return np.arccos(np.clip(points @ middle, -1, 1)) < radius * grid.lens[1]
+    points = common.canvas_point(columns + 0.5, rows + 0.5, grid.lonlat)
+    middle = common.canvas_point(np.array(x), np.array(y), grid.lonlat)
+    if grid.lonlat[1]:
+        return np.arccos(np.clip(points @ middle, -1, 1)) < radius * grid.lonlat[1]
     away = np.abs(points[..., 0] - x)
     return np.hypot(np.minimum(away, grid.width - away) if grid.wraps else away, points[..., 1] - y) < radius

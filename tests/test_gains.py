@@ -39,9 +39,9 @@ def dense_gains(measured: Measured, strict: bool, unknown: np.ndarray) -> np.nda
     """The minimum of the sum in gains.py by least squares, of blocks where differences weigh little."""
     cells, inside = measured.grid, measured.inside
     (_, height, width), index = inside.shape, np.arange(inside.size).reshape(inside.shape)
-    latitude = cells.lens[2] - (np.arange(height) + 0.5) * cells.lens[3]
-    area = np.maximum(np.cos(latitude), 0.02) if cells.lens[1] else np.ones(height)
-    circle = 2 * math.pi / cells.lens[1] if cells.lens[1] else width
+    latitude = cells.lonlat[2] - (np.arange(height) + 0.5) * cells.lonlat[3]
+    area = np.maximum(np.cos(latitude), 0.02) if cells.lonlat[1] else np.ones(height)
+    circle = 2 * math.pi / cells.lonlat[1] if cells.lonlat[1] else width
     solution = np.zeros((*inside.shape, 3))
     blocks = np.zeros((inside.size, inside.size))
     for k, y, x in np.argwhere(inside):

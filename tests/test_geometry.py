@@ -34,7 +34,7 @@ def smooth_flow(seed: int, found: Chart, strength: float = 3.0) -> np.ndarray:
 
 def flow_error(grid: Grid) -> float:
     """How far displacements may be off: positions' rounding in px, in the unit of a point."""
-    return POSITION * (grid.lens[1] or 1.0)
+    return POSITION * (grid.lonlat[1] or 1.0)
 
 
 @pytest.mark.parametrize("wraps", [False, True])
@@ -72,11 +72,11 @@ def test_add_equals_its_twin(device: Device, name: str, first: int) -> None:
     chart_grid = (found.width, found.height, int(found.wraps), 0)
     device.run(
         "geometry", "geometry_add", (13, 19),
-        device.upload(blend), box_j, device.upload(layer), box, grid.border, grid.lens,
+        device.upload(blend), box_j, device.upload(layer), box, grid.border, grid.lonlat,
         device.upload(flow), chart_grid, found.transform, first, out,
     )  # fmt: skip
     expected = twin.geometry_add(
-        blend, box_j, layer, box, grid.lens, flow, chart_grid, found.transform, field
+        blend, box_j, layer, box, grid.lonlat, flow, chart_grid, found.transform, field
     )
     kernel = out.get()
     assert np.array_equal(kernel[..., 3], field[..., 3])
@@ -146,12 +146,12 @@ def test_reach_equals_its_twin(device: Device, name: str) -> None:
     field = np.random.default_rng(7).normal(size=(box[3], box[2], 4)).astype(np.float32) * 0.1
     field[5, 6, :3] = 0, 0, -9  # down to beside the south pole
     rows = device.empty((box[3], 2))
-    device.run("geometry", "geometry_reach", (box[3], 1), device.upload(field), box, grid.lens, rows)
-    expected = twin.geometry_reach(field, box, grid.lens)
+    device.run("geometry", "geometry_reach", (box[3], 1), device.upload(field), box, grid.lonlat, rows)
+    expected = twin.geometry_reach(field, box, grid.lonlat)
     by_hand = [max(math.hypot(*p[:3]) for p in row) for row in field.tolist()]
     assert np.allclose(expected[:, 0], by_hand)
-    if grid.lens[1]:
-        assert expected[5, 1] * grid.lens[3] > (math.pi / 2 if name == "sphere" else 1)
+    if grid.lonlat[1]:
+        assert expected[5, 1] * grid.lonlat[3] > (math.pi / 2 if name == "sphere" else 1)
     else:
         assert np.allclose(expected[:, 1], [max(abs(p[1]) for p in row) for row in field.tolist()])
     result = rows.get()
@@ -167,7 +167,7 @@ def test_reach_on_a_sphere_is_no_less_than_any_rows_way(device: Device) -> None:
     south = np.array([0, 0, -1]) - here * -here[..., 2:]
     turned = here * math.cos(0.8) + south / np.linalg.norm(south, axis=-1, keepdims=True) * math.sin(0.8)
     reach, moved = reached(device, grid, 0.5 * (turned - here), here, rows)
-    assert moved[60] == pytest.approx(0.4 / grid.lens[3], rel=1e-3)
+    assert moved[60] == pytest.approx(0.4 / grid.lonlat[3], rel=1e-3)
     assert (moved <= reach + POSITION).all()
 
 
@@ -179,14 +179,14 @@ def test_reach_holds_between_pixels_and_is_short_for_ways_to_the_side(device: De
     random = np.random.default_rng(seed)
     east = np.stack([-here[..., 1], here[..., 0], np.zeros(rows.shape)], -1)
     east /= np.linalg.norm(east, axis=-1, keepdims=True)
-    way = 8 * grid.lens[1] * random.uniform(-1, 1, (*rows.shape, 1)) * east
+    way = 8 * grid.lonlat[1] * random.uniform(-1, 1, (*rows.shape, 1)) * east
     reach, moved = reached(device, grid, way, here, rows)
     assert (moved <= reach + POSITION).all()
     assert reach[30:170].max() < 3.5 and reach[100] < 1.5
     columns, between = common.pixels(401, 200)
-    place = common.canvas_point(columns + 1, between + 1, grid.lens)
+    place = common.canvas_point(columns + 1, between + 1, grid.lonlat)
     mean = (way[1:, 1:] + way[1:, :-1] + way[:-1, 1:] + way[:-1, :-1]) / 4
-    _, y = common.canvas_position(place + mean, grid.lens)
+    _, y = common.canvas_position(place + mean, grid.lonlat)
     assert (np.abs(y - between - 1).max(1) <= np.maximum(reach[1:], reach[:-1]) + POSITION).all()
 
 
@@ -199,13 +199,13 @@ def test_reach_holds_where_neighbours_lead_to_both_sides(device: Device, middle:
     columns, _ = common.pixels(2048, 31)
     aside, north = np.where(columns % 2, -0.35, 0.35) * math.cos(middle), 0.23 * math.cos(middle)
     there = common.canvas_point(
-        columns + 0.5 + aside / step, rows + 0.5 - math.copysign(north, middle) / step, grid.lens
+        columns + 0.5 + aside / step, rows + 0.5 - math.copysign(north, middle) / step, grid.lonlat
     )
     way = there - here
     reach, moved = reached(device, grid, way, here, rows)
     assert (moved <= reach + POSITION).all()
-    between = common.canvas_point(columns[:, 1:] * 1.0, rows[:, 1:] + 0.5, grid.lens)
-    _, y = common.canvas_position(between + (way[:, 1:] + way[:, :-1]) / 2, grid.lens)
+    between = common.canvas_point(columns[:, 1:] * 1.0, rows[:, 1:] + 0.5, grid.lonlat)
+    _, y = common.canvas_position(between + (way[:, 1:] + way[:, :-1]) / 2, grid.lonlat)
     meant = np.abs(y - rows[:, 1:] - 0.5).max(1)
     assert (meant > moved + 0.5).all()
     assert (meant <= reach + POSITION).all()
@@ -217,7 +217,7 @@ def test_reach_of_rows_beyond_a_pole_is_that_of_their_directions(device: Device)
     grid = Grid(Box(0, 0, 200, 120), 200, 120, True, 0, (-math.pi, step, 60 * step, step))
     here, rows = centres(grid)
     columns, _ = common.pixels(200, 120)
-    way = common.canvas_point(columns + 0.8, rows + 0.5, grid.lens) - here
+    way = common.canvas_point(columns + 0.8, rows + 0.5, grid.lonlat) - here
     reach, moved = reached(device, grid, way, here, rows)
     assert moved.max() > 15 and (moved <= reach + POSITION).all()
 
@@ -225,7 +225,7 @@ def test_reach_of_rows_beyond_a_pole_is_that_of_their_directions(device: Device)
 def centres(grid: Grid) -> tuple[np.ndarray, np.ndarray]:
     """The points of a grid's pixels, and their rows."""
     columns, rows = common.pixels(grid.width, grid.height)
-    return common.canvas_point(columns + 0.5, rows + 0.5, grid.lens), rows
+    return common.canvas_point(columns + 0.5, rows + 0.5, grid.lonlat), rows
 
 
 def reached(
@@ -235,7 +235,7 @@ def reached(
     field = np.concatenate([way, np.ones((*rows.shape, 1))], -1).astype(np.float32)
     layer = on_device(device, np.ones(field.shape))
     found = geometry.reach(device, layer, device.upload(field), grid)
-    _, y = common.canvas_position(here + field[..., :3], grid.lens)
+    _, y = common.canvas_position(here + field[..., :3], grid.lonlat)
     return np.array(found), np.abs(y - rows - 0.5).max(1)
 
 
@@ -314,7 +314,7 @@ def test_displacement_over_the_pole_is_continuous(device: Device) -> None:
     from pixel to neighbour, also across row 0, half a turn further; and it is the chart's own way."""
     grid = sphere(402, 201)
     columns, rows = common.pixels(402, 201)
-    point = common.canvas_point(columns + 0.5, rows + 0.5, grid.lens)
+    point = common.canvas_point(columns + 0.5, rows + 0.5, grid.lonlat)
     near = np.arccos(point[..., 2]) < 0.4
     found = pair_chart(near, grid, grid)
     way = np.array([4.0, -3.0], np.float32)
@@ -325,7 +325,7 @@ def test_displacement_over_the_pole_is_continuous(device: Device) -> None:
         grid, Settings(),
     )  # fmt: skip
     d = fields[1].get()[..., :3].astype(np.float64)
-    step = grid.lens[1]
+    step = grid.lonlat[1]
     # 5 px of angle, half of it for this layer; stretched where the chart's rows are
     assert np.allclose(np.linalg.norm(d[near], axis=-1), 2.5 * step, rtol=0.1)
     across = np.linalg.norm(d[0] - np.roll(d[0], 201, 0), axis=-1)

@@ -107,7 +107,7 @@ def test_places_on_a_grid_come_back(name: str) -> None:
     for one in (grid, half):
         assert np.allclose(one.places(one.points(places)), places, atol=1e-9)
     points, coarse = grid.points(places), half.points(places)
-    scale = (half.width / grid.width, half.height / grid.height, 1) if not grid.lens[1] else 1
+    scale = (half.width / grid.width, half.height / grid.height, 1) if not grid.lonlat[1] else 1
     assert np.allclose(coarse, points * scale)
 
 
@@ -128,7 +128,7 @@ def test_guides_on_a_chart_are_where_kernels_put_them(name: str) -> None:
     assert placed.names == ("there", "back")
     for found, end in ((placed.at_a, ends[0]), (placed.at_b, ends[1])):
         x, y = np.array(end) - (grid.region.left, grid.region.top)
-        u, v = common.chart_position(common.canvas_point(x, y, grid.lens), chart.transform)
+        u, v = common.chart_position(common.canvas_point(x, y, grid.lonlat), chart.transform)
         assert np.allclose(found, [(u, v)] * 2, atol=1e-3)
     back = on_chart(pairs[0, 1], 1, chart, grid)
     assert np.array_equal(back.at_a, placed.at_b) and np.array_equal(back.at_b, placed.at_a)

@@ -61,15 +61,15 @@ def test_share_equals_its_twin(device: Device, name: str) -> None:
     out = device.empty((found.height, found.width)).fill(np.nan)
     device.run(
         "intermediate", "intermediate_share", (-(-found.width // 4), found.height),
-        device.upload(blend_a), box_a, device.upload(blend_b), box_b, grid.border, grid.lens, found.border,
+        device.upload(blend_a), box_a, device.upload(blend_b), box_b, grid.border, grid.lonlat, found.border,
         found.transform, out,
     )  # fmt: skip
     expected = twin.intermediate_share(
-        blend_a, box_a, blend_b, box_b, grid.border, grid.lens, found.border, found.transform
+        blend_a, box_a, blend_b, box_b, grid.border, grid.lonlat, found.border, found.transform
     )
     assert 0.1 < (expected == 0.5).mean() < 0.9
     u, v = common.pixels(found.width, found.height)
-    x, y = common.canvas_position(common.chart_point(u + 0.5, v + 0.5, found.transform), grid.lens)
+    x, y = common.canvas_position(common.chart_point(u + 0.5, v + 0.5, found.transform), grid.lonlat)
     within = (np.abs(x - np.rint(x)) > POSITION) & (np.abs(y - np.rint(y)) > POSITION)
     assert within.mean() > 0.8  # of the others rounding tells in which pixel they lie
     assert_close(out.get()[within], expected[within], SUM)

@@ -187,9 +187,9 @@ def guides_of(one: Shoot, first: int) -> list[Guide]:
     rows, columns = np.nonzero(one.person[0])
     chosen = slice(len(rows) // 4, None, len(rows) // 4)
     x, y = columns[chosen] + 0.5, rows[chosen] + 0.5
-    lens = (-np.pi, 1 / SCALE, np.pi / 2, 1 / SCALE)
-    points = common.canvas_point(x, y, lens) * PERSON.distance + PERSON.step - MOVE
-    ends = [np.stack([x, y], 1).tolist(), np.stack(common.canvas_position(points, lens), 1).tolist()]
+    lonlat = (-np.pi, 1 / SCALE, np.pi / 2, 1 / SCALE)
+    points = common.canvas_point(x, y, lonlat) * PERSON.distance + PERSON.step - MOVE
+    ends = [np.stack([x, y], 1).tolist(), np.stack(common.canvas_position(points, lonlat), 1).tolist()]
     pairs = zip(ends[first], ends[1 - first], strict=True)
     return [Guide(first, 1 - first, tuple(at_a), tuple(at_b)) for at_a, at_b in pairs]
 

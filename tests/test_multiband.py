@@ -71,10 +71,10 @@ def test_weights_and_finest_levels_equal_their_twins(device: Device, name: str, 
         given = (way, twin.NONE) if gain is None else (device.upload(gain), cells.border)
         device.run(
             "multiband", "multiband_finest", there[2:], device.upload(layer), way, box, grid.border,
-            grid.lens, total, *given, shoulder, there, half.border, level, share,
+            grid.lonlat, total, *given, shoulder, there, half.border, level, share,
         )  # fmt: skip
         found = twin.multiband_finest(
-            layer, field, box, grid.border, grid.lens, expected, gain, cells.border, shoulder, there,
+            layer, field, box, grid.border, grid.lonlat, expected, gain, cells.border, shoulder, there,
             half.border,
         )  # fmt: skip
         # a hundredth of a pixel's position, some tenth of full scale from one to the next
@@ -117,7 +117,7 @@ def test_reduced_levels_equal_their_twins(device: Device, name: str, part: str) 
             assert (valid > 0).any() and (part != "inside" or (valid == 0).any())
 
 
-@pytest.mark.parametrize("name", [name for name, grid in GRIDS.items() if grid.lens[1]])
+@pytest.mark.parametrize("name", [name for name, grid in GRIDS.items() if grid.lonlat[1]])
 @pytest.mark.parametrize("part", PARTS)
 def test_levels_are_spread_as_their_twins(device: Device, name: str, part: str) -> None:
     """Far at the poles, across the border where the grid wraps; hardly at all around the equator."""

@@ -77,8 +77,8 @@ def test_cells_beside_are_as_if_compared(device: Device, name: str, monkeypatch:
         pixels = random_layer(30 + number, *place[2:], 0.9)
         pixels[..., :3][patches(number, *place[2:], 0.3, 9) > 0] = 1  # clipped
         field = ndimage.gaussian_filter(np.random.default_rng(number).normal(size=pixels.shape), (4, 4, 0))
-        field *= 3 * (grid.lens[1] or 1)
-        field[..., 2] *= grid.lens[1] > 0
+        field *= 3 * (grid.lonlat[1] or 1)
+        field[..., 2] *= grid.lonlat[1] > 0
         field[..., 3] = np.abs(field[..., 3]) + 0.1
         covered[number][place[1] :, place[0] :][: place[3], : place[2]] = pixels[..., 3] > 0
         layers.append(on_device(device, pixels, *place[:2]))

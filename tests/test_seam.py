@@ -55,8 +55,8 @@ def test_difference_equals_its_twin(device: Device, name: str, shoulder: float, 
     for k, box in enumerate(((0, 0, 60, grid.height), (9, 1, grid.width - 9, grid.height - 1))):
         pixels = random_layer(20 + k, box[2], box[3], 0.9)
         field = ndimage.gaussian_filter(np.random.default_rng(k).normal(size=(box[3], box[2], 4)), (4, 4, 0))
-        field = (3 * field * (grid.lens[1] or 1)).astype(np.float32)
-        if not grid.lens[1]:
+        field = (3 * field * (grid.lonlat[1] or 1)).astype(np.float32)
+        if not grid.lonlat[1]:
             field[..., 2] = 0
         gain = np.random.default_rng(9 + k).normal(size=(3, 5, 4)).astype(np.float32)
         sides += [pixels, field, box, gain]
@@ -64,10 +64,10 @@ def test_difference_equals_its_twin(device: Device, name: str, shoulder: float, 
     out, square = device.empty((5, 7, 4)), device.empty((5, 7))
     uploaded = [device.upload(one) if isinstance(one, np.ndarray) else one for one in sides]
     device.run(
-        "seam", "seam_difference", part[2:], *uploaded, grid.border, grid.lens, colours, cells, part,
+        "seam", "seam_difference", part[2:], *uploaded, grid.border, grid.lonlat, colours, cells, part,
         shoulder, *clipped, out, square,
     )  # fmt: skip
-    expected, squares = seam_difference(*sides, grid.border, grid.lens, colours, cells, shoulder, *clipped)
+    expected, squares = seam_difference(*sides, grid.border, grid.lonlat, colours, cells, shoulder, *clipped)
     assert (expected[..., 3] > 0).mean() > 0.4
     assert (squares > 1.5 * np.square(expected[..., :3]).max(-1)).any()
     # a pixel more or less at a mask's rim is one of some ten of a cell
@@ -114,17 +114,17 @@ def test_what_stays_equals_its_twin(device: Device, name: str) -> None:
     box = (0, 0, grid.width, grid.height)
     layer = random_layer(20, grid.width, grid.height, 0.9)
     field = ndimage.gaussian_filter(np.random.default_rng(3).normal(size=(*grid.shape, 4)), (4, 4, 0))
-    field = (60 * field * (grid.lens[1] or 1)).astype(np.float32)
-    if not grid.lens[1]:
+    field = (60 * field * (grid.lonlat[1] or 1)).astype(np.float32)
+    if not grid.lonlat[1]:
         field[..., 2] = 0
     taken = (patches(2, 10, 7, 0.7, 2) > 0).astype(np.uint8)
     out = device.upload(field)
     device.run(
-        "seam", "seam_stay", box[2:], device.upload(layer), out, box, grid.border, grid.lens,
+        "seam", "seam_stay", box[2:], device.upload(layer), out, box, grid.border, grid.lonlat,
         device.upload(taken), cells.border,
     )  # fmt: skip
-    expected = seam_stay(layer, field, box, grid.border, grid.lens, taken, cells.border)
-    scale = grid.lens[1] or 1
+    expected = seam_stay(layer, field, box, grid.border, grid.lonlat, taken, cells.border)
+    scale = grid.lonlat[1] or 1
     assert_close(out.get() / scale, expected / scale, 10 * POSITION, decisions=0.02)
     changed = (np.abs(expected - field)[..., :3] > 0.1 * scale).any(-1)
     assert 0.01 < changed.mean() < 0.5
@@ -138,7 +138,7 @@ def test_what_stays_moves_along_the_border(device: Device) -> None:
     field[..., :2] = -8.5, -3.25
     layer, out, box = device.upload(np.ones_like(field)), device.upload(field), (0, 0, 60, 40)
     device.run(
-        "seam", "seam_stay", box[2:], layer, out, box, grid.border, grid.lens, device.upload(everything),
+        "seam", "seam_stay", box[2:], layer, out, box, grid.border, grid.lonlat, device.upload(everything),
         grid.resized(8, 5).border,
     )  # fmt: skip
     y, x = np.mgrid[:40, :60] + 0.5

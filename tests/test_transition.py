@@ -73,10 +73,10 @@ def test_parallax_equals_its_twin(device: Device, name: str) -> None:
     device.run(
         "transition", "transition_parallax", cells.border[:2], *(device.upload(one) for one in flows),
         chart_grid, chart.transform, *(device.upload(one) for one in masks), mask_grid.border,
-        grid.border, grid.lens, cells.border, found,
+        grid.border, grid.lonlat, cells.border, found,
     )  # fmt: skip
     expected = twin.transition_parallax(
-        flows, chart_grid, chart.transform, masks, grid.border, grid.lens, cells.border, before
+        flows, chart_grid, chart.transform, masks, grid.border, grid.lonlat, cells.border, before
     )
     assert 0.3 < (expected > before).mean() < 1
     assert_close(found.get(), expected, 100 * POSITION)

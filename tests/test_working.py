@@ -261,7 +261,7 @@ def test_the_region_is_the_layers_bounding_box() -> None:
     grid = working.full_grid(Canvas.plane(500, 300), boxes((40, 20, 90, 70), (60, 10, 200, 50)))
     assert grid.region == Box(40, 10, 200, 70)
     assert (grid.width, grid.height, grid.wraps, grid.poles) == (160, 60, False, 0)
-    assert grid.lens == PLANE
+    assert grid.lonlat == PLANE
 
 
 @pytest.mark.parametrize(("top", "bottom", "poles"), [(0, 401, 3), (0, 400, 1), (1, 401, 2), (30, 300, 0)])
@@ -269,8 +269,8 @@ def test_poles_are_known_where_layers_reach_them(top: int, bottom: int, poles: i
     grid = working.full_grid(SPHERE, boxes((100, top, 300, bottom), (400, 50, 600, 90)))
     assert grid.region == Box(0, top, 802, bottom)
     assert (grid.wraps, grid.poles) == (True, poles)
-    assert grid.lens[0] == pytest.approx(-math.pi)
-    assert grid.lens[2] == pytest.approx(math.pi / 2 - top * math.pi / 401)
+    assert grid.lonlat[0] == pytest.approx(-math.pi)
+    assert grid.lonlat[2] == pytest.approx(math.pi / 2 - top * math.pi / 401)
 
 
 def test_a_canvas_of_odd_width_has_no_row_beyond_the_pole() -> None:
@@ -304,7 +304,7 @@ def test_half_of_a_turn_is_whole_columns_of_coarser_grids(pixels: int) -> None:
         assert flat.coarser(pixels).width == round(width / pixels)
     sphere = working.full_grid(Canvas.sphere(2050, 1025), boxes((0, 0, 2050, 1025)))
     assert (sphere.coarser(2).width, sphere.coarser(2).poles) == (1026, 3)
-    assert sphere.coarser(2).lens[1] * 1026 == pytest.approx(2 * math.pi)
+    assert sphere.coarser(2).lonlat[1] * 1026 == pytest.approx(2 * math.pi)
 
 
 @pytest.mark.parametrize("size", [(100_000, 20), (20, 70_000), (100_000, 50_000), (300_000, 3)])
@@ -319,9 +319,9 @@ def test_resizing_a_sphere_keeps_its_edges() -> None:
     full = working.full_grid(SPHERE, boxes((0, 0, 802, 401)))
     grid = full.resized(77, 53)
     for field in (0, 2):
-        assert grid.lens[field] == full.lens[field]
-    assert grid.lens[1] * 77 == pytest.approx(2 * math.pi)
-    assert grid.lens[3] * 53 == pytest.approx(math.pi)
+        assert grid.lonlat[field] == full.lonlat[field]
+    assert grid.lonlat[1] * 77 == pytest.approx(2 * math.pi)
+    assert grid.lonlat[3] * 53 == pytest.approx(math.pi)
     assert grid.circumference == 2 * math.pi
     assert grid_over(full.region, 77, 53).circumference == 77
 

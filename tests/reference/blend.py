@@ -84,12 +84,12 @@ def read_field(field: Array, box: Sequence[int], x: Array, y: Array, border: Seq
     return total
 
 
-def position(x: Array, y: Array, displacement: Array, scale: Numbers, lens: Numbers) -> tuple[Array, Array]:
+def position(x: Array, y: Array, displacement: Array, scale: Numbers, lonlat: Numbers) -> tuple[Array, Array]:
     """Where a layer is sampled for full-resolution positions."""
-    if not lens[1]:
+    if not lonlat[1]:
         return x + displacement[..., 0] * scale[0], y + displacement[..., 1] * scale[1]
-    there_x, there_y = canvas_position(canvas_point(x, y, lens) + displacement, lens)
-    turn = 2 * np.pi / lens[1]  # the copy that is nearest
+    there_x, there_y = canvas_position(canvas_point(x, y, lonlat) + displacement, lonlat)
+    turn = 2 * np.pi / lonlat[1]  # the copy that is nearest
     return there_x - turn * np.rint((there_x - x) / turn), there_y
 
 
@@ -146,7 +146,7 @@ def blend_band(
     gains: Sequence[Array | None],
     offsets: Sequence[tuple[Sequence[int], Array] | None],
     border: Sequence[int],
-    lens: Numbers,
+    lonlat: Numbers,
     field_border: Sequence[int],
     gain_border: Sequence[int],
     offset_border: Sequence[int],
@@ -182,7 +182,7 @@ def blend_band(
         if offset is not None:
             raised = read(offset[1], offset[0], offset_border)[..., :3]
         own = take(opaque_, place, columns, rows)
-        colour = sample(opaque_, place, *position(x, y, f[..., :3], scale, lens), border, nearest, white)
+        colour = sample(opaque_, place, *position(x, y, f[..., :3], scale, lonlat), border, nearest, white)
         colour = np.where(f[..., :3].any(-1, keepdims=True), colour, own)
         looks = [correct(c[..., :3], exposure, raised, white, shoulder) for c in (own, colour)]
         some = ((exposure != 0) | (raised != 0)).any(-1)

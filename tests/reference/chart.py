@@ -31,7 +31,7 @@ def chart_sample(
     layer: Array,
     box: Sequence[int],
     border: Sequence[int],
-    lens: Numbers,
+    lonlat: Numbers,
     chart: Numbers,
     size: Sequence[int],
     floor_value: float,
@@ -39,7 +39,7 @@ def chart_sample(
 ) -> tuple[Array, Array]:
     """Log brightness and mask (height, width) of a layer on a chart."""
     columns, rows = pixels(size[0], size[1])
-    x, y = canvas_position(chart_point(columns + 0.5, rows + 0.5, chart), lens)
+    x, y = canvas_position(chart_point(columns + 0.5, rows + 0.5, chart), lonlat)
     whole, fraction = [], []
     for position in (x - 0.5, y - 0.5):
         nearest = np.rint(position)

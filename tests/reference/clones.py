@@ -15,13 +15,13 @@ def clones_look(
     box: Sequence[int],
     gain: Array,
     border: Sequence[int],
-    lens: Numbers,
+    lonlat: Numbers,
     colours: Sequence[int],
     cells: Sequence[int],
     shoulder: float,
 ) -> Array:
     """Mean corrected colour, as seen, of every cell's pixels, every other one in x and y, and their share."""
-    seen, look = layer_look(layer, field, box, gain, border, lens, colours, cells, shoulder)
+    seen, look = layer_look(layer, field, box, gain, border, lonlat, colours, cells, shoulder)
     shown = seen[..., 3] > 0
     result = np.zeros((cells[1], cells[0], 4))
     for place, part in cell_parts(border, cells, 2):

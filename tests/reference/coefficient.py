@@ -33,18 +33,18 @@ def packed(shape: tuple[int, int]) -> Array:
     return np.arange(shape[1])[None, :] + 65536 * np.arange(shape[0])[:, None]
 
 
-def between(x: Array, y: Array, place: Array, grid: Sequence[int], lens: Numbers) -> Array:
+def between(x: Array, y: Array, place: Array, grid: Sequence[int], lonlat: Numbers) -> Array:
     """Distance in mask px from pixels to packed places; on the sphere an angle in radians."""
     sx, sy = place % 65536, place // 65536
-    if not lens[1]:
+    if not lonlat[1]:
         dx = np.abs(x - sx)
         return np.hypot(np.minimum(dx, grid[0] - dx) if grid[2] else dx, y - sy)
-    here, there = canvas_point(x + 0.5, y + 0.5, lens), canvas_point(sx + 0.5, sy + 0.5, lens)
+    here, there = canvas_point(x + 0.5, y + 0.5, lonlat), canvas_point(sx + 0.5, sy + 0.5, lonlat)
     chord = np.linalg.norm(here - there, axis=-1)
     return 2 * np.arcsin(np.minimum(1, chord / 2))
 
 
-def coefficient_flood(seed: Array, grid: Sequence[int], lens: Numbers, step: int) -> Array:
+def coefficient_flood(seed: Array, grid: Sequence[int], lonlat: Numbers, step: int) -> Array:
     """Each pixel's nearest seed among those that it and its eight neighbours at `step` know."""
     x, y = pixels(grid[0], grid[1])
     best, nearest = np.full(seed.shape, -1), np.full(seed.shape, np.inf)
@@ -52,18 +52,18 @@ def coefficient_flood(seed: Array, grid: Sequence[int], lens: Numbers, step: int
         for dx in (-step, 0, step):
             px, py, inside = grid_border(x + dx, y + dy, grid)
             found = np.where(inside, seed[np.where(inside, py, 0), np.where(inside, px, 0)], -1)
-            far = np.where(found >= 0, between(x, y, np.maximum(found, 0), grid, lens), np.inf)
+            far = np.where(found >= 0, between(x, y, np.maximum(found, 0), grid, lonlat), np.inf)
             closer = (far < nearest) | ((far == nearest) & (found >= 0) & (found < best))
             best, nearest = np.where(closer, found, best), np.where(closer, far, nearest)
     return best.astype(np.int32)
 
 
 def coefficient_distance(
-    seed: Array, mask: Array, grid: Sequence[int], lens: Numbers, unit: float, furthest: float
+    seed: Array, mask: Array, grid: Sequence[int], lonlat: Numbers, unit: float, furthest: float
 ) -> Array:
     """D_k in working pixels on the mask grid; unit: working px per mask px, or per radian."""
     x, y = pixels(grid[0], grid[1])
-    inside = np.where(seed >= 0, unit * between(x, y, np.maximum(seed, 0), grid, lens), furthest)
+    inside = np.where(seed >= 0, unit * between(x, y, np.maximum(seed, 0), grid, lonlat), furthest)
     return np.where(mask != 0, inside, 0.0)
 
 

@@ -33,7 +33,7 @@ def colour_difference(
     field_b: Array,
     box_b: Sequence[int],
     border: Sequence[int],
-    lens: Numbers,
+    lonlat: Numbers,
     cells: Sequence[int],
     shoulder: float,
     clipped_a: Numbers,
@@ -44,7 +44,7 @@ def colour_difference(
     those that one layer shows clipped, where these are most; and how far both layers are seen.
     """
     sides = ((layer_a, field_a, box_a), (layer_b, field_b, box_b))
-    a, b, clips_a, clips_b, known = _seen(*sides, border, lens, clipped_a, clipped_b)
+    a, b, clips_a, clips_b, known = _seen(*sides, border, lonlat, clipped_a, clipped_b)
     columns, rows = pixels(border[0], border[1])
     s, t = (take(field, box, columns, rows)[..., 3].astype(np.float64) for _, field, box in sides)
     mixed = np.where(known, 4 * s * t / np.maximum((s + t) ** 2, 1e-20), 0)
@@ -78,7 +78,7 @@ def colour_misfit(
     field_b: Array,
     box_b: Sequence[int],
     border: Sequence[int],
-    lens: Numbers,
+    lonlat: Numbers,
     cells: Sequence[int],
     shoulders: Numbers,
     clipped_a: Numbers,
@@ -86,7 +86,7 @@ def colour_misfit(
 ) -> Array:
     """What the best gain of a cell leaves of the difference, by weighted least squares on each scale."""
     sides = ((layer_a, field_a, box_a), (layer_b, field_b, box_b))
-    a, b, clips_a, clips_b, known = _seen(*sides, border, lens, clipped_a, clipped_b)
+    a, b, clips_a, clips_b, known = _seen(*sides, border, lonlat, clipped_a, clipped_b)
     a, b = np.maximum(a, EXPOSURE_FLOOR), np.maximum(b, EXPOSURE_FLOOR)
     result = np.zeros((cells[1], cells[0], len(shoulders)))
     for place, part in cell_parts(border, cells, 4):
@@ -107,13 +107,13 @@ def _seen(
     side_a: Side,
     side_b: Side,
     border: Sequence[int],
-    lens: Numbers,
+    lonlat: Numbers,
     clipped_a: Numbers,
     clipped_b: Numbers,
 ) -> tuple[Array, Array, Array, Array, Array]:
     """Colours of both aligned layers, where each is clipped, and where both are."""
     columns, rows = pixels(border[0], border[1])
-    a, b = (layer_seen(*side, columns, rows, border, lens) for side in (side_a, side_b))
+    a, b = (layer_seen(*side, columns, rows, border, lonlat) for side in (side_a, side_b))
     clips = (
         (one[..., :3] > np.float32(limit)[:3]).any(-1) for one, limit in ((a, clipped_a), (b, clipped_b))
     )

@@ -75,17 +75,17 @@ def _direction(lon: Array, lat: Array) -> Array:
     return np.stack([np.cos(lat) * np.sin(lon), np.cos(lat) * np.cos(lon), np.sin(lat)], -1)
 
 
-def canvas_point(x: Array, y: Array, lens: Numbers) -> Array:
+def canvas_point(x: Array, y: Array, lonlat: Numbers) -> Array:
     """Points in the scene of canvas positions."""
-    lon0, across, lat0, down = np.asarray(lens, np.float64)
+    lon0, across, lat0, down = np.asarray(lonlat, np.float64)
     if across == 0:
         return np.stack([x, y, np.zeros_like(x)], -1).astype(np.float64)
     return _direction(lon0 + x * across, lat0 - y * down)
 
 
-def canvas_position(point: Array, lens: Numbers) -> tuple[Array, Array]:
+def canvas_position(point: Array, lonlat: Numbers) -> tuple[Array, Array]:
     """Canvas positions of points, not necessarily of unit length."""
-    lon0, across, lat0, down = np.asarray(lens, np.float64)
+    lon0, across, lat0, down = np.asarray(lonlat, np.float64)
     if across == 0:
         return point[..., 0], point[..., 1]
     unit = point / np.linalg.norm(point, axis=-1, keepdims=True)
@@ -114,12 +114,12 @@ def chart_position(point: Array, chart: Numbers) -> tuple[Array, Array]:
 
 
 def layer_seen(
-    layer: Array, field: Array, box: Sequence[int], x: Array, y: Array, border: Sequence[int], lens: Numbers
+    layer: Array, field: Array, box: Sequence[int], x: Array, y: Array, border: Sequence[int], lonlat: Numbers
 ) -> Array:
     """layer_sample at layer_position: what a layer shows for working pixels (x, y), r, g, b, valid."""
     way = take(field, box, x, y)[..., :3]
     own = take(layer, box, x, y)[..., 3] != 0
-    px, py = canvas_position(canvas_point(x + 0.5, y + 0.5, lens) + way, lens)
+    px, py = canvas_position(canvas_point(x + 0.5, y + 0.5, lonlat) + way, lonlat)
     still = ~way.any(-1)
     px, py = np.where(still, x + 0.5, px), np.where(still, y + 0.5, py)
     total = 0.0
@@ -152,7 +152,7 @@ def layer_look(
     box: Sequence[int],
     gain: Array,
     border: Sequence[int],
-    lens: Numbers,
+    lonlat: Numbers,
     colours: Sequence[int],
     cells: Sequence[int],
     shoulder: float,
@@ -166,7 +166,7 @@ def layer_look(
         np.searchsorted(np.arange(1, c + 1) * b // c, np.arange(b), "right")
         for b, c in zip(border, cells, strict=False)
     ]
-    seen = layer_seen(layer, field, box, columns, rows, border, lens)
+    seen = layer_seen(layer, field, box, columns, rows, border, lonlat)
     here = gain[gain_row[cell[1]][:, None], gain_column[cell[0]][None], :3].astype(np.float64)
     shifted = exposure_shift(seen[..., :3], here, shoulder)
     return seen, shifted if shoulder else np.sqrt(np.maximum(shifted, 0))

@@ -34,7 +34,7 @@ def geometry_add(
     box_j: Sequence[int],
     layer_k: Array,
     box_k: Sequence[int],
-    lens: Numbers,
+    lonlat: Numbers,
     flow: Array,
     grid: Sequence[int],
     chart: Numbers,
@@ -44,7 +44,7 @@ def geometry_add(
     x, y = pixels(box_k[2], box_k[3], box_k[0], box_k[1])
     weight = np.where(layer_k[..., 3] != 0, take(blend_j, box_j, x, y), 0.0)
     weight[weight < NEGLIGIBLE] = 0
-    point = canvas_point(x + 0.5, y + 0.5, lens)
+    point = canvas_point(x + 0.5, y + 0.5, lonlat)
     u, v = chart_position(point, chart)
     moved = flow_at(flow, u, v, grid)
     way = chart_point(u + moved[..., 0], v + moved[..., 1], chart) - chart_point(u, v, chart)
@@ -82,9 +82,9 @@ def geometry_softmax(field: Array, blend: Array, box: Sequence[int], highest: Ar
     return result
 
 
-def geometry_reach(field: Array, box: Sequence[int], lens: Numbers) -> Array:
+def geometry_reach(field: Array, box: Sequence[int], lonlat: Numbers) -> Array:
     """The longest way of each row, and how many rows its ways lead up or down at most: (height, 2)."""
     x, y = pixels(box[2], box[3], box[0], box[1])
     way = field[..., :3].astype(np.float64)
-    _, there = canvas_position(canvas_point(x + 0.5, y + 0.5, lens) + way, lens)
+    _, there = canvas_position(canvas_point(x + 0.5, y + 0.5, lonlat) + way, lonlat)
     return np.stack([np.linalg.norm(way, axis=-1).max(1), np.abs(there - y - 0.5).max(1)], -1)

@@ -29,13 +29,13 @@ def intermediate_share(
     blend_b: Array,
     box_b: Sequence[int],
     border: Sequence[int],
-    lens: Numbers,
+    lonlat: Numbers,
     grid: Sequence[int],
     chart: Numbers,
 ) -> Array:
     """w_b / (w_a + w_b) in the pixels of the working grid in which a chart's centres lie."""
     u, v = pixels(grid[0], grid[1])
-    x, y = canvas_position(chart_point(u + 0.5, v + 0.5, chart), lens)
+    x, y = canvas_position(chart_point(u + 0.5, v + 0.5, chart), lonlat)
     column, row, inside = grid_border(np.floor(x).astype(int), np.floor(y).astype(int), border)
     a, b = (take(blend, box, column, row, inside) for blend, box in ((blend_a, box_a), (blend_b, box_b)))
     some = a + b > 1e-5

@@ -64,7 +64,7 @@ def multiband_finest(
     field: Array,
     box: Sequence[int],
     border: Sequence[int],
-    lens: Numbers,
+    lonlat: Numbers,
     total: Array,
     gain: Array | None,
     colours: Sequence[int],
@@ -81,7 +81,7 @@ def multiband_finest(
     way = np.zeros((*x.shape, 4))
     for column, row, weight in four_taps(x, y):
         way += weight[..., None] * take(counted, box, *grid_border(column, row, border))
-    there = canvas_position(canvas_point(x, y, lens) + way[..., :3], lens)
+    there = canvas_position(canvas_point(x, y, lonlat) + way[..., :3], lonlat)
     moved = way[..., :3].any(-1)
     seen = np.zeros((*x.shape, 4))
     for column, row, weight in four_taps(

@@ -29,7 +29,7 @@ def seam_difference(
     box_b: Sequence[int],
     gain_b: Array,
     border: Sequence[int],
-    lens: Numbers,
+    lonlat: Numbers,
     colours: Sequence[int],
     cells: Sequence[int],
     shoulder: float,
@@ -42,7 +42,7 @@ def seam_difference(
     usable = np.ones((border[1], border[0]), bool)
     sides = (layer_a, field_a, box_a, gain_a, clipped_a), (layer_b, field_b, box_b, gain_b, clipped_b)
     for *side, clipped in sides:
-        seen, look = layer_look(*side, border, lens, colours, cells, shoulder)
+        seen, look = layer_look(*side, border, lonlat, colours, cells, shoulder)
         usable &= (seen[..., 3] > 0) & (seen[..., :3] <= np.float32(clipped)[:3]).all(-1)
         looks.append(look)
     result, square = np.zeros((cells[1], cells[0], 4)), np.zeros((cells[1], cells[0]))
@@ -77,7 +77,7 @@ def seam_stay(
     field: Array,
     box: Sequence[int],
     border: Sequence[int],
-    lens: Numbers,
+    lonlat: Numbers,
     taken: Array,
     cells: Sequence[int],
 ) -> Array:
@@ -89,10 +89,10 @@ def seam_stay(
         np.minimum(np.floor(y * cells[1] / border[1]).astype(int), cells[1] - 1),
         np.minimum(np.floor(x * cells[0] / border[0]).astype(int), cells[0] - 1),
     ]
-    own = canvas_point(x, y, lens)
-    there_x, there_y = canvas_position(own + field[..., :3], lens)
-    if lens[1]:
-        around = 2 * np.pi / lens[1]
+    own = canvas_point(x, y, lonlat)
+    there_x, there_y = canvas_position(own + field[..., :3], lonlat)
+    if lonlat[1]:
+        around = 2 * np.pi / lonlat[1]
         there_x = there_x - around * np.round((there_x - x) / around)
     inside_x = there_x if border[2] else there_x.clip(0.5, border[0] - 0.5)
     top, bottom = -np.inf if border[3] & 1 else 0.5, np.inf if border[3] & 2 else border[1] - 0.5
@@ -100,11 +100,11 @@ def seam_stay(
     its = (its > 0) & (layer[..., 3] > 0)
     moved = its & ((inside_x != there_x) | (inside_y != there_y))
     result = field.astype(np.float64)
-    result[moved, :3] = (canvas_point(inside_x, inside_y, lens) - own)[moved]
+    result[moved, :3] = (canvas_point(inside_x, inside_y, lonlat) - own)[moved]
 
     def shown(part: Array) -> Array:
         there = np.concatenate([part[..., None] * result[..., :3], result[..., 3:]], -1).astype(np.float32)
-        return layer_seen(layer, there, box, columns, rows, border, lens)[..., 3] > 0
+        return layer_seen(layer, there, box, columns, rows, border, lonlat)[..., 3] > 0
 
     part = np.ones(its.shape)
     short = its & ~shown(part)

@@ -17,7 +17,7 @@ def transition_parallax(
     chart: Numbers,
     masks: Sequence[Array],
     border: Sequence[int],
-    lens: Numbers,
+    lonlat: Numbers,
     cells: Sequence[int],
     parallax: Array,
 ) -> Array:
@@ -25,7 +25,7 @@ def transition_parallax(
 
     masks: of both layers, any (height, width) over the same region.
     """
-    lens, chart = np.asarray(lens, np.float64), np.asarray(chart, np.float64)
+    lonlat, chart = np.asarray(lonlat, np.float64), np.asarray(chart, np.float64)
     longest = np.asarray(parallax, np.float64)
     columns, rows = pixels(cells[0], cells[1])
     for down in (0.25, 0.75):
@@ -34,11 +34,11 @@ def transition_parallax(
             height, width = masks[0].shape
             there = np.floor(y * height).astype(int), np.floor(x * width).astype(int)
             both = (masks[0][there] != 0) & (masks[1][there] != 0)
-            point = canvas_point(x * border[0], y * border[1], lens)
+            point = canvas_point(x * border[0], y * border[1], lonlat)
             at = chart_position(point, chart)
             for flow in flows:
                 total, share = bilinear(flow, chart_grid, *at)
-                found = total / np.maximum(share, 1e-6)[..., None] / chart[9:11] / (lens[1] or 1)
+                found = total / np.maximum(share, 1e-6)[..., None] / chart[9:11] / (lonlat[1] or 1)
                 longest = np.where(both, np.maximum(longest, (found**2).sum(-1)), longest)
     return longest
 
