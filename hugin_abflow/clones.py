@@ -309,7 +309,7 @@ def _look(
     shown = device.empty((part.height, part.width, 4))
     device.run(
         "clones", "clones_look", (part.width, part.height),
-        layer.pixels, fields[k], layer.box, gain, grid.border, grid.lens, colours.border, cells.border,
+        layer.pixels, fields[k], layer.box, gain, grid.border, grid.lonlat, colours.border, cells.border,
         part.place, correction.shoulder, shown,
     )  # fmt: skip
     look = np.zeros((*cells.shape, 4), np.float32)

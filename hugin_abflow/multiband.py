@@ -129,7 +129,7 @@ def _finest(
     gain = correction.gains[index]
     device.run(
         "multiband", "multiband_finest", level.box[2:],
-        layer.pixels, field, layer.box, grid.border, grid.lens, total,
+        layer.pixels, field, layer.box, grid.border, grid.lonlat, total,
         gain or field, correction.grid.border if gain else _NONE, correction.shoulder,
         level.box, half.border, level.colours, level.share,
     )  # fmt: skip
@@ -223,7 +223,7 @@ def _reduced(device: Device, level: _Level, grid: Grid, widths: Widths) -> _Leve
 
 def _spread(device: Device, level: _Level, widths: Widths) -> _Level:
     """The same, on a sphere as smooth along its rows as across them."""
-    if not level.grid.lens[1]:
+    if not level.grid.spherical:
         return level
     spread = _empty(device, level.grid, level.box)
     device.run(
@@ -268,7 +268,7 @@ def _empty(device: Device, grid: Grid, box: Place) -> _Level:
 
 def _widths(grid: Grid) -> Widths:
     """How widely each row of a sphere's grid is smoothed, in columns, to be as smooth along as across it."""
-    if not grid.lens[1]:
+    if not grid.spherical:
         return np.zeros(grid.height, np.float32)
     slope = np.abs(np.tan(grid.latitudes))  # sqrt(1 / cos^2 - 1): the rest has been done by the reduction
     return np.asarray(np.clip(slope, _LEAST_SPREAD, _MOST_SPREAD * grid.width), np.float32)

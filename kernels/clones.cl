@@ -4,7 +4,7 @@
    it shows, and the share of these. */
 __kernel void clones_look(__global const float4 *layer, __global const float4 *field, int4 box,
                           __global const float4 *gain, /* (colours.y, colours.x) */
-                          int4 border, float4 lens,    /* working grid */
+                          int4 border, float4 lonlat,  /* working grid */
                           int4 colours, int4 cells,    /* grid of the gains; seam grid */
                           int4 part,                   /* cells that are looked at, run size */
                           float shoulder,              /* of the exposure scale */
@@ -22,7 +22,7 @@ __kernel void clones_look(__global const float4 *layer, __global const float4 *f
         for (int x = its.x; x < its.z; x += 2) {
             tried += 1.0f;
             float4 c;
-            if (!layer_shown(layer, field, box, (int2)(x, y), border, lens, &c))
+            if (!layer_shown(layer, field, box, (int2)(x, y), border, lonlat, &c))
                 continue;
             sum += exposure_look(c.xyz, gain[g].xyz, shoulder);
             n += 1.0f;

@@ -46,7 +46,7 @@ __kernel void multiband_weights(__global const float4 *layer, __global const flo
 /* What a layer shows, aligned and corrected, and the share of all weight that is its own, on half the working grid:
    at the corners of four working pixels, as the mean of these. Floats are blended by their logarithms. */
 __kernel void multiband_finest(__global const float4 *layer, __global const float4 *field, /* (box.w, box.z) */
-                               int4 box, int4 border, float4 lens, /* place; working grid */
+                               int4 box, int4 border, float4 lonlat, /* place; working grid */
                                __global const float *total,        /* (border.y, border.x), of multiband_weights */
                                __global const float4 *gain,        /* (colours.y, colours.x) */
                                int4 colours,                       /* colour grid; width 0: no gain */
@@ -70,7 +70,7 @@ __kernel void multiband_finest(__global const float4 *layer, __global const floa
             if (all > 0.0f && layer[at].w > 0.0f)
                 way += (i ? t.x : 1.0f - t.x) * (j ? t.y : 1.0f - t.y) * (float4)(field[at].xyz, field[at].w / all);
         }
-    float4 seen = layer_sample(layer, box, layer_position(q, way.xyz, lens), border);
+    float4 seen = layer_sample(layer, box, layer_position(q, way.xyz, lonlat), border);
     const bool valid = seen.w > 0.0f;
     if (valid && colours.x > 0) {
         const float4 g = bilinear_colour(gain, grid_place(x + place.x, y + place.y, grid, colours), colours);
