@@ -79,11 +79,6 @@ class Grid:
         return self.width, self.height, int(self.wraps), self.poles
 
     @property
-    def lens(self) -> tuple[float, float, float, float]:
-        """Old name of `lonlat`."""
-        return self.lonlat
-
-    @property
     def spherical(self) -> bool:
         """Whether it is of a sphere."""
         return self.lonlat[1] > 0
