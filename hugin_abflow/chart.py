@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from hugin_abflow.opencl import Device
-from hugin_abflow.projection import EQUIRECTANGULAR, Eye, directions
+from hugin_abflow.projection import EQUIRECTANGULAR, Projection, directions
 from hugin_abflow.pyramid import Level
 from hugin_abflow.working import Grid, WorkingLayer
 
@@ -31,9 +31,13 @@ _FLOOR = 0.05
 
 @dataclass(frozen=True)
 class Chart:
-    """transform: the 16 numbers of common.cl; width, height px; wraps: columns are periodic; coarse: pixels
-    of the working grid per pixel, 1 or 2; eye: in what directions it shows its places, on a sphere in axes of
-    its own; None: not known.
+    """The flat grid of one pair.
+
+    transform       from the scene to the grid: the 16 numbers of common.cl.
+    width, height   px.
+    wraps           whether columns are periodic.
+    coarse          pixels of the working grid per pixel in x and y, 1 or 2.
+    projection      from places to directions, on a sphere in axes of its own; None: not known.
     """
 
     transform: npt.NDArray[np.float32]
@@ -41,16 +45,15 @@ class Chart:
     height: int
     wraps: bool
     coarse: int = 1
-    eye: Eye | None = None
+    projection: Projection | None = None
 
     def finer(self) -> Chart:
         """The same place, of a chart that is `coarse`, in pixels of half the size."""
         transform = self.transform.copy()
         transform[9:13] *= 2
-        eye = self.eye and self.eye.on(2, 2, 0, 0)
-        return replace(
-            self, transform=transform, width=2 * self.width, height=2 * self.height, coarse=1, eye=eye
-        )
+        projection = self.projection and self.projection.on_grid(2, 2, 0, 0)
+        width, height = 2 * self.width, 2 * self.height
+        return replace(self, transform=transform, width=width, height=height, coarse=1, projection=projection)
 
     def around(self, grid: Grid) -> float:
         """The width of the canvas of `grid` in px of the chart."""
@@ -111,12 +114,12 @@ def _plane(overlap: npt.NDArray[np.bool_], grid: Grid) -> Chart:
     return Chart(transform, width, int(bottom - top), True)
 
 
-def _eye(chart: Chart, grid: Grid) -> Eye | None:
-    """Of a plane's chart."""
-    across, down, left, top = chart.transform[9:13].astype(np.float64)
-    across, down = across * grid.width / grid.region.width, down * grid.height / grid.region.height
-    return grid.eye and grid.eye.on(
-        across, down, grid.region.left - left / across, grid.region.top - top / down
+def _plane_projection(chart: Chart, grid: Grid) -> Projection | None:
+    """The projection of a plane's chart."""
+    scale_x, scale_y, left, top = chart.transform[9:13].astype(np.float64)
+    scale_x, scale_y = scale_x * grid.width / grid.region.width, scale_y * grid.height / grid.region.height
+    return grid.projection and grid.projection.on_grid(
+        scale_x, scale_y, grid.region.left - left / scale_x, grid.region.top - top / scale_y
     )
 
 
@@ -172,8 +175,8 @@ def _sphere(overlap: npt.NDArray[np.bool_], mask_grid: Grid, scale: float) -> Ch
     transform = np.zeros(16, np.float32)
     transform[:9] = (turn @ axes).ravel()
     transform[9:14] = across, scale, width / 2, north * scale, 1
-    eye = Eye(EQUIRECTANGULAR, across, scale, width / 2, north * scale)
-    return Chart(transform, width, math.ceil((north - south) * scale), wraps, eye=eye)
+    projection = Projection(EQUIRECTANGULAR, across, scale, width / 2, north * scale)
+    return Chart(transform, width, math.ceil((north - south) * scale), wraps, projection=projection)
 
 
 def pair_chart(overlap: npt.NDArray[np.bool_], mask_grid: Grid, grid: Grid, coarse: int = 1) -> Chart:
@@ -188,7 +191,7 @@ def pair_chart(overlap: npt.NDArray[np.bool_], mask_grid: Grid, grid: Grid, coar
         rows = np.arange(height) * mask_grid.height // height
         columns = np.arange(width) * mask_grid.width // width
         found = _plane(overlap[rows][:, columns], grid)
-        found = replace(found, eye=_eye(found, grid))
+        found = replace(found, projection=_plane_projection(found, grid))
     return replace(found, coarse=coarse)
 
 

@@ -34,7 +34,7 @@ from hugin_abflow.cells import (
 )
 from hugin_abflow.chart import Chart
 from hugin_abflow.decision import Refused
-from hugin_abflow.projection import Eye
+from hugin_abflow.projection import Projection
 from hugin_abflow.working import connected
 
 # By how much flow has to miss parallax: chart pixels at the canvas's centre, and times the third quartile of
@@ -66,10 +66,10 @@ def find(
     vouched     where somebody says that both show the same: what is matched so is left alone.
     refused     what a search found besides.
     """
-    if not chart.eye:
+    if not chart.projection:
         return None
     ways = [Way.of(chart, flows, views, index) for index in (0, 1)]
-    seen = [_seen(chart.eye, way, index) for index, way in enumerate(ways)]
+    seen = [_seen(chart.projection, way, index) for index, way in enumerate(ways)]
     u, v = (
         np.concatenate([its[photo][way.believed.ravel()] for its, way in zip(seen, ways, strict=True)])
         for photo in (0, 1)
@@ -77,7 +77,7 @@ def find(
     direction = epipolar.known_move(u, v)
     if direction is None:
         return None
-    scale = chart.eye.down
+    scale = chart.projection.focal_y
     limit = max(_APART, _SPREADS * scale * float(np.percentile(epipolar.across(u, v, direction), 75)))
     found = [np.zeros(way.shown.shape, bool) for way in ways]
     every = [(index, False, way, its) for index, (way, its) in enumerate(zip(ways, seen, strict=True))]
@@ -85,7 +85,7 @@ def find(
         wide, gap = one.finest(chart.width, chart.height), CONSISTENT * max(1.0, 2.0 ** (one.level - 1))
         for index in (0, 1):
             way = Way.of(chart, wide, views, index, gap)
-            every.append((index, True, way, _seen(chart.eye, way, index)))
+            every.append((index, True, way, _seen(chart.projection, way, index)))
     for index, searched, way, (u, v) in every:
         across = epipolar.across(u, v, direction)
         apart = scale * across / limit
@@ -101,9 +101,10 @@ def find(
     return Whole.of(found, chart.wraps)
 
 
-def _seen(eye: Eye, way: Way, index: int) -> tuple[epipolar.Points, epipolar.Points]:
+def _seen(projection: Projection, way: Way, index: int) -> tuple[epipolar.Points, epipolar.Points]:
     """Where the first and the second photo show what flow from photo `index` matches: (height * width, 3)."""
-    seen = eye.bearings(way.starts.reshape(-1, 2)), eye.bearings(way.ends.reshape(-1, 2))
+    ends = way.starts.reshape(-1, 2), way.ends.reshape(-1, 2)
+    seen = projection.bearings(ends[0]), projection.bearings(ends[1])
     return seen[index], seen[1 - index]
 
 

@@ -190,7 +190,7 @@ class _Solver:
         device, grid, settings = self.device, self.grid, self.settings
         parameters = quality.flow_parameters(settings.flow_quality, settings.large_motion)
         images = self._images(pair, its_chart)
-        bearings = its_chart.eye.bearings if its_chart.eye else None
+        bearings = its_chart.projection.bearings if its_chart.projection else None
         solved = flow.solve(device, *images, parameters, reach=self._reach(its_chart), bearings=bearings)
         found = (solved.forward, solved.backward)
         placed, held = self._guides(pair, its_chart), tuple[guidance.Values, ...]()
@@ -200,7 +200,7 @@ class _Solver:
             scale = its_finest.width / its_chart.width
             held = tuple(scale * way for way in guidance.held(images, found, placed))
         one = None
-        if settings.seam and (settings.foreground or (settings.movers and its_chart.eye)):
+        if settings.seam and (settings.foreground or (settings.movers and its_chart.projection)):
             views = (View.of(images[0]), View.of(images[1]))
             arrays, vouched = (found[0].get(), found[1].get()), (placed.at_a, placed.at_b)
             one = single.find(its_chart, arrays, views, vouched, solved.refused, settings)

@@ -1,6 +1,6 @@
-"""In what directions a panorama shows its places, for projections of which a formula says so.
+"""Projections: from places on a panorama to directions, where a formula is known.
 
-Formulas of the projections: Snyder, "Map Projections: A Working Manual", 1987 (cylindrical, Mercator,
+Formulas: Snyder, "Map Projections: A Working Manual", 1987 (cylindrical, Mercator,
 stereographic); panorama tools call the central projection of a plane rectilinear, the cylinder with heights
 as they are seen from its axis cylindrical, and an azimuthal equidistant one fisheye.
 """
@@ -22,55 +22,55 @@ _AZIMUTHAL = (RECTILINEAR, FISHEYE, STEREOGRAPHIC)
 
 
 @dataclass(frozen=True)
-class Eye:
-    """From where a flat picture is seen.
+class Projection:
+    """A projection of directions onto a flat pixel grid.
 
-    projection      one of those above.
-    across, down    px for a radian, at the centre.
-    x, y            the centre, px.
+    kind        one of those above.
+    focal_x, focal_y    focal lengths: px per radian at the centre.
+    centre_x, centre_y  px.
     """
 
-    projection: int
-    across: float
-    down: float
-    x: float
-    y: float
+    kind: int
+    focal_x: float
+    focal_y: float
+    centre_x: float
+    centre_y: float
 
     @classmethod
-    def of(cls, projection: int, width: int, height: int, hfov: float) -> Eye | None:
-        """Of a canvas, px and degrees; None for a projection or a field of view that is not known."""
+    def of(cls, kind: int, width: int, height: int, hfov: float) -> Projection | None:
+        """That of a canvas (px, degrees); None for a kind or a field of view that is not known."""
         half = math.radians(hfov) / 2
-        widest = {RECTILINEAR: math.pi / 2, STEREOGRAPHIC: math.pi}.get(projection, math.inf)
-        if not RECTILINEAR <= projection <= MERCATOR or not 0 < half < widest:
+        widest = {RECTILINEAR: math.pi / 2, STEREOGRAPHIC: math.pi}.get(kind, math.inf)
+        if not RECTILINEAR <= kind <= MERCATOR or not 0 < half < widest:
             return None
-        extent = {RECTILINEAR: math.tan(half), STEREOGRAPHIC: 2 * math.tan(half / 2)}.get(projection, half)
+        extent = {RECTILINEAR: math.tan(half), STEREOGRAPHIC: 2 * math.tan(half / 2)}.get(kind, half)
         focal = width / 2 / extent
-        return cls(projection, focal, focal, width / 2, height / 2)
+        return cls(kind, focal, focal, width / 2, height / 2)
 
-    def on(self, across: float, down: float, left: float, top: float) -> Eye:
-        """The same on a grid of so many px per px in each direction, which begins at (left, top)."""
-        return Eye(
-            self.projection, self.across * across, self.down * down,
-            (self.x - left) * across, (self.y - top) * down,
+    def on_grid(self, scale_x: float, scale_y: float, left: float, top: float) -> Projection:
+        """The same on a grid that begins at (left, top) and has so many px for each px in x and y."""
+        return Projection(
+            self.kind, self.focal_x * scale_x, self.focal_y * scale_y,
+            (self.centre_x - left) * scale_x, (self.centre_y - top) * scale_y,
         )  # fmt: skip
 
     def bearings(self, places: Floats) -> Floats:
-        """Unit vectors (n, 3) in which places (n, 2) px are seen: to the right, ahead, up."""
-        x, y = (places[:, 0] - self.x) / self.across, (self.y - places[:, 1]) / self.down
-        if self.projection in _AZIMUTHAL:
+        """Unit vectors (n, 3) towards what places (n, 2) px show: right, ahead, up."""
+        x, y = (places[:, 0] - self.centre_x) / self.focal_x, (self.centre_y - places[:, 1]) / self.focal_y
+        if self.kind in _AZIMUTHAL:
             radius = np.hypot(x, y)
             angle = {
                 RECTILINEAR: np.arctan(radius),
                 FISHEYE: radius,
                 STEREOGRAPHIC: 2 * np.arctan(radius / 2),
-            }[self.projection]
+            }[self.kind]
             share = np.sin(angle) / np.maximum(radius, 1e-12)
             return np.stack([share * x, np.cos(angle), share * y], 1)
         latitudes = {
             CYLINDRICAL: np.arctan(y),
             EQUIRECTANGULAR: y,
             MERCATOR: np.arctan(np.sinh(y)),
-        }[self.projection]
+        }[self.kind]
         return directions(x, latitudes)
 
 

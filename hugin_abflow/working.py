@@ -23,7 +23,7 @@ import numpy.typing as npt
 from hugin_abflow.layer import Box, Canvas, Layer, bounding_box
 from hugin_abflow.opencl import Buffer, Device
 from hugin_abflow.progress import Advance
-from hugin_abflow.projection import Eye, directions
+from hugin_abflow.projection import Projection, directions
 from hugin_abflow.settings import Settings
 
 # Rows of a layer that are decoded and uploaded at a time, and their bytes: many take memory, few more calls,
@@ -56,7 +56,7 @@ class Grid:
     wraps, poles     border rules (kernels/common.cl); poles: bit 0 at the top, bit 1 at the bottom.
     lonlat      (longitude of x = 0, radians per column, latitude of y = 0, radians per row); plane: zeros.
     canvas_width    of the whole canvas, full-resolution px; 0: the region's.
-    eye         of a plane, on the whole canvas; None: not known.
+    projection  of a plane, in px of the whole canvas; None: not known.
     """
 
     region: Box
@@ -66,7 +66,7 @@ class Grid:
     poles: int
     lonlat: tuple[float, float, float, float]
     canvas_width: int = 0
-    eye: Eye | None = None
+    projection: Projection | None = None
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -207,7 +207,7 @@ def full_grid(canvas: Canvas, layers: Sequence[Layer]) -> Grid:
     region = bounding_box(layers)
     if canvas.wraps:
         region = replace(region, left=0, right=canvas.width)
-    lonlat, poles, eye = (0.0, 0.0, 0.0, 0.0), 0, None
+    lonlat, poles, projection = (0.0, 0.0, 0.0, 0.0), 0, None
     if canvas.spherical:
         step = math.radians(canvas.hfov) / canvas.width
         left, top = region.left - canvas.width / 2, canvas.height / 2 - region.top
@@ -216,8 +216,10 @@ def full_grid(canvas: Canvas, layers: Sequence[Layer]) -> Grid:
             poles += abs(lonlat[2] - math.pi / 2) < step / 2
             poles += 2 * (abs(lonlat[2] - region.height * step + math.pi / 2) < step / 2)
     else:
-        eye = Eye.of(canvas.projection, canvas.width, canvas.height, canvas.hfov)
-    return Grid(region, region.width, region.height, canvas.wraps, poles, lonlat, canvas.width, eye)
+        projection = Projection.of(canvas.projection, canvas.width, canvas.height, canvas.hfov)
+    return Grid(
+        region, region.width, region.height, canvas.wraps, poles, lonlat, canvas.width, projection
+    )  # fmt: skip
 
 
 def working_grid(full: Grid, settings: Settings) -> Grid:

@@ -71,7 +71,7 @@ def scene(
     chart = CHARTS[wraps]
     rows, columns = np.mgrid[: chart.height, : chart.width]
     starts = np.stack([columns, rows], -1) + 0.5
-    rays = chart.eye.bearings(starts.reshape(-1, 2)).reshape(*starts.shape[:2], 3)
+    rays = chart.projection.bearings(starts.reshape(-1, 2)).reshape(*starts.shape[:2], 3)
     flows, images, shown = [], [], []
     for second in (False, True):
         here, there = (move, 0 * move) if second else (0 * move, move)

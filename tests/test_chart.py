@@ -142,7 +142,7 @@ def test_bearings_are_what_positions_are_of(name: str) -> None:
     found = pair_chart(mask, grid, grid)
     rng = np.random.default_rng(5)
     places = rng.uniform((1, 1), (found.width - 1, found.height - 1), (50, 2))
-    points = found.eye.bearings(places) @ found.transform[:9].reshape(3, 3).astype(np.float64)
+    points = found.projection.bearings(places) @ found.transform[:9].reshape(3, 3).astype(np.float64)
     assert np.allclose(np.linalg.norm(points, axis=1), 1)
     assert np.allclose(found.positions(points), places, atol=1e-3)
 
@@ -159,9 +159,9 @@ def test_a_finer_chart_shows_the_same_places(name: str) -> None:
     points = common.canvas_point(columns + 0.5, rows + 0.5, grid.lonlat)[mask]
     assert np.allclose(fine.positions(points), 2 * coarse.positions(points), atol=1e-4)
     assert fine.around(grid) == pytest.approx(2 * coarse.around(grid))
-    if coarse.eye:
+    if coarse.projection:
         places = np.random.default_rng(1).uniform(0, coarse.height, (50, 2))
-        assert np.allclose(fine.eye.bearings(2 * places), coarse.eye.bearings(places))
+        assert np.allclose(fine.projection.bearings(2 * places), coarse.projection.bearings(places))
 
 
 def test_a_wrapped_plane_has_one_copy_of_each_point() -> None:

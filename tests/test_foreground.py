@@ -82,7 +82,9 @@ def pair(
     flows, masks, things = ([np.roll(one, turn, 1) for one in many] for many in (flows, masks, things))
     views = tuple(View(np.zeros(mask.shape, np.float32), mask.astype(np.float32)) for mask in masks)
     border = width, HEIGHT, int(turned is not None), 0
-    chart = SimpleNamespace(width=width, height=HEIGHT, wraps=turned is not None, border=border, eye=None)
+    chart = SimpleNamespace(
+        width=width, height=HEIGHT, wraps=turned is not None, border=border, projection=None
+    )
     return Pair(chart, tuple(flows), views, tuple(things))
 
 
@@ -269,7 +271,7 @@ def test_what_somebody_vouches_for_across_the_border_of_a_chart() -> None:
 @pytest.mark.parametrize("size", [(1, 1), (90, 1), (90, 2), (1, 90), (2, 90), (90, 3), (3, 90)])
 def test_charts_without_cells(size: tuple[int, int], wraps: bool) -> None:
     border = *size, int(wraps), 0
-    chart = SimpleNamespace(width=size[0], height=size[1], wraps=wraps, border=border, eye=None)
+    chart = SimpleNamespace(width=size[0], height=size[1], wraps=wraps, border=border, projection=None)
     flow, shown = np.zeros((*size[::-1], 2), np.float32), np.ones(size[::-1], np.float32)
     assert foreground.find(chart, (flow, flow), (View(shown, shown),) * 2, NOBODY) is None
 

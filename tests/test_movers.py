@@ -260,7 +260,7 @@ def test_an_unknown_move_tells_nothing() -> None:
 
 def test_where_directions_are_not_known_nothing_is() -> None:
     one = scene(Thing(AHEAD, UP))
-    assert replace(one, chart=replace(one.chart, eye=None)).found() is None
+    assert replace(one, chart=replace(one.chart, projection=None)).found() is None
 
 
 def far_away(wraps: bool) -> tuple[Scene, Scene]:

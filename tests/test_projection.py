@@ -14,7 +14,7 @@ from hugin_abflow.chart import pair_chart
 from hugin_abflow.layer import Box, Canvas, Layer
 from hugin_abflow.pano_trafo import map_places
 from hugin_abflow.project import read_plan
-from hugin_abflow.projection import EQUIRECTANGULAR, Eye
+from hugin_abflow.projection import EQUIRECTANGULAR, Projection
 from hugin_abflow.working import full_grid
 
 PROJECTIONS = {
@@ -38,24 +38,24 @@ def test_directions_are_hugins(make_project, pano_trafo, kind: str) -> None:
     for stem, panorama in (("canvas", PROJECTIONS[kind]), ("sphere", 'f2 w4000 h2000 v360 n"TIFF_m"')):
         plan = read_plan(make_project(stem=stem, panorama=panorama, yaws=(17,)))
         canvas = plan.canvas
-        eye = Eye.of(canvas.projection, canvas.width, canvas.height, canvas.hfov)
+        view = Projection.of(canvas.projection, canvas.width, canvas.height, canvas.hfov)
         places = map_places(plan, photo)
-        assert eye and None not in places
-        found.append(eye.bearings(np.array(places, float) + 0.5))
+        assert view and None not in places
+        found.append(view.bearings(np.array(places, float) + 0.5))
     assert np.allclose(np.linalg.norm(found[0], axis=1), 1)
     assert np.degrees(np.arccos(np.clip((found[0] * found[1]).sum(1), -1, 1))).max() < 0.02
 
 
 @pytest.mark.parametrize("projection", UNKNOWN)
 def test_what_has_no_formula_here_is_unknown(projection: int) -> None:
-    assert Eye.of(projection, 801, 401, 120.0) is None
+    assert Projection.of(projection, 801, 401, 120.0) is None
 
 
 @pytest.mark.parametrize(
     ("projection", "hfov"), [(0, 180.0), (0, 0.0), (2, 0.0), (4, 360.0), (1, -5.0), (5, math.nan)]
 )
 def test_a_field_of_view_that_cannot_be_is_unknown(projection: int, hfov: float) -> None:
-    assert Eye.of(projection, 801, 401, hfov) is None
+    assert Projection.of(projection, 801, 401, hfov) is None
 
 
 @settings(max_examples=60)
@@ -66,8 +66,8 @@ def test_a_field_of_view_that_cannot_be_is_unknown(projection: int, hfov: float)
 )
 def test_the_centre_is_ahead_and_the_width_is_the_field_of_view(projection, hfov, size) -> None:
     width, height = size
-    eye = Eye.of(projection, width, height, hfov)
-    middle, left, right, above = eye.bearings(
+    view = Projection.of(projection, width, height, hfov)
+    middle, left, right, above = view.bearings(
         np.array(
             [[width / 2, height / 2], [0, height / 2], [width, height / 2], [width / 2, height / 2 - 1e-3]]
         )
@@ -80,11 +80,12 @@ def test_the_centre_is_ahead_and_the_width_is_the_field_of_view(projection, hfov
 
 @pytest.mark.parametrize("projection", range(6))
 def test_pixels_at_the_centre_are_as_wide_as_said(projection: int) -> None:
-    eye = Eye.of(projection, 301, 201, 80.0).on(0.5, 0.75, 11.0, 7.0)
-    step = eye.bearings(np.array([[eye.x, eye.y], [eye.x + 0.01, eye.y], [eye.x, eye.y + 0.01]]))
-    assert (eye.x, eye.y) == ((150.5 - 11) * 0.5, (100.5 - 7) * 0.75)
-    assert np.linalg.norm(step[1] - step[0]) * eye.across == pytest.approx(0.01)
-    assert np.linalg.norm(step[2] - step[0]) * eye.down == pytest.approx(0.01)
+    view = Projection.of(projection, 301, 201, 80.0).on_grid(0.5, 0.75, 11.0, 7.0)
+    x, y = view.centre_x, view.centre_y
+    step = view.bearings(np.array([[x, y], [x + 0.01, y], [x, y + 0.01]]))
+    assert (x, y) == ((150.5 - 11) * 0.5, (100.5 - 7) * 0.75)
+    assert np.linalg.norm(step[1] - step[0]) * view.focal_x == pytest.approx(0.01)
+    assert np.linalg.norm(step[2] - step[0]) * view.focal_y == pytest.approx(0.01)
 
 
 @pytest.mark.parametrize("coarse", [1, 2])
@@ -103,8 +104,8 @@ def test_a_chart_of_a_flat_canvas_shows_the_same_directions(projection: int, coa
     mask[20:40, 30:60] = True
     chart = pair_chart(mask, plane(79, 47), grid, coarse)
     places = np.random.default_rng(8).uniform((150, 100), (300, 200), (40, 2))
-    expected = Eye.of(projection, 701, 403, canvas.hfov).bearings(places)
-    assert np.allclose(chart.eye.bearings(chart.positions(grid.points(places))), expected, atol=1e-5)
+    expected = Projection.of(projection, 701, 403, canvas.hfov).bearings(places)
+    assert np.allclose(chart.projection.bearings(chart.positions(grid.points(places))), expected, atol=1e-5)
 
 
 def test_a_sphere_knows_its_directions_without_a_canvas() -> None:
@@ -114,5 +115,5 @@ def test_a_sphere_knows_its_directions_without_a_canvas() -> None:
     mask = np.zeros((50, 100), bool)
     mask[10:20, 30:50] = True
     chart = pair_chart(mask, grid.resized(100, 50), grid)
-    assert chart.eye.projection == EQUIRECTANGULAR
-    assert pair_chart(mask, plane(100, 50), plane(402, 201)).eye is None
+    assert chart.projection.kind == EQUIRECTANGULAR
+    assert pair_chart(mask, plane(100, 50), plane(402, 201)).projection is None
