@@ -1,5 +1,5 @@
-"""Cells of a grid on the host, and a pair's flow by those of its chart: for what is taken from one photo, as
-a whole (single.py, seam.py).
+"""Cells of a grid on the host, and a pair's flow at those of its chart: for what is taken from one photo,
+whole (single.py, seam.py).
 """
 
 from __future__ import annotations
@@ -22,13 +22,13 @@ Places = npt.NDArray[np.float64]  # (n, 2): x right, y down, px of the chart; a 
 # Cells of a chart, (height, width), by the number of the thing that they show; 0: none.
 Things = npt.NDArray[np.int32]
 
-# Chart pixels per cell: a cell is told by the flow at its centre.
+# Chart pixels per cell; a cell has the flow at its centre.
 CELL = 4
-# Cells by which what is found is to be grown: flow is smooth across outlines.
+# Cells by which what is found is grown: flow is smooth across outlines.
 GROWN = 3
 # Cells of a thing, at least.
 LEAST = 20
-# Chart pixels between start and return of a flow that is believed.
+# Chart pixels between start and return of a flow that is consistent.
 CONSISTENT = 1.0
 
 # Cells of a thing that may lie at a photo's border, beyond which the other photo goes on, for it still to
@@ -99,52 +99,52 @@ class Whole:
 
 
 @dataclass(frozen=True)
-class Way:
-    """Flow that starts on one photo, by cells.
+class CellFlow:
+    """Flow from one photo of a pair to the other, at the centres of cells.
 
-    starts      (height, width, 2) px: the cells' centres.
-    ends        the same, where the flow leads.
-    shown       whether both photos show where it starts and where it leads.
-    believed    whether the opposite flow leads back, too.
-    around      columns of a chart that wraps, px; else 0.
+    starts      (height, width, 2) px: the centres.
+    ends        the same: where the flow leads.
+    shown       whether both photos show where it starts and where it ends.
+    consistent  whether, besides, the opposite flow leads back (forward-backward consistency).
+    period      px after which the columns of the chart repeat; 0: they do not.
     """
 
     starts: Places
     ends: Places
     shown: Mask
-    believed: Mask
-    around: int = 0
+    consistent: Mask
+    period: int = 0
 
     @classmethod
     def of(
         cls, chart: Chart, flows: Flows, views: tuple[View, View], index: int, gap: float = CONSISTENT
-    ) -> Way:
-        """From photo `index` of a pair; gap: px between start and return that are believed."""
+    ) -> CellFlow:
+        """From photo `index` of a pair. gap: px between start and return that are still consistent."""
         flow = at_centres(flows[index]).astype(np.float64)
         rows, columns = np.indices(flow.shape[:2])
         starts = np.stack([columns, rows], -1).astype(np.float64) * CELL + CELL // 2 + 0.5
         inside, (row, column) = pixels_at(starts + flow, chart.border)
         there = np.where(inside, row, 0), np.where(inside, column, 0)
         shown = inside & views[index].cells & (views[1 - index].mask[there] > 0)
-        believed = shown & (np.linalg.norm(flow + flows[1 - index][there], axis=-1) < gap)
-        return cls(starts, starts + flow, shown, believed, chart.width * chart.wraps)
+        consistent = shown & (np.linalg.norm(flow + flows[1 - index][there], axis=-1) < gap)
+        return cls(starts, starts + flow, shown, consistent, chart.width * chart.wraps)
 
     @property
-    def flow(self) -> Places:
+    def vectors(self) -> Places:
         """(height, width, 2) px, from cells' centres."""
         return self.ends - self.starts
 
-    def vouched(self, things: npt.NDArray[np.int32], at: tuple[Places, Places]) -> npt.NDArray[np.intp]:
-        """The numbers of the things, (height, width), that somebody says are matched as their flow has it.
+    def confirmed(self, things: Things, control_points: tuple[Places, Places]) -> npt.NDArray[np.intp]:
+        """The numbers of the things whose flow a control point agrees with.
 
-        at: places on both photos that show the same, the one first on which the flow starts.
+        control_points  their places on the photo on which the flow starts, and on the other one.
         """
-        starts, ends = at
+        starts, ends = control_points
         cell = np.floor(starts / CELL).astype(int)
         inside = (cell >= 0).all(1) & (cell[:, 0] < things.shape[1]) & (cell[:, 1] < things.shape[0])
         column, row = cell[inside].T
         off = self.ends[row, column] - ends[inside]
-        off[:, 0] -= self.around * np.rint(off[:, 0] / (self.around or 1))
+        off[:, 0] -= self.period * np.rint(off[:, 0] / (self.period or 1))
         agree = np.linalg.norm(off, axis=1) < CELL
         return np.unique(things[row[agree], column[agree]])
 

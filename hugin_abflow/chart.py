@@ -55,8 +55,8 @@ class Chart:
         width, height = 2 * self.width, 2 * self.height
         return replace(self, transform=transform, width=width, height=height, coarse=1, projection=projection)
 
-    def around(self, grid: Grid) -> float:
-        """The width of the canvas of `grid` in px of the chart."""
+    def circumference(self, grid: Grid) -> float:
+        """The width of the whole canvas of `grid`, in px of the chart."""
         return grid.circumference * float(self.transform[9])
 
     @property

@@ -42,7 +42,7 @@ def parallax(found: Weighed, grid: Grid) -> Parallax:
     sure = both & (trusted[..., 2] >= _SURE)
     if not sure.any():
         return Parallax(0.0, 0.0, 0.0)
-    pixel = (grid.canvas_width or grid.region.width) / found.chart.around(grid)
+    pixel = (grid.canvas_width or grid.region.width) / found.chart.circumference(grid)
     lengths = np.hypot(trusted[..., 0], trusted[..., 1])[sure] * pixel
     return Parallax(float(np.median(lengths)), float(lengths.max()), float(sure.sum() / both.sum()))
 

@@ -12,6 +12,7 @@ either, it would break at a border.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
@@ -22,12 +23,12 @@ import scipy
 from hugin_abflow.cells import (
     CELL,
     LEAST,
+    CellFlow,
     Flows,
     Mask,
     Places,
     Things,
     View,
-    Way,
     Whole,
     cells_at,
     ends_within,
@@ -49,60 +50,73 @@ _CLOSED = 2
 
 
 def find(
-    chart: Chart, flows: Flows, views: tuple[View, View], vouched: tuple[Places, Places]
+    chart: Chart, flows: Flows, views: tuple[View, View], control_points: tuple[Places, Places]
 ) -> Whole | None:
     """What is to be taken from one photo.
 
-    flows       from the first to the second photo and back, float32 (height, width, 2), chart px.
-    vouched     where somebody says that both show the same: what is matched so is left alone.
+    flows           from the first to the second photo and back, float32 (height, width, 2), chart px.
+    control_points  their places on both photos: what they say is matched rightly is left alone.
     """
     masks = views[0].cells, views[1].cells
-    ways = [Way.of(chart, flows, views, index) for index in (0, 1)]
-    if not all(way.believed.any() for way in ways):
+    cell_flows = [CellFlow.of(chart, flows, views, index) for index in (0, 1)]
+    if not all(flow.consistent.any() for flow in cell_flows):
         return None
     width = _width(masks, chart.wraps)
-    found = [_standing_out(way, width, (vouched[k], vouched[1 - k])) for k, way in enumerate(ways)]
-    shown, strain = _joined(chart, ways, found)
+    first, second = (
+        _near_things(flow, width, (control_points[k], control_points[1 - k]))
+        for k, flow in enumerate(cell_flows)
+    )
+    shown, strain = _joined(chart, cell_flows, first, second)
     kept = (strain >= _STRAIN) & ends_within(shown, len(strain), masks, chart.wraps)
     return Whole.of([_filled(kept[its], chart.wraps) for its in shown], chart.wraps)
 
 
-def _standing_out(
-    way: Way, width: npt.NDArray[np.float64], vouched: tuple[Places, Places]
-) -> tuple[Things, npt.NDArray[np.float64]]:
-    """The things that stand out of what is behind them, and the strain of each number, 0 of 0."""
-    surfaces = _surfaces(way)
-    sizes = np.bincount(surfaces[way.believed], minlength=surfaces.max() + 1)
-    behind = (sizes >= max(_WIDE, _SHARE * np.count_nonzero(way.shown)))[surfaces]
+@dataclass(frozen=True)
+class _NearThings:
+    """Things that are nearer than what is behind them. strain: of each by its number, 0 of 0."""
+
+    things: Things
+    strain: npt.NDArray[np.float64]
+
+
+def _near_things(
+    flow: CellFlow, width: npt.NDArray[np.float64], control_points: tuple[Places, Places]
+) -> _NearThings:
+    """What shifts by more than the large surface that is nearest to it. width: of the overlap, px."""
+    surfaces = _surfaces(flow)
+    sizes = np.bincount(surfaces[flow.consistent], minlength=surfaces.max() + 1)
+    behind = (sizes >= max(_WIDE, _SHARE * np.count_nonzero(flow.shown)))[surfaces]
     if not behind.any():
-        return np.zeros(behind.shape, np.int32), np.zeros(1)
-    around = way.flow[_nearest(behind, way.around > 0)]
-    own = np.linalg.norm(way.flow - around, axis=-1)
-    longer = np.linalg.norm(way.flow, axis=-1) > np.linalg.norm(around, axis=-1)
-    parts = connected((own > _APART) & longer & way.shown, way.around > 0)
-    told = np.bincount(parts[way.believed], minlength=parts.max() + 1) >= LEAST
-    told[0] = False
-    told[way.vouched(parts, vouched)] = False
-    numbers = np.flatnonzero(told)
-    shift = scipy.ndimage.median(own, np.where(way.believed, parts, 0), numbers)
+        return _NearThings(np.zeros(behind.shape, np.int32), np.zeros(1))
+    around = flow.vectors[_nearest(behind, flow.period > 0)]
+    own = np.linalg.norm(flow.vectors - around, axis=-1)
+    longer = np.linalg.norm(flow.vectors, axis=-1) > np.linalg.norm(around, axis=-1)
+    parts = connected((own > _APART) & longer & flow.shown, flow.period > 0)
+    kept = np.bincount(parts[flow.consistent], minlength=parts.max() + 1) >= LEAST
+    kept[0] = False
+    kept[flow.confirmed(parts, control_points)] = False
+    numbers = np.flatnonzero(kept)
+    shift = scipy.ndimage.median(own, np.where(flow.consistent, parts, 0), numbers)
     strain = np.where(shift >= _FAR, shift / scipy.ndimage.median(width, parts, numbers), 0.0)
-    new = np.zeros(told.size, np.int32)
+    new = np.zeros(kept.size, np.int32)
     new[numbers] = np.arange(1, numbers.size + 1)
-    return new[parts], np.concatenate([[0.0], strain])
+    return _NearThings(new[parts], np.concatenate([[0.0], strain]))
 
 
 def _joined(
-    chart: Chart, ways: Sequence[Way], found: Sequence[tuple[Things, npt.NDArray[np.float64]]]
+    chart: Chart, cell_flows: Sequence[CellFlow], from_first: _NearThings, from_second: _NearThings
 ) -> tuple[list[Things], npt.NDArray[np.float64]]:
     """Where each photo shows the things that were found by flow from either, and the strain of each number:
     two that lead to each other are one.
     """
-    (first, strain), (second, other_strain) = found
-    second = np.where(second > 0, second + strain.size - 1, 0)
+    first, strain, other_strain = from_first.things, from_first.strain, from_second.strain
+    second = np.where(from_second.things > 0, from_second.things + strain.size - 1, 0)
     count = strain.size + other_strain.size - 1
     shown, led = [first.copy(), second.copy()], []
-    for its, there, place, way in zip((first, second), (second, first), shown[::-1], ways, strict=True):
-        inside, (row, column) = cells_at(way.ends[its > 0], its.shape, chart)
+    for its, there, place, flow in zip(
+        (first, second), (second, first), shown[::-1], cell_flows, strict=True
+    ):
+        inside, (row, column) = cells_at(flow.ends[its > 0], its.shape, chart)
         number, met = its[its > 0][inside], there[row, column]
         led.append(np.unique((np.minimum(number, met) * count + np.maximum(number, met))[met > 0]))
         place[row, column] = np.where(met > 0, met, number)
@@ -114,12 +128,12 @@ def _joined(
     return [thing[its] for its in shown], strains
 
 
-def _surfaces(way: Way) -> npt.NDArray[np.int32]:
-    """Cells side by side whose flows are believed and alike, numbered; each other one has its own number."""
-    number = np.arange(way.shown.size).reshape(way.shown.shape)
-    links = [_alike(way, np.s_[:, :-1], np.s_[:, 1:]), _alike(way, np.s_[:-1], np.s_[1:])]
-    if way.around:
-        links.append(_alike(way, np.s_[:, -1:], np.s_[:, :1]))
+def _surfaces(flow: CellFlow) -> npt.NDArray[np.int32]:
+    """Adjacent cells whose flows are consistent and alike share a number; each other one has its own."""
+    number = np.arange(flow.shown.size).reshape(flow.shown.shape)
+    links = [_alike(flow, np.s_[:, :-1], np.s_[:, 1:]), _alike(flow, np.s_[:-1], np.s_[1:])]
+    if flow.period:
+        links.append(_alike(flow, np.s_[:, -1:], np.s_[:, :1]))
     first, second = (np.concatenate([number[ends[k]][alike] for *ends, alike in links]) for k in (0, 1))
     graph = scipy.sparse.csr_array((np.ones(first.size), (first, second)), shape=(number.size, number.size))
     found: npt.NDArray[np.int32] = scipy.sparse.csgraph.connected_components(graph, directed=False)[1]
@@ -127,11 +141,11 @@ def _surfaces(way: Way) -> npt.NDArray[np.int32]:
 
 
 def _alike(
-    way: Way, first: tuple[slice, ...] | slice, second: tuple[slice, ...] | slice
+    flow: CellFlow, first: tuple[slice, ...] | slice, second: tuple[slice, ...] | slice
 ) -> tuple[tuple[slice, ...] | slice, tuple[slice, ...] | slice, Mask]:
     """Which of the cells `first` have a flow like that of their neighbours `second`."""
-    near = np.linalg.norm(way.flow[first] - way.flow[second], axis=-1) < _ALIKE
-    return first, second, way.believed[first] & way.believed[second] & near
+    near = np.linalg.norm(flow.vectors[first] - flow.vectors[second], axis=-1) < _ALIKE
+    return first, second, flow.consistent[first] & flow.consistent[second] & near
 
 
 def _nearest(mask: Mask, wraps: bool) -> tuple[npt.NDArray[np.intp], npt.NDArray[np.intp]]:

@@ -101,8 +101,8 @@ def lead(
     wrong = _wrong(ways, parameters.agreement)
     if not wrong.any():
         return flows
-    around = _around(images[0].grid)
-    reasons = doubts(guides.at_a, ways[0].moves, parameters.radius * circumference, around)
+    period = _period(images[0].grid)
+    reasons = doubts(guides.at_a, ways[0].moves, parameters.radius * circumference, period)
     for name, reason, counts in zip(guides.names, reasons, wrong, strict=True):
         if reason and counts:
             _log.info("%s is ignored: %s", name, reason)
@@ -223,7 +223,7 @@ class _Springs:
         way = way.only(np.any(way.residuals, axis=1))  # the others are not on the chart
         table = np.concatenate([way.places, way.residuals], 1)
         self._guides = device.upload(table, np.float32)
-        sigmas = _sigmas(way, _around(image.grid), parameters)
+        sigmas = _sigmas(way, _period(image.grid), parameters)
         self._sigmas = device.upload(sigmas, np.float32)
 
     def at(self, level: int) -> tuple[Buffer, Buffer]:
@@ -252,22 +252,22 @@ class _Springs:
         )  # fmt: skip
 
 
-def _sigmas(way: _Way, around: float, parameters: GuidanceParameters) -> Values:
-    """How far each guide leads, px; `around`: as of `guides.doubts`."""
+def _sigmas(way: _Way, period: float, parameters: GuidanceParameters) -> Values:
+    """How far each guide leads, px; `period`: as of `guides.doubts`."""
     lengths = np.linalg.norm(way.residuals, axis=1)
     sigmas = lengths.copy()
     for i in range(len(lengths)):
         alike = np.linalg.norm(way.moves - way.moves[i], axis=1) < _ALIKE * lengths[i]
         alike[i] = False
-        spaced = parameters.spacing * distances(way.places, i, around)[alike].min(initial=np.inf)
+        spaced = parameters.spacing * distances(way.places, i, period)[alike].min(initial=np.inf)
         if spaced <= parameters.most_sigma:  # one that is farther away is on something else
             sigmas[i] = max(sigmas[i], spaced)
     clipped: Values = np.clip(sigmas, parameters.least_sigma, parameters.most_sigma)
     return clipped
 
 
-def _around(grid: tuple[int, int, int, int]) -> float:
-    """After how many px columns repeat."""
+def _period(grid: tuple[int, int, int, int]) -> float:
+    """Px after which columns repeat; infinity: they do not."""
     width, _, wraps, _ = grid
     return width if wraps else math.inf
 

@@ -55,12 +55,12 @@ def check_guides(guides: Iterable[Guide], layers: int) -> None:
             raise GuideError(f"{guide.name} is at {guide.at_a} and {guide.at_b}; give canvas pixels")
 
 
-def doubts(places: Points, moves: Points, radius: float, around: float = math.inf) -> list[str]:
+def doubts(places: Points, moves: Points, radius: float, period: float = math.inf) -> list[str]:
     """Why each guide of one pair of layers is to be ignored; "" where it is not.
 
     places  (n, 2) px, one end of each guide; moves: (n, 2) px, from there to the other end.
     radius  px: neighbours are the nearest guides within it.
-    around  px after which columns repeat, where they do.
+    period  px after which columns repeat; infinity: they do not.
 
     Repeated guides count once. Guides that send one place to two are both ignored. Else a guide is an
     outlier if its move is far from the median of three neighbours or more, and none of them moves like it:
@@ -68,12 +68,12 @@ def doubts(places: Points, moves: Points, radius: float, around: float = math.in
     """
     reasons = [""] * len(places)
     for i in range(len(places)):  # row by row: a project may have ten thousand points
-        again = (distances(places, i, around) < _SAME_PLACE) & (distances(moves, i) < _SAME_PLACE)
+        again = (distances(places, i, period) < _SAME_PLACE) & (distances(moves, i) < _SAME_PLACE)
         for j in np.flatnonzero(again[i + 1 :]) if not reasons[i] else ():
             reasons[i + 1 + j] = "it repeats another"
     counted = np.array([not reason for reason in reasons], bool)
     for i in map(int, np.flatnonzero(counted)):
-        apart = np.where(counted, distances(places, i, around), np.inf)
+        apart = np.where(counted, distances(places, i, period), np.inf)
         apart[i] = np.inf
         others = np.argsort(apart, kind="stable")[:_MOST_NEIGHBOURS]
         others = others[apart[others] < radius]
@@ -95,11 +95,11 @@ def by_pair(guides: Iterable[Guide]) -> dict[tuple[int, int], list[Guide]]:
     return pairs
 
 
-def distances(points: Points, index: int, around: float = math.inf) -> npt.NDArray[np.float64]:
-    """From one of the points to each of them, px; `around`: as of `doubts`."""
+def distances(points: Points, index: int, period: float = math.inf) -> npt.NDArray[np.float64]:
+    """From one of the points to each of them, px; `period`: as of `doubts`."""
     apart = np.abs(points - points[index])
-    columns = apart[:, 0] % around
-    apart[:, 0] = np.minimum(columns, around - columns)
+    columns = apart[:, 0] % period
+    apart[:, 0] = np.minimum(columns, period - columns)
     found: npt.NDArray[np.float64] = np.linalg.norm(apart, axis=1)
     return found
 

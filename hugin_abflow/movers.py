@@ -11,6 +11,7 @@ takes it from that photo, whole.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
@@ -22,11 +23,11 @@ from hugin_abflow.cells import (
     CONSISTENT,
     GROWN,
     LEAST,
+    CellFlow,
     Flows,
     Mask,
     Places,
     View,
-    Way,
     Whole,
     ends_within,
     grown,
@@ -34,7 +35,6 @@ from hugin_abflow.cells import (
 )
 from hugin_abflow.chart import Chart
 from hugin_abflow.decision import Refused
-from hugin_abflow.projection import Projection
 from hugin_abflow.working import connected
 
 # By how much flow has to miss parallax: chart pixels at the canvas's centre, and times the third quartile of
@@ -56,99 +56,120 @@ _SHOWN = 0.999
 
 
 def find(
-    chart: Chart, flows: Flows, views: tuple[View, View], vouched: tuple[Places, Places],
+    chart: Chart, flows: Flows, views: tuple[View, View], control_points: tuple[Places, Places],
     refused: Sequence[Refused] = (),
 ) -> Whole | None:  # fmt: skip
-    """What moved by itself; None, too, where nothing tells how the camera moved: flow does not, or it is not
-    known in what directions the chart shows its places.
+    """What moved by itself. None: nothing, or it is not known how the camera moved, since too little flow
+    tells it, or the chart's projection is not known.
 
-    flows       from the first to the second photo and back, float32 (height, width, 2), chart px.
-    vouched     where somebody says that both show the same: what is matched so is left alone.
-    refused     what a search found besides.
+    flows           from the first to the second photo and back, float32 (height, width, 2), chart px.
+    control_points  their places on both photos: what they say is matched rightly is left alone.
+    refused         flow that a search found besides.
     """
     if not chart.projection:
         return None
-    ways = [Way.of(chart, flows, views, index) for index in (0, 1)]
-    seen = [_seen(chart.projection, way, index) for index, way in enumerate(ways)]
+    matches = [_Matches.of(chart, flows, views, index) for index in (0, 1)]
     u, v = (
-        np.concatenate([its[photo][way.believed.ravel()] for its, way in zip(seen, ways, strict=True)])
-        for photo in (0, 1)
+        np.concatenate([one.seen[photo][one.flow.consistent.ravel()] for one in matches]) for photo in (0, 1)
     )
     direction = epipolar.known_move(u, v)
     if direction is None:
         return None
     scale = chart.projection.focal_y
     limit = max(_APART, _SPREADS * scale * float(np.percentile(epipolar.across(u, v, direction), 75)))
-    found = [np.zeros(way.shown.shape, bool) for way in ways]
-    every = [(index, False, way, its) for index, (way, its) in enumerate(zip(ways, seen, strict=True))]
-    for one in refused:
-        wide, gap = one.finest(chart.width, chart.height), CONSISTENT * max(1.0, 2.0 ** (one.level - 1))
-        for index in (0, 1):
-            way = Way.of(chart, wide, views, index, gap)
-            every.append((index, True, way, _seen(chart.projection, way, index)))
-    for index, searched, way, (u, v) in every:
-        across = epipolar.across(u, v, direction)
-        apart = scale * across / limit
-        its_way = across < _ELSEWHERE * np.linalg.norm(v - u, axis=1)
-        apart = np.where(its_way, np.minimum(apart, 1.0), apart).reshape(way.shown.shape)
-        if searched:  # only what is certain
-            apart *= way.believed
-        its = _things(
-            chart, way, apart, (views[index], views[1 - index]), (vouched[index], vouched[1 - index])
-        )
-        found[index] |= its
-        found[1 - index] |= reached(way.ends[its & way.believed], its.shape, chart)
+    found = [np.zeros(one.flow.shown.shape, bool) for one in matches]
+    for candidate in refused:
+        finest = candidate.finest(chart.width, chart.height)
+        gap = CONSISTENT * max(1.0, 2.0 ** (candidate.level - 1))
+        matches += [_Matches.of(chart, finest, views, index, gap) for index in (0, 1)]
+    for number, one in enumerate(matches):
+        off_parallax = one.off_parallax(direction, scale, limit)
+        if number > 1:  # of what was refused only what is certain
+            off_parallax *= one.flow.consistent
+        here, there = one.index, 1 - one.index
+        moved = _moved(
+            chart, one.flow, off_parallax, (views[here], views[there]),
+            (control_points[here], control_points[there]),
+        )  # fmt: skip
+        found[here] |= moved
+        found[there] |= reached(one.flow.ends[moved & one.flow.consistent], moved.shape, chart)
     return Whole.of(found, chart.wraps)
 
 
-def _seen(projection: Projection, way: Way, index: int) -> tuple[epipolar.Points, epipolar.Points]:
-    """Where the first and the second photo show what flow from photo `index` matches: (height * width, 3)."""
-    ends = way.starts.reshape(-1, 2), way.ends.reshape(-1, 2)
-    seen = projection.bearings(ends[0]), projection.bearings(ends[1])
-    return seen[index], seen[1 - index]
+@dataclass(frozen=True)
+class _Matches:
+    """What flow from photo `index` of a pair matches, by cells.
+
+    seen        in what directions the first and the second photo show it: unit vectors (height * width, 3).
+    """
+
+    index: int
+    flow: CellFlow
+    seen: tuple[epipolar.Points, epipolar.Points]
+
+    @classmethod
+    def of(
+        cls, chart: Chart, flows: Flows, views: tuple[View, View], index: int, gap: float = CONSISTENT
+    ) -> _Matches:
+        """Of a chart whose projection is known; gap: as of `CellFlow.of`."""
+        assert chart.projection is not None
+        flow = CellFlow.of(chart, flows, views, index, gap)
+        start, end = (chart.projection.bearings(one.reshape(-1, 2)) for one in (flow.starts, flow.ends))
+        return cls(index, flow, (end, start) if index else (start, end))
+
+    def off_parallax(self, direction: epipolar.Points, scale: float, limit: float) -> Places:
+        """By how much each cell's motion misses parallax, of the limit, (height, width), for a camera that
+        moved in a direction. scale: px per radian; limit: px.
+        """
+        u, v = self.seen
+        across = epipolar.across(u, v, direction)
+        off = scale * across / limit
+        its_way = across < _ELSEWHERE * np.linalg.norm(v - u, axis=1)
+        return np.where(its_way, np.minimum(off, 1.0), off).reshape(self.flow.shown.shape)
 
 
-def _things(
-    chart: Chart, way: Way, apart: Places, views: tuple[View, View], vouched: tuple[Places, Places]
-) -> Mask:
-    """The cells of what moves by itself; apart: by how much each misses parallax, of the limit."""
-    things = connected(apart > _WEAK, way.around > 0)
-    clear = np.bincount(things[(apart > 1) & way.shown], minlength=things.max() + 1)
+def _moved(
+    chart: Chart, flow: CellFlow, off_parallax: Places, views: tuple[View, View],
+    control_points: tuple[Places, Places],
+) -> Mask:  # fmt: skip
+    """The cells of what moved by itself; off_parallax: by how much each misses parallax, of the limit."""
+    things = connected(off_parallax > _WEAK, flow.period > 0)
+    clear = np.bincount(things[(off_parallax > 1) & flow.shown], minlength=things.max() + 1)
     kept = clear >= np.maximum(LEAST, _CLEAR * np.bincount(things.ravel()))
-    kept[way.vouched(things, vouched)] = False
+    kept[flow.confirmed(things, control_points)] = False
     for thing in np.flatnonzero(kept):
         its = things == thing
-        kept[thing] = _ends_within(chart, way, views, its) and _differs(*views, way, its)
+        kept[thing] = _ends_within(chart, flow, views, its) and _differs(*views, flow, its)
     moved: Mask = kept[things]
     return moved
 
 
-def _ends_within(chart: Chart, way: Way, views: tuple[View, View], thing: Mask) -> bool:
+def _ends_within(chart: Chart, flow: CellFlow, views: tuple[View, View], thing: Mask) -> bool:
     """Whether one photo shows a thing as far as the other one does: taken from either, what crosses the
     overlap would break at a border. Most often it is no thing: photos that are badly aligned miss parallax.
     """
-    its = thing & way.shown
-    there = reached(way.ends[its & way.believed], its.shape, chart)
+    its = thing & flow.shown
+    there = reached(flow.ends[its & flow.consistent], its.shape, chart)
     masks = views[0].cells, views[1].cells
     shown = [its.astype(np.int32), there.astype(np.int32)]
     return bool(ends_within(shown, 2, masks, chart.wraps)[1])
 
 
-def _differs(here: View, there: View, way: Way, thing: Mask) -> bool:
+def _differs(here: View, there: View, flow: CellFlow, thing: Mask) -> bool:
     """Whether the photos differ in a thing's place if it moves as what is around, more than they do there.
 
     What is across the border of a chart that wraps does not count as around. A plain thing that left its
     place wholly differs there by as much all over, as a place that one photo shows darker, and is not told.
     """
     wider = grown(thing, GROWN, wraps=False)
-    ring = np.nonzero(grown(wider, _RING, wraps=False) & ~wider & way.believed)
-    its = np.nonzero(thing & way.shown)
+    ring = np.nonzero(grown(wider, _RING, wraps=False) & ~wider & flow.consistent)
+    its = np.nonzero(thing & flow.shown)
     if min(len(ring[0]), len(its[0])) < LEAST:
         return False
-    unknown = wider | ~way.believed
+    unknown = wider | ~flow.consistent
     nearest = scipy.ndimage.distance_transform_edt(unknown, return_distances=False, return_indices=True)
-    beside = _difference(here, there, ring, way.flow[ring])
-    inside = _difference(here, there, its, way.flow[tuple(nearest[:, its[0], its[1]])])
+    beside = _difference(here, there, ring, flow.vectors[ring])
+    inside = _difference(here, there, its, flow.vectors[tuple(nearest[:, its[0], its[1]])])
     if min(beside.size, inside.size) < LEAST:
         return False
     # each from its own median: exposure may be another one there, and change faster than anything tells

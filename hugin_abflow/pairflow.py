@@ -195,15 +195,15 @@ class _Solver:
         found = (solved.forward, solved.backward)
         placed, held = self._guides(pair, its_chart), tuple[guidance.Values, ...]()
         if placed:
-            found = guidance.lead(device, images, found, placed, its_chart.around(grid))
+            found = guidance.lead(device, images, found, placed, its_chart.circumference(grid))
         if placed and self.compared:
             scale = its_finest.width / its_chart.width
             held = tuple(scale * way for way in guidance.held(images, found, placed))
         one = None
         if settings.seam and (settings.foreground or (settings.movers and its_chart.projection)):
             views = (View.of(images[0]), View.of(images[1]))
-            arrays, vouched = (found[0].get(), found[1].get()), (placed.at_a, placed.at_b)
-            one = single.find(its_chart, arrays, views, vouched, solved.refused, settings)
+            arrays, points = (found[0].get(), found[1].get()), (placed.at_a, placed.at_b)
+            one = single.find(its_chart, arrays, views, points, solved.refused, settings)
         its_flow = PairFlow(pair.a, pair.b, its_chart, *found)
         if its_finest is not its_chart:
             images = self._images(pair, its_finest)

@@ -22,16 +22,16 @@ def find(
     chart: Chart,
     flows: Flows,
     views: tuple[View, View],
-    vouched: tuple[Places, Places],
+    control_points: tuple[Places, Places],
     refused: Sequence[Refused],
     settings: Settings,
 ) -> Whole | None:
     """All of it in one pair; None: nothing. The arguments are those of `movers.find`."""
     found = []
     if settings.movers:
-        found.append(movers.find(chart, flows, views, vouched, refused))
+        found.append(movers.find(chart, flows, views, control_points, refused))
     if settings.foreground:
-        found.append(foreground.find(chart, flows, views, vouched))
+        found.append(foreground.find(chart, flows, views, control_points))
     some = [one for one in found if one]
     return reduce(or_, some) if some else None
 

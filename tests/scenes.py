@@ -50,10 +50,10 @@ class Scene:
     shown: tuple[tuple[Array, Array], ...]
 
     def found(
-        self, vouched: tuple[Array, Array] = NOBODY, refused: tuple[Array, Array] | None = None
+        self, points: tuple[Array, Array] = NOBODY, refused: tuple[Array, Array] | None = None
     ) -> Whole | None:
         return movers.find(
-            self.chart, self.flows, self.views, vouched, [Refused(0, np.stack(refused))] if refused else ()
+            self.chart, self.flows, self.views, points, [Refused(0, np.stack(refused))] if refused else ()
         )
 
     def vouch(self, thing: int, off: tuple[float, float] = (0, 0)) -> tuple[Array, Array]:

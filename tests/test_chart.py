@@ -158,7 +158,7 @@ def test_a_finer_chart_shows_the_same_places(name: str) -> None:
     columns, rows = common.pixels(grid.width, grid.height)
     points = common.canvas_point(columns + 0.5, rows + 0.5, grid.lonlat)[mask]
     assert np.allclose(fine.positions(points), 2 * coarse.positions(points), atol=1e-4)
-    assert fine.around(grid) == pytest.approx(2 * coarse.around(grid))
+    assert fine.circumference(grid) == pytest.approx(2 * coarse.circumference(grid))
     if coarse.projection:
         places = np.random.default_rng(1).uniform(0, coarse.height, (50, 2))
         assert np.allclose(fine.projection.bearings(2 * places), coarse.projection.bearings(places))

@@ -40,8 +40,8 @@ class Pair:
     views: tuple[View, View]
     thing: tuple[Array, Array]
 
-    def found(self, vouched: tuple[Array, Array] = NOBODY) -> Whole | None:
-        return foreground.find(self.chart, self.flows, self.views, vouched)
+    def found(self, points: tuple[Array, Array] = NOBODY) -> Whole | None:
+        return foreground.find(self.chart, self.flows, self.views, points)
 
 
 def pair(
