@@ -64,7 +64,7 @@ def flows(folder: Path, settings: Settings) -> list[tuple[str, str, PairFlow]]:
     solve = pairflow.solve
 
     def kept(device: Any, layers: Any, *rest: Any) -> Any:
-        for one in solve(device, layers, *rest)[0]:
+        for one in solve(device, layers, *rest).flows:
             found.append((layers[one.a].layer.name, layers[one.b].layer.name, one))
         raise _Enough
 

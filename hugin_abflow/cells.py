@@ -55,29 +55,29 @@ class View:
 
 
 @dataclass(frozen=True)
-class Whole:
-    """What is taken from one photo, whole: where the first and the second photo of a pair show it, cells of
-    their chart.
+class SingleSource:
+    """What is taken from a single photo of a pair, whole: where the first and where the second photo show it,
+    cells of their chart.
     """
 
     first: Mask
     second: Mask
 
     @classmethod
-    def of(cls, found: Sequence[Mask], wraps: bool) -> Whole | None:
+    def of(cls, found: Sequence[Mask], wraps: bool) -> SingleSource | None:
         """What was found in each photo, and the cells around; None: nothing."""
         if not any(one.any() for one in found):
             return None
         first, second = (grown(one, GROWN, wraps) for one in found)
         return cls(first, second)
 
-    def __or__(self, other: Whole) -> Whole:
-        return Whole(self.first | other.first, self.second | other.second)
+    def __or__(self, other: SingleSource) -> SingleSource:
+        return SingleSource(self.first | other.first, self.second | other.second)
 
-    def finer(self) -> Whole:
+    def finer(self) -> SingleSource:
         """The same by cells of the chart of twice the resolution."""
         first, second = (one.repeat(2, 0).repeat(2, 1) for one in (self.first, self.second))
-        return Whole(first, second)
+        return SingleSource(first, second)
 
     def on_canvas(self, chart: Chart, cells: Grid) -> Mask:
         """Cells of a grid over the canvas, (height, width), that show it, in either photo, or lie beside one

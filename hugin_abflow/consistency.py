@@ -16,26 +16,26 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hugin_abflow.cells import CELL, Mask, Whole
+from hugin_abflow.cells import CELL, Mask, SingleSource
 from hugin_abflow.chart import Chart
 from hugin_abflow.geometry import Pair, PairFlow
 from hugin_abflow.opencl import Buffer, Device
 from hugin_abflow.pyramid import Level
 
-# Brightness of what tells nothing: UNTOLD of kernels/common.cl.
-UNTOLD = 1e3
+# Brightness of pixels that do not count: EXCLUDED of kernels/common.cl.
+EXCLUDED = 1e3
 # Pixels between start and return that leave a sixteenth of the trust, whatever the chart's resolution:
 # refined flow is that much more exact. What is far off must leave next to nothing: many such pixels would
 # outweigh the few around them.
 _TOLERANCE = 2.2
-# What one photo shows and a near thing hides in the other has no place there. Flow squeezes it between its
-# neighbours, and leads back all the same. A pixel has no trust if only this share of its area is left.
+# What a near thing hides in the other photo has no place there. Flow squeezes it between its neighbours, and
+# is consistent all the same. A pixel has no trust if flow leaves no more than this share of its area.
 _SQUEEZED = 0.6
 # The level whose mean tells how much is trusted around a pixel, and the mean that is enough: less is found on
 # islands and lines on which wrong flows happen to lead back.
 _AROUND, _ENOUGH = 2, 0.3
-# What a pixel's own flow counts where its trust is a half, against what one neighbour has to say; else it
-# counts by the odds of its trust. Less, and thin things lose theirs; more, and what is wrong is spread.
+# Weight of a pixel's own flow where its trust is a half, against that of one neighbour's; else it counts by
+# the odds of its trust. With less, thin things lose theirs; with more, what is wrong is spread.
 _OWN = 16.0
 # Difference of log brightness between neighbours that halves what is carried from one to the other.
 _EDGE = 0.08
@@ -45,96 +45,104 @@ _SWEEPS, _RELAXATION, _LEAST_PIXELS = 4, 1.5, 64
 
 
 @dataclass(frozen=True)
-class Weighed(Pair):
-    """Flow between the layers of a pair as it was found, and how far it is trusted.
+class WeightedFlow(Pair):
+    """Flow between the layers of a pair as it was found, weighted by how far it is trusted.
 
     forward, backward   float32 (height, width, 4) on their chart: flow in px, trust 0..1, and brightness of
-                        the layer that it starts on, 0 where it shows nothing.
-    whole               whether something is taken from one of them.
+                        the layer that it starts on: 0 where it shows nothing, EXCLUDED where it does not
+                        count.
+    single              whether anything is taken from a single one of them.
     """
 
     chart: Chart
     forward: Buffer
     backward: Buffer
-    whole: bool
+    single: bool
 
 
-def weigh(device: Device, pair: PairFlow, images: Sequence[Level], whole: Whole | None = None) -> Weighed:
-    """How far a pair's flows are trusted. images: log brightness of both layers on the pair's chart."""
-    ways = [(pair.forward, pair.backward), (pair.backward, pair.forward)]
-    cells = (whole.first, whole.second) if whole else (None, None)
+def weigh(
+    device: Device, pair: PairFlow, images: Sequence[Level], single: SingleSource | None = None
+) -> WeightedFlow:
+    """How far a pair's flows are trusted.
+
+    images      log brightness of both layers on the pair's chart.
+    single      what is taken from a single one of them: flow there is not trusted.
+    """
+    flows = [(pair.forward, pair.backward), (pair.backward, pair.forward)]
+    excluded = (single.first, single.second) if single else (None, None)
     forward, backward = (
-        _supported(device, trust(device, *way, pair.chart.wraps, level.image, its), pair.chart.wraps)
-        for way, level, its in zip(ways, images, cells, strict=True)
+        _supported(device, trust(device, *both, pair.chart.wraps, level.image, cells), pair.chart.wraps)
+        for both, level, cells in zip(flows, images, excluded, strict=True)
     )
-    return Weighed(pair.a, pair.b, pair.chart, forward, backward, bool(whole))
+    return WeightedFlow(pair.a, pair.b, pair.chart, forward, backward, bool(single))
 
 
-def unknown(device: Device, pair: Pair, chart: Chart, images: Sequence[Level]) -> Weighed:
+def unknown(device: Device, pair: Pair, chart: Chart, images: Sequence[Level]) -> WeightedFlow:
     """A pair of whose flow nothing is known. images: log brightness of both layers on the chart."""
 
-    def way(image: Level) -> Buffer:
+    def untrusted(image: Level) -> Buffer:
         values = np.zeros((chart.height, chart.width, 4), np.float32)
         values[..., 3] = image.image.get()
         return device.upload(values)
 
-    return Weighed(pair.a, pair.b, chart, way(images[0]), way(images[1]), whole=False)
+    return WeightedFlow(pair.a, pair.b, chart, untrusted(images[0]), untrusted(images[1]), single=False)
 
 
-def known(found: Weighed) -> float:
-    """The share of an overlap, 0..1, in which its flow is trusted, both ways; but for its rim, from where
-    flow leads out of it.
+def known(found: WeightedFlow) -> float:
+    """The share of an overlap, 0..1, in which its flow is trusted in both directions; without its rim, from
+    where flow leads out of it.
     """
-    ways = found.forward.get(), found.backward.get()
-    both = np.logical_and(*(way[..., 3] != 0 for way in ways))
+    flows = found.forward.get(), found.backward.get()
+    overlap = np.logical_and(*(flow[..., 3] != 0 for flow in flows))
     shares = []
-    for way in ways:
-        trusted = both & (way[..., 2] > 0.5)
+    for flow in flows:
+        trusted = overlap & (flow[..., 2] > 0.5)
         if not trusted.any():
             return 0.0
-        across, down = np.rint(np.median(way[trusted, :2], axis=0)).astype(int)
-        inside = both & _moved(_moved(both, -down, 0, False), -across, 1, found.chart.wraps)
-        shares.append(float(way[inside, 2].mean()) if inside.any() else 0.0)
+        across, down = np.rint(np.median(flow[trusted, :2], axis=0)).astype(int)
+        inside = overlap & _moved(_moved(overlap, -down, 0, False), -across, 1, found.chart.wraps)
+        shares.append(float(flow[inside, 2].mean()) if inside.any() else 0.0)
     return min(shares)
 
 
 def _moved(mask: Mask, by: int, axis: int, wraps: bool) -> Mask:
-    """A mask, so many pixels on; what comes in is not in it, unless it comes back."""
+    """A mask, moved by so many pixels; what comes in from beyond the border is False unless columns wrap."""
     moved, size = np.roll(mask, by, axis), mask.shape[axis]
     if not wraps:
         np.moveaxis(moved, axis, 0)[slice(by) if by > 0 else slice(max(0, size + by), size)] = False
     return moved
 
 
-def mend(device: Device, found: Weighed) -> PairFlow:
-    """The pair's flows, filled where they are not trusted, and in the place of what is taken from one."""
+def fill(device: Device, found: WeightedFlow) -> PairFlow:
+    """The pair's flows, filled where they are not trusted, and in the place of what one layer is to show."""
     forward, backward = (
-        _fill(device, trusted, found.chart.wraps, found.whole) for trusted in (found.forward, found.backward)
+        _filled(device, flow, found.chart.wraps, found.single) for flow in (found.forward, found.backward)
     )
     return PairFlow(found.a, found.b, found.chart, forward, backward)
 
 
 def trust(
-    device: Device, flow: Buffer, back: Buffer, wraps: bool, image: Buffer, whole: Mask | None = None
+    device: Device, flow: Buffer, back: Buffer, wraps: bool, image: Buffer, excluded: Mask | None = None
 ) -> Buffer:
     """float32 (height, width, 4): flow in px, trust 0..1, and brightness, which tells where edges are.
 
-    image: log brightness of the layer that the flow starts on, float32 (height, width), 0 where it shows
-    nothing. whole: cells that have no trust, and whose brightness tells nothing.
+    image       log brightness of the layer that the flow starts on, float32 (height, width), 0 where it shows
+                nothing.
+    excluded    cells that have no trust, and whose brightness does not count.
     """
     trusted = device.empty((*flow.shape[:2], 4))
     grid = _grid(flow, wraps)
-    distrusted = device.upload(np.zeros((1, 1), np.uint8) if whole is None else whole.astype(np.uint8))
-    cells = (*distrusted.shape[::-1], CELL, 0)
+    mask = device.upload(np.zeros((1, 1), np.uint8) if excluded is None else excluded.astype(np.uint8))
+    cells = (*mask.shape[::-1], CELL, 0)
     device.run(
         "consistency", "consistency_trust", grid[:2], flow, back, grid, _TOLERANCE, _SQUEEZED,
-        distrusted, cells, image, trusted,
+        mask, cells, image, trusted,
     )  # fmt: skip
     return trusted
 
 
 def _supported(device: Device, trusted: Buffer, wraps: bool) -> Buffer:
-    """Less trust, in place, where there is little around."""
+    """Lower trust, in place, where there is little around."""
     around, grid = trusted, _grid(trusted, wraps)
     for _ in range(_AROUND):
         around = _coarser(device, around, wraps)
@@ -145,12 +153,12 @@ def _supported(device: Device, trusted: Buffer, wraps: bool) -> Buffer:
     return trusted
 
 
-def _fill(device: Device, trusted: Buffer, wraps: bool, whole: bool) -> Buffer:
+def _filled(device: Device, trusted: Buffer, wraps: bool, single: bool) -> Buffer:
     grid, levels = _grid(trusted, wraps), [trusted]
     while max(levels[-1].shape[:2]) > 1:
         levels.append(_coarser(device, levels[-1], wraps))
     filled = _carried(device, levels, wraps, _SWEEPS)
-    wide = _carried(device, levels, wraps, sweeps=0) if whole else filled
+    wide = _carried(device, levels, wraps, sweeps=0) if single else filled
     device.run("consistency", "consistency_mix", grid[:2], trusted, grid, wide, filled)
     return filled
 

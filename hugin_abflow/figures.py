@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from hugin_abflow.coefficient import on_cells
-from hugin_abflow.consistency import UNTOLD, Weighed
+from hugin_abflow.consistency import EXCLUDED, WeightedFlow
 from hugin_abflow.geometry import Pair
 from hugin_abflow.working import Grid, WorkingLayer
 
@@ -35,10 +35,10 @@ class Parallax:
     consistent: float
 
 
-def parallax(found: Weighed, grid: Grid) -> Parallax:
+def parallax(found: WeightedFlow, grid: Grid) -> Parallax:
     """Of a pair's flow before it is filled, beside what is taken from one photo. grid: the working grid."""
     trusted, brightness = found.forward.get(), found.backward.get()[..., 3]
-    both = np.logical_and(*((one != 0) & (one < UNTOLD) for one in (trusted[..., 3], brightness)))
+    both = np.logical_and(*((one != 0) & (one < EXCLUDED) for one in (trusted[..., 3], brightness)))
     sure = both & (trusted[..., 2] >= _SURE)
     if not sure.any():
         return Parallax(0.0, 0.0, 0.0)

@@ -27,9 +27,9 @@ from hugin_abflow.cells import (
     Flows,
     Mask,
     Places,
+    SingleSource,
     Things,
     View,
-    Whole,
     cells_at,
     ends_within,
     grown,
@@ -51,7 +51,7 @@ _CLOSED = 2
 
 def find(
     chart: Chart, flows: Flows, views: tuple[View, View], control_points: tuple[Places, Places]
-) -> Whole | None:
+) -> SingleSource | None:
     """What is to be taken from one photo.
 
     flows           from the first to the second photo and back, float32 (height, width, 2), chart px.
@@ -68,7 +68,7 @@ def find(
     )
     shown, strain = _joined(chart, cell_flows, first, second)
     kept = (strain >= _STRAIN) & ends_within(shown, len(strain), masks, chart.wraps)
-    return Whole.of([_filled(kept[its], chart.wraps) for its in shown], chart.wraps)
+    return SingleSource.of([_filled(kept[its], chart.wraps) for its in shown], chart.wraps)
 
 
 @dataclass(frozen=True)

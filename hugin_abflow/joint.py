@@ -39,7 +39,7 @@ from hugin_abflow import (
     working,
 )
 from hugin_abflow.blend import BlendLayer
-from hugin_abflow.cells import Whole
+from hugin_abflow.cells import SingleSource
 from hugin_abflow.chart import Chart
 from hugin_abflow.coefficient import Masks
 from hugin_abflow.colour import Correction
@@ -174,11 +174,11 @@ def prepare(
     fast = partial(_of_quality, "fast", full, shared, masks.grid, settings)
     abreast = _check_memory(device, reduced, charts, grid, settings, fast, abreast)
     its_guides = by_pair(guides if settings.guides else ())
-    flows, shifts, singles = list[PairFlow](), list[figures.Parallax](), list[Whole | None]()
+    flows, shifts, singles = list[PairFlow](), list[figures.Parallax](), list[SingleSource | None]()
     if settings.flow:
         flows, shifts, singles = pairflow.solve(
             device, reduced, overlapping, charts, grid, progress, settings, its_guides, numbers, abreast,
-            partial(relay.relayed, overlapping, shared, masks.grid),
+            partial(relay.inferable, overlapping, shared, masks.grid),
         )  # fmt: skip
     with progress("align", 1) as advance:
         once = single.on_canvas(singles, [one.chart for one in flows], seam.seam_grid(grid))

@@ -27,8 +27,8 @@ from hugin_abflow.cells import (
     Flows,
     Mask,
     Places,
+    SingleSource,
     View,
-    Whole,
     ends_within,
     grown,
     reached,
@@ -58,7 +58,7 @@ _SHOWN = 0.999
 def find(
     chart: Chart, flows: Flows, views: tuple[View, View], control_points: tuple[Places, Places],
     refused: Sequence[Refused] = (),
-) -> Whole | None:  # fmt: skip
+) -> SingleSource | None:  # fmt: skip
     """What moved by itself. None: nothing, or it is not known how the camera moved, since too little flow
     tells it, or the chart's projection is not known.
 
@@ -93,7 +93,7 @@ def find(
         )  # fmt: skip
         found[here] |= moved
         found[there] |= reached(one.flow.ends[moved & one.flow.consistent], moved.shape, chart)
-    return Whole.of(found, chart.wraps)
+    return SingleSource.of(found, chart.wraps)
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,7 @@ from operator import or_
 import numpy as np
 
 from hugin_abflow import foreground, movers
-from hugin_abflow.cells import Flows, Mask, Places, View, Whole
+from hugin_abflow.cells import Flows, Mask, Places, SingleSource, View
 from hugin_abflow.chart import Chart
 from hugin_abflow.decision import Refused
 from hugin_abflow.settings import Settings
@@ -25,7 +25,7 @@ def find(
     control_points: tuple[Places, Places],
     refused: Sequence[Refused],
     settings: Settings,
-) -> Whole | None:
+) -> SingleSource | None:
     """All of it in one pair; None: nothing. The arguments are those of `movers.find`."""
     found = []
     if settings.movers:
@@ -36,7 +36,7 @@ def find(
     return reduce(or_, some) if some else None
 
 
-def on_canvas(found: Sequence[Whole | None], charts: Sequence[Chart], cells: Grid) -> Mask | None:
+def on_canvas(found: Sequence[SingleSource | None], charts: Sequence[Chart], cells: Grid) -> Mask | None:
     """Where it is of any pair, on a grid over the canvas; None: nowhere."""
     places = [one.on_canvas(chart, cells) for one, chart in zip(found, charts, strict=True) if one]
     return np.logical_or.reduce(places) if places else None

@@ -326,7 +326,7 @@ static inline float2 bilinear_flow(__global const float2 *values, float2 q, int4
     return w.x * values[at.x] + w.y * values[at.y] + w.z * values[at.z] + w.w * values[at.w];
 }
 
-#define UNTOLD 1e3f /* brightness, in what consistency.cl makes, of what tells nothing */
+#define EXCLUDED 1e3f /* brightness, in what consistency.cl makes, of pixels that do not count */
 
 /* A feature of flow.cl at pixel (x, y) displaced by f, bilinear; all 0 where a tap that counts is not valid. */
 static inline float4 feature_sample(__global const float4 *feature, int x, int y, float2 f, int4 grid) {

@@ -1,7 +1,7 @@
-/* Where the two flows of a pair do not lead back to the start they are not to be trusted; there flow is filled
-   from where it is: coarse to fine, on every level by sweeps that carry it on, but hardly across edges of the
-   image. In the place of what is taken from one photo, edges are its own and tell nothing of what
-   is around. */
+/* Where the two flows of a pair are not consistent (there and back does not end at the start) they are not trusted.
+   There flow is filled from where it is: coarse to fine, on every level by sweeps that carry it on, but hardly across
+   edges of the image. The place of what is taken from one photo is excluded: edges there are its own and tell nothing
+   of what is around. */
 
 /* The area that a pixel's has become where its flow leads. Beyond a border that does not wrap flow is the same. */
 static inline float consistency_area(__global const float2 *flow, int x, int y, int4 grid) {
@@ -19,7 +19,7 @@ __kernel void consistency_trust(__global const float2 *flow, /* (grid.y, grid.x)
                                 int4 grid,                   /* width, height, wraps, 0; run size */
                                 float tolerance,             /* px that leave a sixteenth of the trust */
                                 float squeezed,              /* area of a pixel that leaves none, as a share */
-                                __global const uchar *once,  /* (cells.y, cells.x): what is taken from one photo */
+                                __global const uchar *mask,  /* (cells.y, cells.x): what is taken from one photo */
                                 int4 cells,                  /* width, height, px of the chart per cell, 0 */
                                 __global const float *image, /* (grid.y, grid.x) a: log brightness, 0 outside */
                                 __global float4 *trusted)    /* (grid.y, grid.x) F_ab, trust, brightness */
@@ -39,8 +39,8 @@ __kernel void consistency_trust(__global const float2 *flow, /* (grid.y, grid.x)
     const int column = LEAST(x / cells.z, cells.x - 1), row = LEAST(y / cells.z, cells.y - 1);
     const float room = (consistency_area(flow, x, y, grid) - squeezed) / (1.0f - squeezed);
     const float shown = LIMITED(room, 0.0f, 1.0f);
-    const bool single = once[row * cells.x + column];
-    trusted[at] = (float4)(f, single ? 0.0f : shown * c * c * c * c, single ? UNTOLD : image[at]);
+    const bool excluded = mask[row * cells.x + column];
+    trusted[at] = (float4)(f, excluded ? 0.0f : shown * c * c * c * c, excluded ? EXCLUDED : image[at]);
 }
 
 /* Halve: the mean flow, weighted by trust, the mean trust and the mean brightness; taps as in pyramid_reduce. */
@@ -54,7 +54,7 @@ __kernel void consistency_push(__global const float4 *trusted, /* (fine.y, fine.
         return;
     const float taps[4] = {0.125f, 0.375f, 0.375f, 0.125f};
     float2 sum = (float2)(0.0f);
-    float trust = 0.0f, brightness = 0.0f, told = 0.0f, weight = 0.0f;
+    float trust = 0.0f, brightness = 0.0f, counted = 0.0f, weight = 0.0f;
     for (int j = 0; j < 4; ++j)
         for (int i = 0; i < 4; ++i) {
             int2 p = (int2)(2 * x - 1 + i, 2 * y - 1 + j);
@@ -64,13 +64,13 @@ __kernel void consistency_push(__global const float4 *trusted, /* (fine.y, fine.
             const float w = taps[i] * taps[j];
             sum += w * f.z * f.xy;
             trust += w * f.z;
-            const float tells = f.w < UNTOLD ? w : 0.0f;
-            brightness += tells * f.w;
-            told += tells;
+            const float counts = f.w < EXCLUDED ? w : 0.0f;
+            brightness += counts * f.w;
+            counted += counts;
             weight += w;
         }
     small[y * size.x + x] = (float4)(trust > 0.0f ? sum / trust : (float2)(0.0f), trust / weight,
-                                     told > 0.0f ? brightness / told : UNTOLD);
+                                     counted > 0.0f ? brightness / counted : EXCLUDED);
 }
 
 /* Less trust, in place, where there is little around: between two wrong flows lies a line on which they happen to
@@ -119,7 +119,7 @@ __kernel void consistency_pull(__global const float4 *trusted, /* (fine.y, fine.
 
 /* How well flow is carried from a pixel to the next, by their brightness: 1 where it is equal. */
 static inline float consistency_conductance(float a, float b, float edge) {
-    const float d = GREATEST(a, b) < UNTOLD ? (a - b) / edge : 0.0f;
+    const float d = GREATEST(a, b) < EXCLUDED ? (a - b) / edge : 0.0f;
     return 1.0f / (1.0f + d * d);
 }
 
@@ -165,6 +165,6 @@ __kernel void consistency_mix(__global const float4 *trusted, /* (grid.y, grid.x
         return;
     const int at = y * grid.x + x;
     const float4 its = trusted[at];
-    const float2 other = its.w < UNTOLD ? filled[at] : wide[at];
+    const float2 other = its.w < EXCLUDED ? filled[at] : wide[at];
     filled[at] = its.z * its.xy + (1.0f - its.z) * other;
 }

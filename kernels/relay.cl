@@ -4,7 +4,7 @@
 /* By how much brightness may be off its mean: what differs by more tells no more. */
 #define RELAY_MOST 0.3f
 
-/* Brightness of the pair's other layer where flow leads from pixel p; UNTOLD where it is not known. */
+/* Brightness of the pair's other layer where flow leads from pixel p; EXCLUDED where it is not known. */
 static inline float relay_seen(__global const float4 *other, int2 p, float2 flow, int4 grid) {
     const float2 q = (float2)(p.x, p.y) + flow;
     const int2 corner = floor_int2(q);
@@ -14,8 +14,8 @@ static inline float relay_seen(__global const float4 *other, int2 p, float2 flow
         for (int i = 0; i < 2; ++i) {
             const int at = grid_index(corner + (int2)(i, j), grid);
             const float c = at < 0 ? 0.0f : other[at].w;
-            if (c == 0.0f || c >= UNTOLD)
-                return UNTOLD;
+            if (c == 0.0f || c >= EXCLUDED)
+                return EXCLUDED;
             sum += (i ? t.x : 1.0f - t.x) * (j ? t.y : 1.0f - t.y) * c;
         }
     return sum;
@@ -44,10 +44,10 @@ __kernel void relay_cells(__global const float4 *found, /* (grid.y, grid.x) from
                 if (!grid_border(&p, grid))
                     continue;
                 const float4 f = found[p.y * grid.x + p.x];
-                if (f.w == 0.0f || f.w >= UNTOLD)
+                if (f.w == 0.0f || f.w >= EXCLUDED)
                     continue;
                 const float seen = relay_seen(other, p, f.xy, grid), d = f.w - seen;
-                if (seen >= UNTOLD)
+                if (seen >= EXCLUDED)
                     continue;
                 if (pass == 0) {
                     known += 1.0f;
@@ -68,7 +68,7 @@ __kernel void relay_cells(__global const float4 *found, /* (grid.y, grid.x) from
     const float told = texture + known * noise * noise, fit = told / (told + 2.0f * misfit);
     const int at = middle.y * grid.x + middle.x;
     const float4 own = found[at];
-    const bool shown = own.w != 0.0f && own.w < UNTOLD && other[at].w != 0.0f;
+    const bool shown = own.w != 0.0f && own.w < EXCLUDED && other[at].w != 0.0f;
     cells[y * size.x + x] = (float4)(own.xy, shown ? own.z : -1.0f,
                                      known < 0.2f * cell * cell ? -1.0f : fit * fit * fit * fit);
 }
@@ -178,7 +178,7 @@ __kernel void relay_take(__global const float4 *sum, /* (grid.y, grid.x) of rela
         return;
     const int at = y * grid.x + x;
     const float4 its = sum[at], own = found[at];
-    if (own.w >= UNTOLD)
+    if (own.w >= EXCLUDED)
         return;
     const float held = its.w * own.z, told = (1.0f - held) * LEAST(its.z / enough, 1.0f);
     const float2 other = its.z > 0.0f ? its.xy / its.z : own.xy;

@@ -11,7 +11,7 @@ from reference import common
 
 from hugin_abflow import relay
 from hugin_abflow.chart import Chart, pair_chart
-from hugin_abflow.consistency import Weighed
+from hugin_abflow.consistency import WeightedFlow
 from hugin_abflow.opencl import Device
 from hugin_abflow.working import Grid
 
@@ -73,13 +73,13 @@ class Scene:
             brightness = np.where(self.shown[layer][row, column], brightness, 0)
         return brightness
 
-    def _weighed(self, a: int, b: int, chart: Chart) -> Weighed:
+    def _weighed(self, a: int, b: int, chart: Chart) -> WeightedFlow:
         ways = []
         for start, end in ((a, b), (b, a)):
             trust = np.ones((chart.height, chart.width))
             values = [*np.moveaxis(self.flow(start, end), -1, 0), trust, self._brightness(start, chart)]
             ways.append(self.device.upload(np.stack(values, -1).astype(np.float32)))
-        return Weighed(a, b, chart, *ways, False)
+        return WeightedFlow(a, b, chart, *ways, False)
 
     def change(self, a: int, b: int, edit: Callable[[np.ndarray, int], None]) -> None:
         """Edit a pair's found flow in place, that from a to b with 1, and back with -1."""

@@ -9,7 +9,7 @@ from grids import sphere
 from rooms import ROOM, Thing, hit, pattern, unit
 
 from hugin_abflow import movers
-from hugin_abflow.cells import View, Whole
+from hugin_abflow.cells import SingleSource, View
 from hugin_abflow.chart import Chart, pair_chart
 from hugin_abflow.decision import Refused
 
@@ -51,7 +51,7 @@ class Scene:
 
     def found(
         self, points: tuple[Array, Array] = NOBODY, refused: tuple[Array, Array] | None = None
-    ) -> Whole | None:
+    ) -> SingleSource | None:
         return movers.find(
             self.chart, self.flows, self.views, points, [Refused(0, np.stack(refused))] if refused else ()
         )

@@ -106,7 +106,7 @@ def test_modules_have_the_numbers_of_their_kernels() -> None:
         "INTERMEDIATE_CHUNK": intermediate._CHUNK,
         "SEARCH_MARGIN": search._MARGIN,
         "SEARCH_RADIUS": search._LARGEST_RADIUS,
-        "UNTOLD": consistency.UNTOLD,
+        "EXCLUDED": consistency.EXCLUDED,
     }.items():
         assert numbers[name] == number, name
 

@@ -10,7 +10,7 @@ from reference import common
 from scenes import CANVAS, CHARTS
 from scipy import ndimage
 
-from hugin_abflow.cells import CELL, Whole, ends_within
+from hugin_abflow.cells import CELL, SingleSource, ends_within
 from hugin_abflow.chart import pair_chart
 from hugin_abflow.layer import Box
 from hugin_abflow.working import Grid
@@ -28,7 +28,7 @@ def check_on_canvas(grid: Grid, at: int) -> None:
     first[rows - 9 : rows - 2, columns - 5 : columns + 6] = True
     second[rows + 1 : rows + 4, columns + 2 : columns + 9] = True
     cells = grid.resized(round(grid.width / 7.9), 23)
-    found = Whole(first, second).on_canvas(chart, cells)
+    found = SingleSource(first, second).on_canvas(chart, cells)
     assert found.shape == cells.shape
     x, y = (n + 0.5 for n in common.pixels(cells.width, cells.height))
     u, v = common.chart_position(common.canvas_point(x, y, cells.lonlat), chart.transform)
@@ -40,8 +40,8 @@ def check_on_canvas(grid: Grid, at: int) -> None:
     expected = ndimage.binary_dilation(expected, np.ones((3, 3)))[:, 1:-1]
     assert 20 < expected.sum() < 200
     assert np.array_equal(found, expected)
-    assert np.array_equal(Whole(first, second).finer().on_canvas(chart.finer(), cells), expected)
-    assert not Whole(empty, empty).on_canvas(chart, cells).any()
+    assert np.array_equal(SingleSource(first, second).finer().on_canvas(chart.finer(), cells), expected)
+    assert not SingleSource(empty, empty).on_canvas(chart, cells).any()
 
 
 LONLAT = (-np.pi, CANVAS.lonlat[1], np.pi / 2 - 90 * CANVAS.lonlat[3], CANVAS.lonlat[3])
@@ -63,7 +63,7 @@ def test_cells_are_those_of_a_region_of_the_canvas() -> None:
 def test_around_the_canvas_every_cell_has_one_of_the_chart() -> None:
     chart = CHARTS[True]
     shape = (chart.height + 1) // CELL, (chart.width + 1) // CELL
-    everywhere = Whole(np.ones(shape, bool), np.zeros(shape, bool))
+    everywhere = SingleSource(np.ones(shape, bool), np.zeros(shape, bool))
     found = everywhere.on_canvas(chart, CANVAS.resized(90, 45))
     assert found[20:25].all() and not found[:5].any() and not found[-5:].any()
 

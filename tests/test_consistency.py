@@ -13,7 +13,7 @@ from scipy import ndimage
 from tolerances import SUM, assert_close
 
 from hugin_abflow import consistency
-from hugin_abflow.cells import CELL, Whole
+from hugin_abflow.cells import CELL, SingleSource
 from hugin_abflow.chart import Chart
 from hugin_abflow.geometry import PairFlow
 from hugin_abflow.opencl import Device
@@ -30,7 +30,7 @@ def random_trusted(seed: int, width: int, height: int) -> np.ndarray:
     trusted = random.normal(size=(height, width, 4)).astype(np.float32) * 3
     trusted[..., 2] = random.random((height, width)) * patches(seed, width, height, 0.6)
     trusted[..., 3] = random.normal(size=(height, width)) * 0.05 + patches(seed + 1, width, height, 0.5) * 0.7
-    trusted[patches(seed + 2, width, height, 0.15) > 0, 3] = twin.UNTOLD
+    trusted[patches(seed + 2, width, height, 0.15) > 0, 3] = twin.EXCLUDED
     return trusted
 
 
@@ -70,16 +70,16 @@ def test_twin_of_push_is_a_weighted_mean(wraps: bool, width: int) -> None:
                     trusts.append(own[2])
                     bright.append(own[3])
                     weights.append(taps[i] * taps[j])
-                    told.append(weights[-1] * (own[3] < twin.UNTOLD))
+                    told.append(weights[-1] * (own[3] < twin.EXCLUDED))
         assert small[row, column, 2] == pytest.approx(np.average(trusts, weights=weights))
-        expected = np.average(bright, weights=told) if sum(told) else twin.UNTOLD
+        expected = np.average(bright, weights=told) if sum(told) else twin.EXCLUDED
         assert small[row, column, 3] == pytest.approx(expected)
         counted = np.multiply(weights, trusts)
         mean = counted @ np.array(flows) / counted.sum() if counted.sum() else np.zeros(2)
         assert np.allclose(small[row, column, :2], mean)
     assert (small[..., 2] == 0).any()
     assert (small[..., 2] > 0.3).any()
-    assert (small[..., 3] == twin.UNTOLD).any()
+    assert (small[..., 3] == twin.EXCLUDED).any()
 
 
 @pytest.mark.parametrize("size", SIZES)
@@ -143,7 +143,7 @@ def test_twin_of_sweeps_ends_at_the_systems_solution(wraps: bool, width: int) ->
     for one, other in joints:
         for i, j in zip(one.ravel(), other.ravel(), strict=True):
             ends = trusted[..., 3].ravel()[[i, j]]
-            difference = 0 if twin.UNTOLD in ends else ends[0] - ends[1]
+            difference = 0 if twin.EXCLUDED in ends else ends[0] - ends[1]
             carried = edge**2 / (edge**2 + difference**2)
             matrix[[i, j, i, j], [i, j, j, i]] += np.array([1, 1, -1, -1]) * carried
     expected = np.linalg.solve(matrix, counts[:, None] * trusted[..., :2].reshape(-1, 2))
@@ -192,7 +192,7 @@ def mended(
     grid: Grid,
     forward: np.ndarray,
     backward: np.ndarray,
-    moved: Whole | None = None,
+    moved: SingleSource | None = None,
     images: tuple[np.ndarray | None, np.ndarray | None] = (None, None),
 ) -> tuple[np.ndarray, np.ndarray]:
     """Both flows mended; images: what the layers show, on the chart; None: nothing."""
@@ -201,7 +201,7 @@ def mended(
     nothing = np.zeros(forward.shape[:2])
     shown = [device.upload((nothing if one is None else one).astype(np.float32)) for one in images]
     levels = [Level(one, device.zeros(nothing.shape), pair.chart.wraps) for one in shown]
-    result = consistency.mend(device, consistency.weigh(device, pair, levels, moved))
+    result = consistency.fill(device, consistency.weigh(device, pair, levels, moved))
     assert (result.a, result.b, result.chart) == (0, 1, pair.chart)
     return result.forward.get(), result.backward.get()
 
@@ -286,7 +286,7 @@ def test_flow_of_what_moved_is_filled_from_around(device: Device, name: str, col
         there[: CELL * cells.shape[0]][np.kron(cells, np.ones((CELL, CELL), bool))] = way, 0
         places.append(cells)
         flows.append(there)
-    filled = mended(device, CANVASES[name], *flows, Whole(*places))
+    filled = mended(device, CANVASES[name], *flows, SingleSource(*places))
     assert max(np.abs(flow).max() for flow in filled) < LEFT
     for kept, flow in zip(mended(device, CANVASES[name], *flows), flows, strict=True):
         # at its outline what is before and what is behind are told apart by brightness, and here is none
@@ -358,14 +358,14 @@ def test_a_line_on_which_wrong_flows_lead_back_counts_little(device: Device) -> 
     assert np.abs(result[..., 0] - 4)[patch & (rows != 30)].mean() < 3
 
 
-def moved_place(grid: Grid) -> tuple[Whole, np.ndarray]:
+def moved_place(grid: Grid) -> tuple[SingleSource, np.ndarray]:
     """Cells that moved, and their pixels."""
     found = whole_chart(grid)
     cells = np.zeros((found.height // CELL, found.width // CELL), bool)
     cells[5:11, 2:8] = True
     place = np.zeros((found.height, found.width), bool)
     place[: CELL * cells.shape[0], : CELL * cells.shape[1]] = np.kron(cells, np.ones((CELL, CELL), bool))
-    return Whole(cells, cells), place
+    return SingleSource(cells, cells), place
 
 
 def test_place_of_what_moved_gets_all_of_the_motion_around(device: Device) -> None:

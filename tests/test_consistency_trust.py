@@ -84,7 +84,7 @@ def test_twin_of_trust_has_none_in_what_moved(size: tuple[int, int]) -> None:
     trusted = twin.consistency_trust(still, still, grid, 1.5, 0.6, moved, cells, still[..., 0])
     for y, x in np.ndindex(trusted.shape[:2]):
         its = moved[min(y // CELL, rows - 1), min(x // CELL, columns - 1)]
-        assert tuple(trusted[y, x, 2:]) == ((0, twin.UNTOLD) if its else (1, 0))
+        assert tuple(trusted[y, x, 2:]) == ((0, twin.EXCLUDED) if its else (1, 0))
 
 
 @pytest.mark.parametrize("size", SIZES)

@@ -18,7 +18,7 @@ from scenes import NOBODY
 from scipy import ndimage
 
 from hugin_abflow import foreground, movers
-from hugin_abflow.cells import CELL, View, Whole
+from hugin_abflow.cells import CELL, SingleSource, View
 from hugin_abflow.layer import Canvas
 
 Array = np.ndarray
@@ -40,7 +40,7 @@ class Pair:
     views: tuple[View, View]
     thing: tuple[Array, Array]
 
-    def found(self, points: tuple[Array, Array] = NOBODY) -> Whole | None:
+    def found(self, points: tuple[Array, Array] = NOBODY) -> SingleSource | None:
         return foreground.find(self.chart, self.flows, self.views, points)
 
 
@@ -88,7 +88,7 @@ def pair(
     return Pair(chart, tuple(flows), views, tuple(things))
 
 
-def assert_found(found: Whole | None, of: Pair) -> None:
+def assert_found(found: SingleSource | None, of: Pair) -> None:
     """The cells in whose middle a photo shows the thing, if the other one does, too, and those around."""
     assert found is not None
     modes = "constant", "wrap" if of.chart.wraps else "constant"

@@ -23,7 +23,7 @@ from pictures import (
 )
 
 from hugin_abflow import chart, coefficient, consistency, joint, merge, single
-from hugin_abflow.cells import Whole
+from hugin_abflow.cells import SingleSource
 from hugin_abflow.errors import SettingsError
 from hugin_abflow.layer import Box, Canvas, Layer
 from hugin_abflow.opencl import Device
@@ -348,7 +348,7 @@ def test_only_transitions_do_without_distances(monkeypatch, canvas, strain):
 def test_every_pair_is_mended_with_its_own_images(monkeypatch, looked_for):
     """Each with what is taken whole, whatever others are worked on meanwhile, and told in their order."""
     sampled, weighed, mended, found, given = [], {}, {}, {}, []
-    sample, weigh, mend, align = chart.sample, consistency.weigh, consistency.mend, joint._align
+    sample, weigh, mend, align = chart.sample, consistency.weigh, consistency.fill, joint._align
 
     def spy_sample(device, layer, grid, chart):
         level = sample(device, layer, grid, chart)
@@ -364,7 +364,7 @@ def test_every_pair_is_mended_with_its_own_images(monkeypatch, looked_for):
         return mended.setdefault(id(found), mend(device, found))
 
     def spy_find(chart, *_):
-        return found.setdefault(id(chart), Whole(nowhere, nowhere) if looked_for else None)
+        return found.setdefault(id(chart), SingleSource(nowhere, nowhere) if looked_for else None)
 
     def spy_align(device, layers, pairs, flows, *rest):
         given.append((layers, pairs, list(flows)))
@@ -375,7 +375,7 @@ def test_every_pair_is_mended_with_its_own_images(monkeypatch, looked_for):
     monkeypatch.setattr(single, "on_canvas", lambda *_: None)
     monkeypatch.setattr(chart, "sample", spy_sample)
     monkeypatch.setattr(consistency, "weigh", spy_weigh)
-    monkeypatch.setattr(consistency, "mend", spy_mend)
+    monkeypatch.setattr(consistency, "fill", spy_mend)
     monkeypatch.setattr(joint, "_align", spy_align)
     merged(moving(SPHERE), SPHERE, movers=looked_for, foreground=False)
     [(layers, pairs, flows)] = given

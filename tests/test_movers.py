@@ -12,7 +12,7 @@ from rooms import Thing
 from scenes import LEFT, UP, Scene, scene
 from scipy import ndimage
 
-from hugin_abflow.cells import CELL, LEAST, Whole
+from hugin_abflow.cells import CELL, LEAST, SingleSource
 
 Array = np.ndarray
 
@@ -33,7 +33,7 @@ def grown(cells: Array, wraps: bool) -> Array:
     return ndimage.binary_dilation(tiled, np.ones((7, 7)))[:, 9:-9]
 
 
-def assert_found(found: Whole | None, of: Scene, *numbers: int) -> None:
+def assert_found(found: SingleSource | None, of: Scene, *numbers: int) -> None:
     """Just these things are, in each photo where it shows them: in cells whose middle does, perhaps in those
     where one of the other photo leads, and in those around."""
     assert found is not None
@@ -310,7 +310,7 @@ def test_what_somebody_vouches_for_is_left_alone(wraps: bool) -> None:
         assert_found(one.found((starts, ends)), one, 1 - thing)
         turned = replace(one, flows=one.flows[::-1], views=one.views[::-1]).found((ends, starts))
         assert turned is not None
-        assert_found(Whole(turned.second, turned.first), one, 1 - thing)
+        assert_found(SingleSource(turned.second, turned.first), one, 1 - thing)
     for off in ((0, 8), (0, -8), (8, 0)):
         assert_found(one.found(one.vouch(0, off)), one, 0, 1)
 

@@ -13,7 +13,7 @@ from pictures import merged, one_device
 from scipy import ndimage
 
 from hugin_abflow import chart, consistency, flow, guidance, joint, opencl, pairflow, quality, relay, single
-from hugin_abflow.cells import Whole
+from hugin_abflow.cells import SingleSource
 from hugin_abflow.errors import SettingsError
 from hugin_abflow.guides import Guide
 from hugin_abflow.layer import Canvas, Layer
@@ -251,13 +251,13 @@ def test_what_is_taken_whole_is_told_on_the_chart_that_its_flow_has(
     """It is looked for on the coarse one."""
     seen, places = [], []
 
-    def find(its_chart: chart.Chart, *_: Any) -> Whole:
+    def find(its_chart: chart.Chart, *_: Any) -> SingleSource:
         first = np.zeros((its_chart.height // 4, its_chart.width // 4), bool)
         first[5:8, 3:6] = True
-        seen.append((its_chart, Whole(first, ~first)))
+        seen.append((its_chart, SingleSource(first, ~first)))
         return seen[-1][1]
 
-    def on_canvas(found: list[Whole], charts: list[chart.Chart], cells: Grid) -> None:
+    def on_canvas(found: list[SingleSource], charts: list[chart.Chart], cells: Grid) -> None:
         places.append([one.on_canvas(its_chart, cells) for one, its_chart in zip(found, charts, strict=True)])
 
     monkeypatch.setattr(single, "find", find)
@@ -293,8 +293,8 @@ def test_flow_is_compared_with_that_of_other_pairs(monkeypatch: pytest.MonkeyPat
     monkeypatch.setattr(
         relay, "mend", lambda device, found, *_: asked.append([(one.a, one.b) for one in found]) or []
     )
-    fill = consistency.mend
-    monkeypatch.setattr(consistency, "mend", lambda *given: filled.append(len(asked)) or fill(*given))
+    fill = consistency.fill
+    monkeypatch.setattr(consistency, "fill", lambda *given: filled.append(len(asked)) or fill(*given))
     two = layers(31)
     merged(two, CANVAS, relay=wanted)
     assert asked == [] and filled == [0]

@@ -29,7 +29,7 @@ def random_found(seed: int, width: int, height: int, far: float = 2.0) -> np.nda
     found[..., 0], found[..., 1] = far * np.sin(x / 9 + seed), far * np.cos(y / 7 + x / 23)
     found[..., 2] = random.random((height, width)) * patches(seed, width, height, 0.8)
     found[..., 3] = random.normal(size=(height, width)) * 0.05 + patches(seed + 1, width, height, 0.5) * 0.7
-    found[patches(seed + 2, width, height, 0.1, 9) > 0, 3] = consistency_twin.UNTOLD
+    found[patches(seed + 2, width, height, 0.1, 9) > 0, 3] = consistency_twin.EXCLUDED
     found[patches(seed + 3, width, height, 0.1, 9) > 0, 3] = 0
     return found.astype(np.float32)
 
@@ -135,7 +135,7 @@ def test_taking_equals_its_twin(device: Device, counts: float) -> None:
     assert_close(result.get()[..., 2:], expected[..., 2:], SUM)
     sure = expected[..., 2] > 0.05
     assert_close(result.get()[sure][:, :2], expected[sure][:, :2], 1e-4)
-    single = found[..., 3] >= consistency_twin.UNTOLD
+    single = found[..., 3] >= consistency_twin.EXCLUDED
     assert single.any() and np.array_equal(result.get()[single], found[single])
 
 
@@ -233,9 +233,9 @@ def test_exact_flow_stays_where_others_nearly_agree(device: Device) -> None:
 def test_of_many_layers_those_with_the_largest_overlaps_are_asked(
     device: Device, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    asked, others = [], relay._others
+    asked, composed = [], relay._composed
     monkeypatch.setattr(
-        relay, "_others", lambda *given: asked.append((given[2], list(given[3]))) or others(*given)
+        relay, "_composed", lambda *given: asked.append((given[2], list(given[3]))) or composed(*given)
     )
     canvas = CANVASES["plane"]
     columns = np.indices(canvas.shape)[1]
@@ -263,7 +263,7 @@ def told(scene: Scene, a: int, b: int) -> np.ndarray:
     scene.found = [one for one in scene.found if (one.a, one.b) != (a, b)]
     scene.mend()
     before = scene.state()
-    relay.tell(scene.device, relay.compare(scene.device, scene.found), unknown)
+    relay.infer(scene.device, relay.compare(scene.device, scene.found), unknown)
     assert all(map(np.array_equal, before, scene.state()))
     scene.found += unknown
     return np.minimum(*(buffer.get()[..., 2] for buffer in scene.buffers(a, b)))

@@ -35,7 +35,7 @@ def chosen(spans: Spans, grid: Grid, pairs: Sequence[tuple[int, int]] | None = N
     shown = [(columns >= first) & (columns < end) for first, end in spans]
     pairs = [p for p in pairs or combinations(range(len(spans)), 2) if (shown[p[0]] & shown[p[1]]).any()]
     overlaps = [shown[a] & shown[b] for a, b in pairs]
-    found = relay.relayed([Pair(*pair) for pair in pairs], overlaps, grid)
+    found = relay.inferable([Pair(*pair) for pair in pairs], overlaps, grid)
     return {(min(pair), max(pair)) for pair, its in zip(pairs, found, strict=True) if its}
 
 
@@ -67,11 +67,11 @@ def test_others_have_to_show_all_of_it() -> None:
         middle = rows < below
         shown = [first, last, middle]
         pairs = [(0, 1), (0, 2), (1, 2)]
-        found = relay.relayed([Pair(*p) for p in pairs], [shown[a] & shown[b] for a, b in pairs], grid)
+        found = relay.inferable([Pair(*p) for p in pairs], [shown[a] & shown[b] for a, b in pairs], grid)
         assert found == [expected, False, False], below
     shown += [rows >= 40, rows < 60]
     pairs = [(0, 1), (0, 3), (1, 3), (0, 4), (1, 4)]
-    found = relay.relayed([Pair(*p) for p in pairs], [shown[a] & shown[b] for a, b in pairs], grid)
+    found = relay.inferable([Pair(*p) for p in pairs], [shown[a] & shown[b] for a, b in pairs], grid)
     assert found == [True, False, False, False, False]
 
 
@@ -88,9 +88,9 @@ def test_what_is_relayed_stands_for_nothing_else() -> None:
         for first, end in spans:
             masks[index, 0, first:end] = True
     pairs = [Pair(*pair) for pair in ((0, 1), (0, 2), (1, 2), (0, 3), (1, 3))]
-    assert relay.relayed(pairs, masks, plane(120, 1)) == [True, False, False, False, False]
+    assert relay.inferable(pairs, masks, plane(120, 1)) == [True, False, False, False, False]
     del pairs[3:]
-    assert relay.relayed(pairs, masks[:3], plane(120, 1)) == [False, True, False]
+    assert relay.inferable(pairs, masks[:3], plane(120, 1)) == [False, True, False]
 
 
 def test_at_a_pole_a_row_is_small() -> None:
@@ -101,10 +101,10 @@ def test_at_a_pole_a_row_is_small() -> None:
     overlaps = [cap, wider, wider]
     pairs = [Pair(0, 1), Pair(0, 2), Pair(1, 2)]
     assert 3 * np.count_nonzero(cap) > np.count_nonzero(wider)
-    assert relay.relayed(pairs, overlaps, grid) == [True, False, False]
+    assert relay.inferable(pairs, overlaps, grid) == [True, False, False]
     half = wider & (columns < 39)  # the third shows half of the cap with each of both, or all with one
-    assert relay.relayed(pairs, [cap, half, half], grid) == [False, False, False]
-    assert relay.relayed(pairs, [cap, half, wider], grid) == [False, False, False]
+    assert relay.inferable(pairs, [cap, half, half], grid) == [False, False, False]
+    assert relay.inferable(pairs, [cap, half, wider], grid) == [False, False, False]
 
 
 @given(st.lists(st.tuples(st.integers(0, 100), st.integers(5, 90)), min_size=3, max_size=7), st.randoms())
@@ -174,8 +174,8 @@ def layers(changed: slice | None = None) -> list[Layer]:
 @pytest.fixture
 def found(monkeypatch: pytest.MonkeyPatch) -> list[PairFlow]:
     """The flows of all pairs, mended."""
-    seen, mend = list[PairFlow](), consistency.mend
-    monkeypatch.setattr(consistency, "mend", lambda *given: seen.append(mend(*given)) or seen[-1])
+    seen, mend = list[PairFlow](), consistency.fill
+    monkeypatch.setattr(consistency, "fill", lambda *given: seen.append(mend(*given)) or seen[-1])
     return seen
 
 
@@ -333,7 +333,7 @@ def test_figures_and_flow_of_what_is_unknown(device: Device) -> None:
     image = np.random.default_rng(1).normal(size=grid.shape).astype(np.float32)
     level = Level(device.upload(image), device.empty(grid.shape).fill(1), False)
     one = consistency.unknown(device, Pair(0, 1), chart, (level, level))
-    assert consistency.known(one) == 0 and not one.whole
+    assert consistency.known(one) == 0 and not one.single
     assert np.array_equal(one.forward.get()[..., 3], image)
     assert not one.forward.get()[..., :3].any() and not one.backward.get()[..., :3].any()
     assert parallax(one, grid).consistent == 0
@@ -343,7 +343,7 @@ def test_figures_and_flow_of_what_is_unknown(device: Device) -> None:
     one.forward.set(values)
     told = parallax(one, grid)
     assert (told.median, told.largest) == (5, 5) and told.consistent == pytest.approx(10 / 53)
-    values[20:, :, 3] = consistency.UNTOLD  # taken from one photo, whole
+    values[20:, :, 3] = consistency.EXCLUDED  # taken from one photo, whole
     one.forward.set(values)
     assert parallax(one, grid).consistent == pytest.approx(10 / 20)
     values[20:, :70, 3], values[20:, 70:, 3] = image[20:, :70], 0

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from hugin_abflow import foreground, movers, single
-from hugin_abflow.cells import Whole
+from hugin_abflow.cells import SingleSource
 
 
 @pytest.mark.parametrize("movers_too", [False, True])
@@ -18,7 +18,7 @@ def test_both_kinds_are_taken_whole(
     monkeypatch: pytest.MonkeyPatch, movers_too: bool, foreground_too: bool
 ) -> None:
     rng = np.random.default_rng(1)
-    one, other = (Whole(rng.random((9, 9)) < 0.3, rng.random((9, 9)) < 0.3) for _ in range(2))
+    one, other = (SingleSource(rng.random((9, 9)) < 0.3, rng.random((9, 9)) < 0.3) for _ in range(2))
     monkeypatch.setattr(movers, "find", lambda *given: one if given == (1, 2, 3, 4, 5) else None)
     monkeypatch.setattr(foreground, "find", lambda *given: other if given == (1, 2, 3, 4) else None)
     found = single.find(1, 2, 3, 4, 5, SimpleNamespace(movers=movers_too, foreground=foreground_too))

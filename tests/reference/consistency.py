@@ -9,7 +9,7 @@ import numpy as np
 from reference.common import Array, bilinear, pixels
 
 # Brightness of what tells nothing.
-UNTOLD = 1e3
+EXCLUDED = 1e3
 
 
 def area_there(flow: Array, grid: Sequence[int]) -> Array:
@@ -52,7 +52,7 @@ def consistency_trust(
     trust = (1 + (away / tolerance) ** 2) ** -4
     trust = trust * np.clip((area_there(flow, grid) - squeezed) / (1 - squeezed), 0, 1)
     gone = on_pixels(moved, cells[2], grid)
-    return np.dstack([flow, np.where(gone, 0, trust), np.where(gone, UNTOLD, image)])
+    return np.dstack([flow, np.where(gone, 0, trust), np.where(gone, EXCLUDED, image)])
 
 
 def _around(values: Array, fine: Sequence[int]) -> Array:
@@ -65,14 +65,14 @@ def consistency_push(trusted: Array, fine: Sequence[int]) -> Array:
     """Trust-weighted mean flow, mean trust and brightness, ((height + 1) // 2, (width + 1) // 2, 4)."""
     width, height = fine[:2]
     trust, bright = trusted[..., 2].astype(np.float64), trusted[..., 3]
-    tells = bright < UNTOLD
+    tells = bright < EXCLUDED
     parts = [trusted[..., 0] * trust, trusted[..., 1] * trust, trust, bright * tells, tells]
     padded, total = _around(np.dstack([*parts, np.ones_like(trust)]), fine), 0.0
     for (j, i), tap in np.ndenumerate(np.outer([1, 3, 3, 1], [1, 3, 3, 1]) / 64):
         total = total + tap * padded[2 + j : 2 + j + height : 2, 2 + i : 2 + i + width : 2]
     known, told = total[..., 2:3] > 0, total[..., 4] > 0
     mean = np.where(known, total[..., :2] / np.where(known, total[..., 2:3], 1), 0)
-    brightness = np.where(told, total[..., 3] / np.where(told, total[..., 4], 1), UNTOLD)
+    brightness = np.where(told, total[..., 3] / np.where(told, total[..., 4], 1), EXCLUDED)
     return np.dstack([mean, total[..., 2] / total[..., 5], brightness])
 
 
@@ -120,7 +120,7 @@ def consistency_relax(
         x, y = columns + dx, rows + dy
         there = (y >= 0) & (y < height) & (joined | ((x >= 0) & (x < width)))
         x, y = np.where(there, x % width, columns), np.where(there, y, rows)
-        told = np.maximum(trusted[y, x, 3], trusted[..., 3]) < UNTOLD
+        told = np.maximum(trusted[y, x, 3], trusted[..., 3]) < EXCLUDED
         difference = told * (trusted[y, x, 3].astype(np.float64) - trusted[..., 3]) / edge
         carried = there / (1 + difference**2)
         total, weight = total + carried[..., None] * filled[y, x], weight + carried
@@ -134,4 +134,4 @@ def consistency_mix(trusted: Array, wide: Array, filled: Array) -> Array:
     width, 2).
     """
     trust = trusted[..., 2:3]
-    return trust * trusted[..., :2] + (1 - trust) * np.where(trusted[..., 3:] < UNTOLD, filled, wide)
+    return trust * trusted[..., :2] + (1 - trust) * np.where(trusted[..., 3:] < EXCLUDED, filled, wide)

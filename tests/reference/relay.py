@@ -17,13 +17,13 @@ from reference.common import (
     on_grid,
     pixels,
 )
-from reference.consistency import UNTOLD
+from reference.consistency import EXCLUDED
 
 MOST = 0.3
 
 
 def _shown(brightness: Array) -> Array:
-    return (brightness != 0) & (brightness < UNTOLD)
+    return (brightness != 0) & (brightness < EXCLUDED)
 
 
 def seen(other: Array, flow: Array, grid: Sequence[int]) -> tuple[Array, Array]:
@@ -136,4 +136,4 @@ def relay_take(total: Array, enough: float, agrees: float, counts: float, found:
     mixed = (kept[..., None] * own + taken[..., None] * other) / np.maximum(kept + taken, 1e-9)[..., None]
     flow = np.where((taken > 0)[..., None], mixed, own)
     changed = np.dstack([flow, kept + taken, found[..., 3]])
-    return np.where((found[..., 3] < UNTOLD)[..., None], changed, found)
+    return np.where((found[..., 3] < EXCLUDED)[..., None], changed, found)
