@@ -135,8 +135,8 @@ def coefficients(
     """The blend coefficients w_k of all layers, float32 on their boxes of the working grid: 0 outside the
     layer, 1 where it is alone.
 
-    even    where several are, the same for all of them: enough where `transition.settle` then tells what
-            they are, and without distances, which take time.
+    even    equal shares where several layers are: enough where `transition.minimise_strain` then finds them,
+            and done without distances, which take time.
     """
     total = device.zeros(grid.shape)
     ratio = (masks_.grid.width / grid.width, masks_.grid.height / grid.height)

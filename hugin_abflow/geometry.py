@@ -38,14 +38,15 @@ class PairFlow(Pair):
     """Flow between the layers of a pair on their chart: float32 (height, width, 2), chart px.
 
     `forward` is F_ab: what a shows at q, b shows at q + F_ab(q); `backward` is F_ba. After intermediate.py
-    they are ways through q, no longer from q.
+    both
+    are of what passes through q, no longer of what starts there.
     """
 
     chart: Chart
     forward: Buffer
     backward: Buffer
 
-    def between(self, source: int) -> Buffer:
+    def starting_on(self, source: int) -> Buffer:
         """Flow that starts on layer `source` of the pair."""
         return self.forward if source == self.a else self.backward
 
@@ -105,8 +106,8 @@ def _displacement(
         other = pair.b if index == pair.a else pair.a
         device.run(
             "geometry", "geometry_add", chunks, coefficients[other], layers[other].box, layer.pixels,
-            layer.box, grid.border, grid.lonlat, pair.between(other), pair.chart.border, pair.chart.transform,
-            number == 0, field,
+            layer.box, grid.border, grid.lonlat, pair.starting_on(other), pair.chart.border,
+            pair.chart.transform, number == 0, field,
         )  # fmt: skip
     return field
 

@@ -97,7 +97,7 @@ def lead(
     circumference   of the canvas in px of the chart.
     """
     parameters, count = parameters or GuidanceParameters(), len(guides)
-    ways = list(_ways(images[0].grid, (flows[0].get(), flows[1].get()), guides))
+    ways = list(_directed(images[0].grid, (flows[0].get(), flows[1].get()), guides))
     wrong = _wrong(ways, parameters.agreement)
     if not wrong.any():
         return flows
@@ -137,10 +137,10 @@ def lead(
     nearness = [spring.at(0)[1] for spring in springs]
     for rival, near in zip(rivals, nearness, strict=True):
         _choose(device, rival, near, parameters)
-    settled = flow.pair_flow(device, *images, solved, Start(0, (found[0], found[1])))
-    for one, near, result in zip(settled, nearness, flows, strict=True):
+    refined = flow.pair_flow(device, *images, solved, Start(0, (found[0], found[1])))
+    for one, near, result in zip(refined, nearness, flows, strict=True):
         grid = images[0].grid
-        device.run("guidance", "guidance_settle", grid[:2], one, near, grid, result)
+        device.run("guidance", "guidance_blend", grid[:2], one, near, grid, result)
     return flows
 
 
@@ -156,7 +156,7 @@ def contradict(
     chart       of both, `times` as fine as that on which guides lead.
     """
     agreement = (parameters or GuidanceParameters()).agreement
-    return bool(_wrong(_ways(chart.border, flows, guides), times * agreement).any())
+    return bool(_wrong(_directed(chart.border, flows, guides), times * agreement).any())
 
 
 def held(
@@ -169,7 +169,7 @@ def held(
     to b and back.
     """
     agreement = (parameters or GuidanceParameters()).agreement
-    ways = _ways(images[0].grid, (flows[0].get(), flows[1].get()), guides)
+    ways = _directed(images[0].grid, (flows[0].get(), flows[1].get()), guides)
     agree = np.ones(len(guides), bool)
     for image, way in zip(images, ways, strict=True):
         inside, (row, column) = pixels_at(way.places, image.grid)
@@ -180,7 +180,7 @@ def held(
 
 
 @dataclass(frozen=True)
-class _Way:
+class _DirectedGuides:
     """The guides in one direction: places, moves and what the flow there lacks to them, (n, 2) px.
 
     A residual is 0 where the place is not on the chart.
@@ -190,17 +190,19 @@ class _Way:
     moves: Points
     residuals: Points
 
-    def only(self, chosen: npt.NDArray[np.bool_]) -> _Way:
-        return _Way(self.places[chosen], self.moves[chosen], self.residuals[chosen])
+    def only(self, chosen: npt.NDArray[np.bool_]) -> _DirectedGuides:
+        return _DirectedGuides(self.places[chosen], self.moves[chosen], self.residuals[chosen])
 
 
-def _wrong(ways: Sequence[_Way], agreement: float) -> npt.NDArray[np.bool_]:
+def _wrong(ways: Sequence[_DirectedGuides], agreement: float) -> npt.NDArray[np.bool_]:
     """Which guides lie farther than that from the flow in one direction."""
     far = [np.linalg.norm(way.residuals, axis=1) > agreement for way in ways]
     return np.asarray(np.any(far, axis=0))
 
 
-def _ways(grid: tuple[int, int, int, int], flows: Flows, guides: ChartGuides) -> tuple[_Way, _Way]:
+def _directed(
+    grid: tuple[int, int, int, int], flows: Flows, guides: ChartGuides
+) -> tuple[_DirectedGuides, _DirectedGuides]:
     width, _, wraps, _ = grid
     moves = guides.at_b - guides.at_a
     if wraps:
@@ -209,7 +211,7 @@ def _ways(grid: tuple[int, int, int, int], flows: Flows, guides: ChartGuides) ->
     for field, places, way in zip(flows, (guides.at_a, guides.at_b), (moves, -moves), strict=True):
         inside, (row, column) = pixels_at(places, grid)
         found = field[row * inside, column * inside]
-        ways.append(_Way(places, way, np.where(inside[:, None], way - found, 0.0)))
+        ways.append(_DirectedGuides(places, way, np.where(inside[:, None], way - found, 0.0)))
     return ways[0], ways[1]
 
 
@@ -217,7 +219,12 @@ class _Springs:
     """Start and springs of one direction, on any level."""
 
     def __init__(
-        self, device: Device, image: Level, found: Buffer, way: _Way, parameters: GuidanceParameters
+        self,
+        device: Device,
+        image: Level,
+        found: Buffer,
+        way: _DirectedGuides,
+        parameters: GuidanceParameters,
     ) -> None:
         self._device, self._image, self._found, self._parameters = device, image, found, parameters
         way = way.only(np.any(way.residuals, axis=1))  # the others are not on the chart
@@ -252,7 +259,7 @@ class _Springs:
         )  # fmt: skip
 
 
-def _sigmas(way: _Way, period: float, parameters: GuidanceParameters) -> Values:
+def _sigmas(way: _DirectedGuides, period: float, parameters: GuidanceParameters) -> Values:
     """How far each guide leads, px; `period`: as of `guides.doubts`."""
     lengths = np.linalg.norm(way.residuals, axis=1)
     sigmas = lengths.copy()
@@ -296,7 +303,9 @@ class _Rivals:
         return cls(grid, feature, old, new, brought)
 
 
-def _refusals(rivals: Sequence[_Rivals], ways: Sequence[_Way], parameters: GuidanceParameters) -> list[str]:
+def _refusals(
+    rivals: Sequence[_Rivals], ways: Sequence[_DirectedGuides], parameters: GuidanceParameters
+) -> list[str]:
     """Why guides are ignored after all, "" where they are not: what the images say around each of them."""
     radius = math.ceil(2 * parameters.witness)
     steps = np.arange(-radius, radius + 1)

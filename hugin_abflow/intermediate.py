@@ -1,12 +1,12 @@
 """Flow as it passes through the view between two layers (kernels/intermediate.cl).
 
 Flow starts on a layer: at a place p, F_ab tells of what layer a shows at p, which is not what is to be seen
-there. That is what is on its way from where a shows it to where b shows it, and has come as far as b's share
-at p: the intermediate flow of frame interpolation. Both flows that start at p most often tell it well enough.
-Where a near thing is narrower than its way, neither does: a cable that lies 20 px lower in the other photo
-would be cut halfway. So flows that lead back to their start are followed to where they pass (forward
-splatting). Of two that meet there, the one is seen that hides the other: if what is behind is seen beside it
-in a layer, and leads to behind it.
+there. To be seen is what passes through p on its way from where a shows it to where b shows it, having come
+as far as b's share at p: the intermediate flow of frame interpolation. The two flows that start at p tell it
+well enough most often. Where a near thing is narrower than its motion, neither does: a cable that lies 20 px
+lower in the other photo would be cut halfway. So consistent flows are followed to where they pass (forward
+splatting). Of two that meet there, the one is taken that hides the other: what is behind is seen beside it in
+a layer, and leads to behind it.
 """
 
 from __future__ import annotations
@@ -20,13 +20,13 @@ from hugin_abflow.opencl import MUCH, Buffer, Device
 from hugin_abflow.settings import Settings
 from hugin_abflow.working import Grid, WorkingLayer
 
-# Times that each place listens to what passes there.
+# Rounds in which each place takes over what passes there.
 _ROUNDS = 2
 # Pixels of a row that a work item takes: INTERMEDIATE_CHUNK of kernels/intermediate.cl.
 _CHUNK = 4
 
 
-def settle(
+def replace_flows(
     device: Device,
     layers: Sequence[WorkingLayer],
     coefficients: Sequence[Buffer],
@@ -34,12 +34,11 @@ def settle(
     grid: Grid,
     settings: Settings,
 ) -> None:
-    """Make each pair's flows those that pass through places, in place: what is to be seen at p, layer a shows
-    at p + w_b `backward`(p), and layer b at p + w_a `forward`(p), and `backward` is -`forward`. With
-    `settings.intermediate` off they stay as they start at places.
+    """Replace each pair's flows, which start at places, by intermediate ones, which pass through them. What
+    is to be seen at p, layer a then shows at p + w_b `backward`(p), layer b at p + w_a `forward`(p), and
+    `backward` is -`forward`. With `settings.intermediate` off nothing changes.
 
-    coefficients    w_k on each layer's box; where more than two layers are, a pair's as if they were the only
-                    ones.
+    coefficients    w_k on each layer's box; those of a pair count as if there were no other layers.
     """
     for number, pair in enumerate(flows if settings.intermediate else ()):
         a, b = layers[pair.a], layers[pair.b]
@@ -55,6 +54,7 @@ def settle(
 
 
 def _passing(device: Device, pair: PairFlow, share: Buffer) -> PairFlow:
+    """The intermediate flows of a pair. share: of layer b, float32 (height, width) on the chart."""
     flow, back = pair.forward, pair.backward
     shape, border = share.shape, pair.chart.border
     size = shape[::-1]
@@ -76,5 +76,5 @@ def _passing(device: Device, pair: PairFlow, share: Buffer) -> PairFlow:
     kept = device.empty(shape, np.uint8)
     device.run("intermediate", "intermediate_keep", size, passing, seen, border, kept)
     forward, backward = device.empty(flow.shape), device.empty(flow.shape)
-    device.run("intermediate", "intermediate_settle", size, direct, passing, kept, border, forward, backward)
+    device.run("intermediate", "intermediate_fill", size, direct, passing, kept, border, forward, backward)
     return PairFlow(pair.a, pair.b, pair.chart, forward, backward)

@@ -264,8 +264,10 @@ def _align(
     coefficients = coefficient.coefficients(device, layers, masks, grid, even=settled)
     clipped = highlights.measure(device, layers, masks, grid, settings)
     if settled:
-        transition.settle(device, layers, coefficients, flows, masks, grid, settings, clipped.excess.max(0))
-    intermediate.settle(device, layers, coefficients, flows, grid, settings)
+        transition.minimise_strain(
+            device, layers, coefficients, flows, masks, grid, settings, clipped.excess.max(0)
+        )
+    intermediate.replace_flows(device, layers, coefficients, flows, grid, settings)
     fields = geometry.fields(device, layers, coefficients, flows, grid, settings)
     del coefficients
     device.give_back()

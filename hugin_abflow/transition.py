@@ -2,8 +2,8 @@
 
 Changing over bends the picture: across a transition of width t, parallax of P px stretches or squeezes it
 by P / t, its strain. The published coefficient changes over across the whole overlap, wherever near things
-are in it; they are shown between their places in the photos, as sharp and as straight as the flow is right.
-A retoucher would lead the transition around them. So the coefficients are those of least
+are in it. These are shown between their places in the photos, as sharp and as straight as the flow is right.
+A retoucher would lead the transition around them. So the coefficients are those that minimise
 
     sum_k  integral  (P^2 + P0^2) |grad w_k|^2  +  (2 strain)^2 w_k (1 - w_k),
 
@@ -15,9 +15,9 @@ this well Blowey and Elliott 1991). Near things that end within an overlap are l
 layers cannot be brought to one brightness there is no well, and transitions of layers that reach beyond each
 other are as wide as the overlap. Layers of one and the same mask share it evenly.
 
-Layers end hard at their borders in overlaps that are thinner than a cell, as in holes of their masks. It is
-relaxed on a pyramid of cells. On the coarsest the well is added by and by, since there is one least
-without it; the finer ones start from what the coarser ones have found.
+Layers end hard at their borders in overlaps that are thinner than a cell, as in holes of their masks. The sum
+is minimised by relaxation on a pyramid of cells. On the coarsest the well is deepened step by step, since
+without it there is a single minimum; the finer ones start from what the coarser ones have found.
 """
 
 from __future__ import annotations
@@ -38,13 +38,13 @@ from hugin_abflow.working import Grid, WorkingLayer
 
 # Working pixels per cell of the grids on which transitions are found, from the coarsest to the finest.
 _CELLS = (32, 16, 8, 4)
-# Working pixels of parallax that are always reckoned with: flow is hardly truer, a transition no narrower.
+# P0, working pixels: flow is hardly more exact, and no transition is to be narrower.
 _LEAST_PARALLAX = 2.0
 # Cells of the finest grid over which parallax is averaged.
 _SIGMA = 1.0
 # Sweeps of over-relaxation on each grid, and on the coarsest before there is a well and while it gets deeper.
 _SWEEPS, _FIRST_SWEEPS, _DEEPER_SWEEPS = 20, 100, 30
-_OVER = 1.8
+_RELAXATION = 1.8
 _DEPTHS = (0.25, 0.5, 0.75)
 # Cells of a sphere are reckoned with as no narrower than this part of one at the equator.
 _NARROWEST = 0.02
@@ -54,8 +54,10 @@ Values = npt.NDArray[np.float32]
 
 @dataclass(frozen=True)
 class Shares:
-    """Coefficients by cells, as kernels/transition.cl has them: of the layers that cover a cell, if any does
-    whole, else of those that reach into it.
+    """Coefficients by cells: of the layers that cover a cell wholly, if any does, else of those that reach
+    into it. They are stored as compressed rows (kernels/transition.cl).
+
+    first   where the shares of each cell begin; owner: the layer of each share.
     """
 
     cells: Grid
@@ -74,11 +76,11 @@ class Shares:
 
 
 def wanted(flows: Sequence[PairFlow], settings: Settings) -> bool:
-    """Whether there is something to look for: without flow, or with a strain of 0, coefficients stay."""
+    """Whether coefficients of least strain are wanted: not without flow, nor with a strain of 0."""
     return settings.transition_strain > 0 and len(flows) > 0
 
 
-def settle(
+def minimise_strain(
     device: Device,
     layers: Sequence[WorkingLayer],
     coefficients: Sequence[Buffer],
@@ -88,11 +90,11 @@ def settle(
     settings: Settings,
     unlike: Values,
 ) -> None:
-    """Make coefficients those of least strain, in place; see `wanted`. What they are where several layers
-    are counts for nothing.
+    """Make coefficients those of least strain, in place; see `wanted`. What they were where several layers
+    overlap does not count.
 
-    unlike: (height, width) on any coarse grid over the same region, from 0 to 1, where layers cannot be
-    brought to one brightness.
+    unlike      where layers cannot be brought to one brightness, 0..1: (height, width) on any coarse grid
+                over the same region.
     """
     grids = [grid.coarser(pixels) for pixels in _CELLS]
     covers = _covers(masks, grids)
@@ -205,7 +207,7 @@ def relax(device: Device, shares: Shares, system: tuple[Buffer, ...], depth: flo
     """Sweeps over all cells, in place. system: links and wells; depth: the part of the wells that counts."""
     cells = shares.cells
     calls = [
-        (shares.share, shares.first, shares.owner, cells.border, *system, depth, colour, _OVER)
+        (shares.share, shares.first, shares.owner, cells.border, *system, depth, colour, _RELAXATION)
         for colour in (0, 1)
     ]
     size = (-(-cells.width // 2), cells.height)

@@ -130,11 +130,11 @@ __kernel void guidance_choose(__global const float2 *vote, /* (grid.y, grid.x) -
         flow[at] = new[at];
 }
 
-/* The settled flow around guides, the flow found without them elsewhere, to the bit. */
-__kernel void guidance_settle(__global const float2 *settled, /* (grid.y, grid.x) */
-                              __global const float *near,     /* (grid.y, grid.x) */
-                              int4 grid,                      /* run size */
-                              __global float2 *flow)          /* (grid.y, grid.x) in place */
+/* The flow refined from where guides led it around these; elsewhere the flow found without them, to the bit. */
+__kernel void guidance_blend(__global const float2 *refined, /* (grid.y, grid.x) */
+                             __global const float *near,     /* (grid.y, grid.x) */
+                             int4 grid,                      /* run size */
+                             __global float2 *flow)          /* (grid.y, grid.x) in place */
 {
     const int x = get_global_id(0), y = get_global_id(1);
     if (x >= grid.x || y >= grid.y)
@@ -142,5 +142,5 @@ __kernel void guidance_settle(__global const float2 *settled, /* (grid.y, grid.x
     const int at = y * grid.x + x;
     const float w = fmin(10.0f * guidance_share(near[at]), 1.0f); /* the new flow wins nowhere where w < 1 */
     if (w > 0.0f)
-        flow[at] += w * (settled[at] - flow[at]);
+        flow[at] += w * (refined[at] - flow[at]);
 }

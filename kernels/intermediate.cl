@@ -141,7 +141,7 @@ __kernel void intermediate_pass(__global const float2 *flow, /* (grid.y, grid.x)
                                 __global const float2 *back, /* (grid.y, grid.x) F_ba, px */
                                 int4 grid,                   /* chart; run size: grid.x, grid.y, 2 */
                                 __global const int *places,  /* (2, grid.y, grid.x) of intermediate_follow */
-                                __global const float2 *through, /* (grid.y, grid.x) what is there, from a to b */
+                                __global const float2 *passing, /* (grid.y, grid.x) what is there, from a to b */
                                 int named,                   /* 0: the difference is found; 1: whose it is */
                                 __global uint *furthest,     /* (grid.y, grid.x) bits of the squared difference */
                                 __global uint *source)       /* (grid.y, grid.x) 0: none; 1 + pixel, of b: + all */
@@ -158,7 +158,7 @@ __kernel void intermediate_pass(__global const float2 *flow, /* (grid.y, grid.x)
         const int there = grid_index(corner + (int2)(tap & 1, tap >> 1), grid);
         if (there < 0)
             continue;
-        const float apart = square2(f - through[there]);
+        const float apart = square2(f - passing[there]);
         if (!(apart > INTERMEDIATE_APART))
             continue;
         /* of numbers above 0, those that are larger have larger bits */
@@ -186,7 +186,7 @@ __kernel void intermediate_choose(__global const float2 *flow,    /* (grid.y, gr
                                   int4 grid,                      /* chart; run size */
                                   __global const float *share,    /* (grid.y, grid.x) */
                                   __global const uint *source,    /* (grid.y, grid.x) of intermediate_pass */
-                                  __global float2 *through,       /* (grid.y, grid.x) what is there, in place */
+                                  __global float2 *passing,       /* (grid.y, grid.x) what is there, in place */
                                   __global uchar *seen)           /* (grid.y, grid.x) 1 where something passes */
 {
     const int x = get_global_id(0), y = get_global_id(1);
@@ -195,7 +195,7 @@ __kernel void intermediate_choose(__global const float2 *flow,    /* (grid.y, gr
     const int at = y * grid.x + x, all = grid.x * grid.y, from = (int)source[at] - 1;
     if (from < 0)
         return;
-    const float2 u = (float2)(x + 0.5f, y + 0.5f), there = through[at];
+    const float2 u = (float2)(x + 0.5f, y + 0.5f), there = passing[at];
     const float2 way = from < all ? flow[from] : -back[from - all];
     const float s = share[at];
     const float2 off = intermediate_off(flow, back, u, way, s, grid);
@@ -205,7 +205,7 @@ __kernel void intermediate_choose(__global const float2 *flow,    /* (grid.y, gr
     if (GREATEST(its.x, its.y) < INTERMEDIATE_TRUSTED &&
         intermediate_hides(flow, back, u, way, there, s, grid) <= intermediate_hides(flow, back, u, there, way, s, grid))
         return;
-    through[at] = way;
+    passing[at] = way;
     seen[at] = 1;
 }
 
@@ -230,12 +230,12 @@ __kernel void intermediate_keep(__global const float2 *passing, /* (grid.y, grid
 
 /* What passes where it is seen, and its mean beside that: holes are filled, and an outline is a pixel further out, where
    the photos have its soft edge. Both ways, as flows at p itself. */
-__kernel void intermediate_settle(__global const float2 *direct,  /* (grid.y, grid.x) what starts there, px */
-                                  __global const float2 *passing, /* (grid.y, grid.x) what passes, px */
-                                  __global const uchar *kept,     /* (grid.y, grid.x) where that is seen */
-                                  int4 grid,                      /* chart; run size */
-                                  __global float2 *forward,       /* (grid.y, grid.x) V, px */
-                                  __global float2 *backward)      /* (grid.y, grid.x) -V, px */
+__kernel void intermediate_fill(__global const float2 *direct,  /* (grid.y, grid.x) what starts there, px */
+                                __global const float2 *passing, /* (grid.y, grid.x) what passes, px */
+                                __global const uchar *kept,     /* (grid.y, grid.x) where that is seen */
+                                int4 grid,                      /* chart; run size */
+                                __global float2 *forward,       /* (grid.y, grid.x) V, px */
+                                __global float2 *backward)      /* (grid.y, grid.x) -V, px */
 {
     const int x = get_global_id(0), y = get_global_id(1);
     if (x >= grid.x || y >= grid.y)

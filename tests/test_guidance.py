@@ -153,13 +153,13 @@ def test_choice_equals_its_twin(device: Device) -> None:
 def test_settling_equals_its_twin(device: Device) -> None:
     """And is exact where no guide is."""
     grid = GRIDS["plane"]
-    settled, old = (smooth_noise(74 + i, grid, 2, 2) for i in range(2))
+    refined, old = (smooth_noise(74 + i, grid, 2, 2) for i in range(2))
     near = np.maximum(smooth_noise(76, grid, 1, 4)[..., 0], 0) ** 2
     result = device.upload(old)
     device.run(
-        "guidance", "guidance_settle", grid[:2], device.upload(settled), device.upload(near), grid, result
+        "guidance", "guidance_blend", grid[:2], device.upload(refined), device.upload(near), grid, result
     )
-    assert_close(result.get(), twin.guidance_settle(settled, near, old), SUM)
+    assert_close(result.get(), twin.guidance_blend(refined, near, old), SUM)
     assert 0.3 < (near < 5e-4).mean() < 0.8
     assert np.array_equal(result.get()[near < 5e-4], old[near < 5e-4])
 

@@ -131,19 +131,19 @@ def test_kernels_equal_their_twins(device: Device, wraps: bool, seed: int) -> No
     assert np.array_equal(kept.get(), held)
 
     ends = device.empty((HEIGHT, WIDTH, 2)), device.empty((HEIGHT, WIDTH, 2))
-    device.run("intermediate", "intermediate_settle", size, device.upload(direct), through, kept, grid, *ends)
-    settled = twin.intermediate_settle(direct, passing, held, grid)
-    assert_close(ends[0].get(), settled, SUM)
+    device.run("intermediate", "intermediate_fill", size, device.upload(direct), through, kept, grid, *ends)
+    replaced = twin.intermediate_fill(direct, passing, held, grid)
+    assert_close(ends[0].get(), replaced, SUM)
     assert np.array_equal(ends[1].get(), -ends[0].get())
 
 
-def settled(
+def replaced(
     device: Device, grid: Grid, found: Chart, ways: Sequence[np.ndarray], share: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """What `settle` makes of the flows between two layers of which the second has `share` everywhere."""
+    """Intermediate flows between two layers of which the second has `share` everywhere."""
     parts = [whole(device, grid, blend) for blend in (1 - share, share)]
     flows = [PairFlow(0, 1, found, *(device.upload(way.astype(np.float32)) for way in ways))]
-    intermediate.settle(device, [p[0] for p in parts], [p[1] for p in parts], flows, grid, Settings())
+    intermediate.replace_flows(device, [p[0] for p in parts], [p[1] for p in parts], flows, grid, Settings())
     return flows[0].forward.get(), flows[0].backward.get()
 
 
@@ -161,9 +161,9 @@ def test_settling_is_what_the_twins_do(device: Device, width: int, wraps: bool) 
         passing, its = twin.intermediate_choose(flow, back, border, share, sources, passing)
         seen = seen | its
     kept = twin.intermediate_keep(passing, seen, border)
-    expected = twin.intermediate_settle(direct, passing, kept, border)
+    expected = twin.intermediate_fill(direct, passing, kept, border)
     assert kept.mean() > 0.02
-    found, opposite = settled(device, plane(width, HEIGHT, wraps=wraps), chart, (flow, back), 0.375)
+    found, opposite = replaced(device, plane(width, HEIGHT, wraps=wraps), chart, (flow, back), 0.375)
     assert (np.abs(found - expected).max(-1) > 1e-3).mean() < 1e-3
     assert np.array_equal(opposite, -found)
 
@@ -187,7 +187,7 @@ def test_a_bar_narrower_than_its_way_is_seen_once_between_its_places(
     device: Device, share: float, way: float
 ) -> None:
     """No flow that starts there knows of it."""
-    forward, backward = settled(device, PLANE, ALL, bar(50, 5, way, 0.0), share)
+    forward, backward = replaced(device, PLANE, ALL, bar(50, 5, way, 0.0), share)
     first = 50 + share * way
     inside = np.s_[2:-2, math.ceil(first) : math.floor(first + 5)]
     assert np.allclose(forward[inside][..., 0], way, atol=0.1)
@@ -215,7 +215,7 @@ def test_a_bar_hides_what_moves_further(
     device: Device, width: int, way: float, around: float, share: float
 ) -> None:
     """What is behind differs more from what both flows tell there, and is the same at its ends, too."""
-    forward, _ = settled(device, PLANE, ALL, bar(50, width, way, around), share)
+    forward, _ = replaced(device, PLANE, ALL, bar(50, width, way, around), share)
     assert wrong(forward, 50, width, way, around, share) == 0
 
 
@@ -225,7 +225,7 @@ def test_single_pixels_that_lead_back_by_chance_change_nothing(device: Device) -
     for x, y in zip(range(10, 90, 9), random.permutation(9) * 3 + 2, strict=True):
         way = random.integers(4, 12)
         flow[y, x, 0], back[y, x + way, 0] = way, -way
-    forward, _ = settled(device, PLANE, ALL, (flow, back), 0.5)
+    forward, _ = replaced(device, PLANE, ALL, (flow, back), 0.5)
     assert (np.abs(forward[..., 0]) < 1e-3).mean() > 0.98
 
 
@@ -233,8 +233,8 @@ def test_layers_may_come_in_any_order(device: Device) -> None:
     """Of a bar whose own place in one of them is beside the chart's border as well."""
     for left in (50, 20, 1):
         flow, back = bar(left, 5, 14.0, -2.0)
-        forward, _ = settled(device, PLANE, ALL, (flow, back), 0.5)
-        swapped, _ = settled(device, PLANE, ALL, (back, flow), 0.5)
+        forward, _ = replaced(device, PLANE, ALL, (flow, back), 0.5)
+        swapped, _ = replaced(device, PLANE, ALL, (back, flow), 0.5)
         assert np.allclose(forward, -swapped, atol=1e-5)
 
 
@@ -245,9 +245,9 @@ def test_where_it_begins_does_not_matter_on_a_cylinder(device: Device, columns: 
     assert found.wraps and found.width == 128
     flow, back = (np.zeros((31, 128, 2)) for _ in range(2))
     flow[:, 60:65, 0], back[:, 74:79, 0] = 14, -14
-    first, _ = settled(device, grid, found, (flow, back), 0.5)
+    first, _ = replaced(device, grid, found, (flow, back), 0.5)
     flow, back = (np.roll(one, 60 + columns, 1) for one in (flow, back))
-    rolled, _ = settled(device, grid, found, (flow, back), 0.5)
+    rolled, _ = replaced(device, grid, found, (flow, back), 0.5)
     assert (np.abs(first[4:-4, 68:71, 0] - 14) < 1).all()
     assert np.allclose(np.roll(first, 60 + columns, 1), rolled, atol=1e-4)
 
@@ -256,14 +256,14 @@ def test_where_it_begins_does_not_matter_on_a_cylinder(device: Device, columns: 
 def test_what_is_no_flow_does_not_spread(device: Device, value: float) -> None:
     flow, back = bar(50, 5, 14.0, 0.0)
     flow[15, 20] = value
-    forward, _ = settled(device, PLANE, ALL, (flow, back), 0.5)
+    forward, _ = replaced(device, PLANE, ALL, (flow, back), 0.5)
     near = forward[4:-4, 57:62][..., 0]
     assert (np.abs(near - 14) < 1)[:, 1:4].all()
 
 
 @pytest.mark.parametrize("share", [0.3, 0.5])
 def test_a_bar_that_stands_still_hides_what_passes_behind_it(device: Device, share: float) -> None:
-    forward, _ = settled(device, PLANE, ALL, bar(50, 5, 0.0, 12.0), share)
+    forward, _ = replaced(device, PLANE, ALL, bar(50, 5, 0.0, 12.0), share)
     assert not forward[2:-2, 50:55].any()
     assert np.allclose(forward[2:-2, 20:36, 0], 12) and np.allclose(forward[2:-2, 70:100, 0], 12)
 
@@ -272,7 +272,7 @@ def test_what_the_other_layer_hides_is_not_seen_through_it(device: Device) -> No
     """In b it is behind something that stands still."""
     flow, back = bar(50, 5, 14.0, 0.0)
     back[:] = 0
-    forward, _ = settled(device, PLANE, ALL, (flow, back), 0.5)
+    forward, _ = replaced(device, PLANE, ALL, (flow, back), 0.5)
     assert not forward[2:-2, 57:62].any()
 
 
@@ -294,7 +294,7 @@ def test_flows_that_undo_each_other_are_met_on_their_way(device: Device) -> None
     apart, beside = [], []
     for between in (False, True):
         flows = [PairFlow(0, 1, found, *ways)]
-        intermediate.settle(device, layers, coefficients, flows, grid, Settings(intermediate=between))
+        intermediate.replace_flows(device, layers, coefficients, flows, grid, Settings(intermediate=between))
         a, b = geometry.fields(device, layers, coefficients, flows, grid, Settings())
         at_a, at_b = (place + one.get()[..., :2] for one in (a, b))
         inner = np.s_[20:-20, 20:-20]
@@ -311,7 +311,7 @@ def test_a_near_things_outline_goes_with_the_thing(device: Device, share: float)
     columns, _ = common.pixels(120, 31)
     flow, back = np.zeros((31, 120, 2)), np.zeros((31, 120, 2))
     flow[..., 0], back[..., 0] = np.where(columns < 50, 8, 0), np.where(columns < 58, -8, 0)
-    forward, _ = settled(device, PLANE, ALL, (flow, back), share)
+    forward, _ = replaced(device, PLANE, ALL, (flow, back), share)
     between = forward[5:-5, 51 : math.floor(50 + 8 * share) - 1, 0]
     assert np.abs(between - 8).max() < 0.3
     for far, way in ((np.s_[:, 10:40], 8), (np.s_[:, 70:110], 0)):

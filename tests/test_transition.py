@@ -248,12 +248,14 @@ def scene(device: Device, grid: Grid, covers: Sequence[np.ndarray], shift: np.nd
     return layers, coefficients, flows, masks
 
 
-def settled(
+def minimised(
     device: Device, grid: Grid, made: Scene, settings: Settings | None = None, unlike: float = 0.0
 ) -> list[np.ndarray]:
     layers, coefficients, flows, masks = made
     everywhere = np.full(highlights.highlights_grid(grid).shape, unlike, np.float32)
-    transition.settle(device, layers, coefficients, flows, masks, grid, settings or Settings(), everywhere)
+    transition.minimise_strain(
+        device, layers, coefficients, flows, masks, grid, settings or Settings(), everywhere
+    )
     return [one.get() for one in coefficients]
 
 
@@ -269,7 +271,7 @@ WIDE = plane(301, 61)
 @pytest.mark.parametrize("flow", [4.0, 8.0])
 def test_a_transition_strains_as_wanted_in_a_wide_overlap(device: Device, flow: float) -> None:
     made = scene(device, WIDE, left_and_right(WIDE, 20), np.full(WIDE.shape, flow))
-    first, second = settled(device, WIDE, made)
+    first, second = minimised(device, WIDE, made)
     assert np.allclose(first + second, 1, atol=1e-6)
     assert (np.diff(second, axis=1) >= -1e-4).all()
     steepest = ndimage.gaussian_filter1d(second, 4, axis=1)
@@ -284,14 +286,14 @@ def test_a_transition_strains_as_wanted_in_a_wide_overlap(device: Device, flow: 
 def test_a_transition_takes_the_overlap_if_that_is_narrow(device: Device, flow: float) -> None:
     made = scene(device, WIDE, left_and_right(WIDE, 130), np.full(WIDE.shape, flow))
     before = made[1][1].get()
-    second = settled(device, WIDE, made)[1]
+    second = minimised(device, WIDE, made)[1]
     assert second == pytest.approx(before, abs=0.08)
 
 
 def test_layers_that_are_not_alike_change_over_across_the_overlap(device: Device) -> None:
     made = scene(device, WIDE, left_and_right(WIDE, 20), np.full(WIDE.shape, 1.0))
     before = made[1][1].get()
-    assert settled(device, WIDE, made, unlike=1.0)[1] == pytest.approx(before, abs=0.03)
+    assert minimised(device, WIDE, made, unlike=1.0)[1] == pytest.approx(before, abs=0.03)
 
 
 def test_a_near_thing_within_the_overlap_is_one_photo_s(device: Device) -> None:
@@ -302,7 +304,7 @@ def test_a_near_thing_within_the_overlap_is_one_photo_s(device: Device) -> None:
     shift[20:, 120:200] = 20
     made = scene(device, WIDE, left_and_right(WIDE, 20), shift)
     assert (np.ptp(made[1][0].get()[25:, 120:200], axis=1) > 0.25).all()
-    first = settled(device, WIDE, made)[0][25:, 124:196]
+    first = minimised(device, WIDE, made)[0][25:, 124:196]
     assert min(first.max(), (1 - first).max()) < 0.03
 
 
@@ -311,7 +313,7 @@ def test_what_crosses_the_overlap_bends_little_more_than_wanted(device: Device) 
     shift[30:] = 15
     made = scene(device, WIDE, left_and_right(WIDE, 20), shift)
     before = np.diff(made[1][1].get()[34:], axis=1).max()
-    assert before < np.diff(settled(device, WIDE, made)[1][34:], axis=1).max() < 1.4 * STRAIN / 15
+    assert before < np.diff(minimised(device, WIDE, made)[1][34:], axis=1).max() < 1.4 * STRAIN / 15
 
 
 def test_three_layers_share_what_all_of_them_cover(device: Device) -> None:
@@ -319,11 +321,11 @@ def test_three_layers_share_what_all_of_them_cover(device: Device) -> None:
     columns, rows = np.indices(WIDE.shape)[::-1]
     covers = [columns < 200, columns >= 90, (rows >= 25) & (columns > 60) & (columns < 240)]
     shift = np.full(WIDE.shape, 3.0)
-    found = settled(device, WIDE, scene(device, WIDE, covers, shift))
+    found = minimised(device, WIDE, scene(device, WIDE, covers, shift))
     assert np.allclose(np.sum(found, 0), 1, atol=1e-6)
     for one, cover in zip(found, covers, strict=True):
         assert not one[~cover].any() and (one >= 0).all()
-    turned = settled(device, WIDE, scene(device, WIDE, covers[::-1], shift))
+    turned = minimised(device, WIDE, scene(device, WIDE, covers[::-1], shift))
     assert np.allclose(found, turned[::-1], atol=0.02)
 
 
@@ -337,7 +339,7 @@ def test_off_and_without_flow_nothing_is_wanted(device: Device) -> None:
 def test_more_sweeps_change_little(device: Device, monkeypatch: pytest.MonkeyPatch) -> None:
     shift = np.zeros(WIDE.shape)
     shift[20:, 120:200] = 20
-    few = settled(device, WIDE, scene(device, WIDE, left_and_right(WIDE, 20), shift))[0]
+    few = minimised(device, WIDE, scene(device, WIDE, left_and_right(WIDE, 20), shift))[0]
     monkeypatch.setattr(transition, "_SWEEPS", 2000)
-    many = settled(device, WIDE, scene(device, WIDE, left_and_right(WIDE, 20), shift))[0]
+    many = minimised(device, WIDE, scene(device, WIDE, left_and_right(WIDE, 20), shift))[0]
     assert np.abs(few - many).mean() < 0.01

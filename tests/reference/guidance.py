@@ -93,7 +93,7 @@ def guidance_choose(vote: Array, new: Array, flow: Array) -> Array:
     return np.where(vote[..., :1] > 0, new, flow)
 
 
-def guidance_settle(settled: Array, near: Array, flow: Array) -> Array:
-    """The settled flow around guides, fading to the old one where their share falls below a tenth."""
+def guidance_blend(refined: Array, near: Array, flow: Array) -> Array:
+    """The refined flow around guides, fading to the old one where their share falls below a tenth."""
     weight = np.minimum(10 * share_of(near), 1)[..., None]
-    return (1 - weight) * flow.astype(np.float64) + weight * settled
+    return (1 - weight) * flow.astype(np.float64) + weight * refined

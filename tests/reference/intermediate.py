@@ -95,7 +95,7 @@ def intermediate_follow(flows: tuple[Array, Array], grid: Sequence[int], share: 
 
 
 def intermediate_pass(
-    flows: tuple[Array, Array], grid: Sequence[int], corners: Array, through: Array
+    flows: tuple[Array, Array], grid: Sequence[int], corners: Array, passing: Array
 ) -> tuple[Array, Array]:
     """Both passes over both flows: the largest squared differences, and whose they are."""
     width, height = grid[:2]
@@ -107,7 +107,7 @@ def intermediate_pass(
             column, row = corners[other, ..., 0] + tap % 2, corners[other, ..., 1] + tap // 2
             column, row, inside = grid_border(column, row, grid)
             at = np.where(inside, row * width + column, 0)
-            apart = square((-f if other else f) - through.reshape(-1, 2)[at])
+            apart = square((-f if other else f) - passing.reshape(-1, 2)[at])
             counts = (corners[other, ..., 1] > -2) & inside & (apart > APART)
             for place, how, name in zip(at[counts], apart[counts], names[counts], strict=True):
                 if (how, name) > (furthest[place], source[place]):
@@ -127,17 +127,17 @@ def hides(
 
 
 def intermediate_choose(
-    flow: Array, back: Array, grid: Sequence[int], share: Array, source: Array, through: Array
+    flow: Array, back: Array, grid: Sequence[int], share: Array, source: Array, passing: Array
 ) -> tuple[Array, Array]:
     """What is there, and where it is what passes."""
     u, v = (n + 0.5 for n in pixels(grid[0], grid[1]))
     ways = np.concatenate([flow.reshape(-1, 2), -back.reshape(-1, 2)]).astype(np.float64)
     way = ways[np.maximum(source - 1, 0)]
-    its, there = (np.maximum(*off(flow, back, u, v, one, share, grid)) for one in (way, through))
-    over = hides(flow, back, u, v, way, through, share, grid)
-    under = hides(flow, back, u, v, through, way, share, grid)
+    its, there = (np.maximum(*off(flow, back, u, v, one, share, grid)) for one in (way, passing))
+    over = hides(flow, back, u, v, way, passing, share, grid)
+    under = hides(flow, back, u, v, passing, way, share, grid)
     seen = (source > 0) & (its < TRUSTED) & ((there >= TRUSTED) | (over > under))
-    return np.where(seen[..., None], way, through), seen
+    return np.where(seen[..., None], way, passing), seen
 
 
 def around(values: Array, grid: Sequence[int]) -> Iterator[tuple[Array, Array]]:
@@ -154,7 +154,7 @@ def intermediate_keep(passing: Array, seen: Array, grid: Sequence[int]) -> Array
     return (seen != 0) & (alike >= KEEP)
 
 
-def intermediate_settle(direct: Array, passing: Array, kept: Array, grid: Sequence[int]) -> Array:
+def intermediate_fill(direct: Array, passing: Array, kept: Array, grid: Sequence[int]) -> Array:
     """What passes where it is kept, and its mean beside that."""
     total = sum(its for its, _ in around(passing * kept[..., None], grid))
     number = sum(its for its, _ in around(kept.astype(int), grid))
