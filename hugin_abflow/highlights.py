@@ -44,7 +44,7 @@ _SHOWN = 0.03
 # A layer clips less than another if this part of what both show clipped, together, is the other one's alone.
 _LESS = 0.25
 
-Cells = npt.NDArray[np.float32]  # (layers, height, width) on the highlights grid
+PerLayer = npt.NDArray[np.float32]  # (layers, height, width) on the highlights grid
 
 
 @dataclass(frozen=True)
@@ -55,8 +55,8 @@ class Clipped:
     excess  e_k, 0 where the layer is not, where it is alone, and where all are clipped alike.
     """
 
-    shares: Cells
-    excess: Cells
+    shares: PerLayer
+    excess: PerLayer
 
 
 def highlights_grid(grid: Grid) -> Grid:
@@ -85,57 +85,57 @@ def measure(
     return Clipped(shares, np.where(inside, excess, np.float32(0)))
 
 
-def give_way(
+def reduce_weights(
     device: Device,
     layers: Sequence[WorkingLayer],
     fields: Sequence[Buffer],
     clipped: Clipped,
     masks: Masks,
     grid: Grid,
-) -> Cells:
-    """Lower the colour weights of fields (geometry.py), in place.
+) -> PerLayer:
+    """Reduce colour weights of what is clipped (fields[...].w, in place).
 
-    Returns by how much more than if white had to be shown everywhere: the weights are divided by the
-    exponential of this, 0 or more, bilinear between the cells.
+    Returns by how much more than if white had to be shown everywhere: the exponential of this, 0 or more,
+    bilinear between the cells, divides the weights besides.
     """
     cells = highlights_grid(grid)
-    further = np.zeros_like(clipped.excess)
+    extra = np.zeros_like(clipped.excess)
     if not clipped.excess.any():
-        return further
-    bounds = _bounds(clipped, masks, cells)
+        return extra
+    required = _required(clipped, masks, cells)
     for k, (layer, field, excess) in enumerate(zip(layers, fields, clipped.excess, strict=True)):
         if excess.any():
-            further[k] = excess * _further(device, bounds[k], grid)
+            extra[k] = excess * _extra_strength(device, required[k], grid)
             device.run(
-                "highlights", "highlights_yield", layer.box[2:], field, layer.box, grid.border,
-                device.upload(_STRENGTH * excess + further[k]), cells.border,
+                "highlights", "highlights_reduce", layer.box[2:], field, layer.box, grid.border,
+                device.upload(_STRENGTH * excess + extra[k]), cells.border,
             )  # fmt: skip
-    return further
+    return extra
 
 
-def regain(
+def restore_weights(
     device: Device,
     layers: Sequence[WorkingLayer],
     fields: Sequence[Buffer],
-    further: Cells,
+    extra: PerLayer,
     there: Mask,
     grid: Grid,
 ) -> None:
-    """Have weights be as if white had to be shown, in some cells.
+    """Restore, in some cells, the colour weights that layers would have if white had to be shown.
 
-    further     what `give_way` returned.
-    there       (height, width) on any grid over the region.
+    extra       what `reduce_weights` returned.
+    there       (height, width) on any grid over the region: these cells.
     """
     part, part_cells = device.upload(there, np.float32), (*there.shape[::-1], *grid.border[2:])
-    for layer, field, one in zip(layers, fields, further, strict=True):
+    for layer, field, one in zip(layers, fields, extra, strict=True):
         if one.any():
             device.run(
-                "highlights", "highlights_regain", layer.box[2:], field, layer.box, grid.border,
+                "highlights", "highlights_restore", layer.box[2:], field, layer.box, grid.border,
                 device.upload(one), highlights_grid(grid).border, part, part_cells,
             )  # fmt: skip
 
 
-def _bounds(clipped: Clipped, masks: Masks, cells: Grid) -> npt.NDArray[np.bool_]:
+def _required(clipped: Clipped, masks: Masks, cells: Grid) -> npt.NDArray[np.bool_]:
     """What each layer has to show, though white, (layers, height, width): no layer shows it that clips less
     than it, by all that both show.
     """
@@ -148,13 +148,13 @@ def _bounds(clipped: Clipped, masks: Masks, cells: Grid) -> npt.NDArray[np.bool_
     return np.asarray((clipped.shares > _WHITE) & ~replaced.reshape(clipped.shares.shape))
 
 
-def _further(device: Device, bound: Mask, grid: Grid) -> npt.NDArray[np.float32]:
-    """How much stronger than _STRENGTH, (height, width) on the highlights grid: from 0 at `bound` on."""
+def _extra_strength(device: Device, required: Mask, grid: Grid) -> npt.NDArray[np.float32]:
+    """What is added to _STRENGTH, (height, width) on the highlights grid: from 0 at what is `required` on."""
     cells = highlights_grid(grid)
     most = np.float32(_FULL_STRENGTH - _STRENGTH)
-    if not bound.any():
+    if not required.any():
         return np.full(cells.shape, most)
-    free, everywhere = ~bound, np.ones(cells.shape, np.uint8)
+    free, everywhere = ~required, np.ones(cells.shape, np.uint8)
     masks = Masks(cells, (device.upload(free, np.uint8),), free[None])
     off = distance(device, masks, 0, device.upload(everywhere), grid).get()
     off = np.minimum(off / np.float32(_FAR), 1)

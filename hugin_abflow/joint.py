@@ -271,7 +271,7 @@ def _align(
     fields = geometry.fields(device, layers, coefficients, flows, grid, settings)
     del coefficients
     device.give_back()
-    further = highlights.give_way(device, layers, fields, clipped, masks, grid)
+    extra = highlights.reduce_weights(device, layers, fields, clipped, masks, grid)
     measured = colour.measure(device, layers, fields, pairs, grid, masks.host)
     device.give_back()  # two solutions at a time take the most memory
     with ThreadPoolExecutor(2, "gains") as solving:  # each on one core: the device goes on meanwhile
@@ -291,23 +291,23 @@ def _align(
             strict = (first if first and whole is None else gains(exposure, whole, True)).result()
             device.give_back()
             residual = seam.residuals(device, layers, fields, pairs, strict, grid)
-            found = seam.regions(residual, grid, aligned=settings.flow, once=once)
+            found = seam.regions(residual, grid, aligned=settings.flow, single=once)
             grown = found if whole is None else found | whole
             if not grown.any() or (whole is not None and np.array_equal(grown, whole)):
                 break
             whole = grown
         if rounds and not settings.flow:
-            seam.divide(device, layers, fields, pairs, strict, masks, grid)
+            seam.cut_unaligned(device, layers, fields, pairs, strict, masks, grid)
             # what is not aligned tells little of exposures; bands of frequencies change over as they are
             last, whole = gains(replace(settings, exposure=False), None), None
         elif whole is not None:
             last = gains(settings, whole)
-            lost = seam.lost(device, layers, fields, pairs, strict, clipped.excess, grid)
-            highlights.regain(device, layers, fields, further, whole, grid)
+            clipping = seam.clipping_prices(device, layers, fields, pairs, strict, clipped.excess, grid)
+            highlights.restore_weights(device, layers, fields, extra, whole, grid)
             cells = seam.seam_grid(grid)
             each_once = partial(clones.owners, device, layers, fields, pairs, strict, grid, cells)
             owner, gone = seam.cut(
-                device, layers, fields, residual, whole, masks, grid, once, lost,
+                device, layers, fields, residual, whole, masks, grid, once, clipping,
                 choose=each_once if settings.clones else None,
             )  # fmt: skip
             moved = [*gone.values()] + ([] if once is None else [once])
@@ -316,7 +316,7 @@ def _align(
                 device, layers, fields, owner, whole, unlike.anywhere, masks, grid, cells
             ):
                 reaches[k] = geometry.reach(device, layers[k], fields[k], grid)
-            seam.stay(device, layers, fields, owner, whole, grid, cells)
+            seam.clamp_displacements(device, layers, fields, owner, whole, grid, cells)
         else:
             last = hoped or gains(settings, None)
         return _Aligned(fields, reaches, last.result(), whole, unlike)

@@ -46,32 +46,33 @@ class Residuals:
     any pair and channel, 0 where no two lie.
 
     mean    r: of their low frequencies.
-    rms     t: of all, of each cell by itself. What is strong, averaged, would fill a gap beside it, and a cut
-            through somebody's chin be as cheap as one below. In `seam.divide` both are the mean square, on
-            finer cells.
-    around  of all, averaged as r is, for the outskirts of regions. None: t.
-    told    where any pair has pixels to compare: none are where layers are clipped, or sampled beyond their
-            borders. None: everywhere.
+    rms     t: of all frequencies, of each cell by itself. What is strong, averaged, would fill a gap beside
+            it, and a cut through somebody's chin be as cheap as one below. In `seam.cut_unaligned` both are
+            the mean square, on finer cells.
+    measured    where any pair has pixels to compare: none are where layers are clipped, or sampled beyond
+                their borders. None: everywhere.
+    smooth_rms  of all frequencies, averaged as r is, for the outskirts of regions. None: t.
     """
 
     mean: npt.NDArray[np.float64]
     rms: npt.NDArray[np.float64]
-    told: Cells | None = None
-    around: npt.NDArray[np.float64] | None = None
+    measured: Cells | None = None
+    smooth_rms: npt.NDArray[np.float64] | None = None
 
 
 @dataclass(frozen=True)
 class Choice:
-    """What tells which layer each cell of some regions is taken from.
+    """The choice of the layer that each cell of some regions is taken from.
 
     whole       (height, width): the cells of all regions.
     residual    on the same grid.
-    shares      of the softmax, cover: of the layers (layers, height, width).
-    wraps       whether the grid goes once around.
-    cut_price   of a cut, in cells.
-    dearer      how much more than a cut one layer may cost, (height, width), of a region the most; None: it
-                is not asked.
-    lost        what each layer costs in a cell besides; None: nothing.
+    shares      (layers, height, width): s_k, of the softmax.
+    cover       (layers, height, width): the cells that each layer covers.
+    wraps       whether columns are periodic.
+    cut_price   c: of a cut, in cells.
+    whole_factor    (height, width): how many times as much as a cut it may cost to take a region from one
+                    layer, the largest of its cells; None: it is cut wherever that is cheapest.
+    clipping    h e_k: what each layer costs in a cell besides, for what it clips; None: nothing.
     """
 
     whole: Cells
@@ -80,8 +81,8 @@ class Choice:
     cover: npt.NDArray[np.bool_]
     wraps: bool
     cut_price: float
-    dearer: npt.NDArray[np.float64] | None = None
-    lost: Prices | None = None
+    whole_factor: npt.NDArray[np.float64] | None = None
+    clipping: Prices | None = None
 
     def owners(self, unwanted: Prices | None = None) -> tuple[npt.NDArray[np.intp], float]:
         """The layer of each cell, (height, width): in the regions the one it is taken from, elsewhere the one
@@ -103,8 +104,9 @@ class Choice:
         """Which layer each cell (rows, columns) of a region is taken from, and the energy of that: the least
         found.
 
-        One layer is taken, as far as it goes, if that costs no more than `dearer`: somebody may stand there
-        twice, and a cut between his two places, or where these overlap, is as cheap as one beside him.
+        One layer is taken, as far as it goes, if that costs no more than `whole_factor` allows: somebody may
+        stand there twice, and a cut between his two places, or where these overlap, is as cheap as one beside
+        him.
         """
         candidates = np.flatnonzero(self.cover[:, rows, columns].any(1))
         if candidates.size < 2:
@@ -112,8 +114,8 @@ class Choice:
         weight, rough = self.residual.mean[rows, columns], self.residual.rms[rows, columns]
         present = self.cover[candidates][:, rows, columns]
         price = np.where(present, weight * (1 - self.shares[candidates][:, rows, columns]), _FORBIDDEN)
-        if self.lost is not None:
-            price += self.lost[candidates][:, rows, columns]
+        if self.clipping is not None:
+            price += self.clipping[candidates][:, rows, columns]
         number = np.full(self.residual.mean.shape, -1)
         number[rows, columns] = np.arange(rows.size)
         links = []
@@ -132,25 +134,25 @@ class Choice:
         if unwanted is not None:
             wanted = replace(plain, price=price + unwanted[candidates][:, rows, columns])
         labels = least(wanted)
-        if self.dearer is not None:
-            dearer = self.dearer[rows, columns].max()
+        if self.whole_factor is not None:
+            factor = self.whole_factor[rows, columns].max()
             alone = [np.where(one, k, labels) for k, one in enumerate(present) if one.mean() > _MOSTLY]
             energies = [_energy(wanted, one) for one in (labels, *alone)]
-            if alone and min(energies[1:]) <= dearer * energies[0]:
+            if alone and min(energies[1:]) <= factor * energies[0]:
                 labels = alone[int(np.argmin(energies[1:]))]
         return candidates[labels], _energy(plain, labels)
 
 
-def find(residual: Residuals, cells: Grid, once: Cells) -> list[Cells]:
-    """Connected outskirts that hold enough of strong residual, or anything of `once`, grown by a cell."""
-    around = residual.rms if residual.around is None else residual.around
-    weak = (residual.mean > _WEAK) | (around > _STRONG) | once
+def find(residual: Residuals, cells: Grid, single: Cells) -> list[Cells]:
+    """Connected outskirts that hold enough strong residual, or any cell of `single`, grown by a cell."""
+    smooth_rms = residual.rms if residual.smooth_rms is None else residual.smooth_rms
+    weak = (residual.mean > _WEAK) | (smooth_rms > _STRONG) | single
     strong = np.interp(residual.mean, (_STRONG - _DOUBT, _STRONG + _DOUBT), (0, 1))
     strong *= cells.row_widths[:, None]
     return [
         region
         for region in parts(grown(weak, 1, cells.wraps), cells.wraps)
-        if strong[region].sum() >= _LEAST or once[region].any()
+        if strong[region].sum() >= _LEAST or single[region].any()
     ]
 
 
@@ -161,21 +163,21 @@ def parts(mask: Cells, wraps: bool) -> list[Cells]:
 
 
 def completed(residual: Residuals, cover: npt.NDArray[np.bool_], wraps: bool) -> Residuals:
-    """With the nearest cell's residual in cells that nothing tells of, from a layer's border on: things are
-    moved away from there, and a cut would cost nothing, and leave half of somebody.
+    """With the nearest cell's residual in cells without a measured one, from a layer's border on: flow leads
+    away from there, so that a cut would cost nothing, and leave half of somebody.
 
     cover       (layers, height, width): the cells that each of them covers.
     """
-    if residual.told is None or not residual.told.any():
+    if residual.measured is None or not residual.measured.any():
         return residual
-    by = residual.told.shape[1] // 2 if wraps else 0
+    by = residual.measured.shape[1] // 2 if wraps else 0
     around = [(0, 0), (by, by)]
     cover = np.pad(cover, [(0, 0), *around], mode="wrap")
-    told = np.pad(residual.told, around, mode="wrap")
+    measured = np.pad(residual.measured, around, mode="wrap")
     borders = [one & scipy.ndimage.binary_dilation(~one, np.ones((3, 3))) for one in cover]
-    missing = (cover.sum(0) > 1) & ~told
+    missing = (cover.sum(0) > 1) & ~measured
     missing = scipy.ndimage.binary_propagation(np.any(borders, 0) & missing, np.ones((3, 3)), missing)
-    nearest = scipy.ndimage.distance_transform_edt(~told, return_distances=False, return_indices=True)
+    nearest = scipy.ndimage.distance_transform_edt(~measured, return_distances=False, return_indices=True)
 
     def whole(values: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
         values = np.pad(values, around, mode="wrap")

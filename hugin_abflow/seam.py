@@ -47,9 +47,9 @@ _SHORTER = 0.005
 _CLIPPED, _DARKER = 0.5, 0.05
 # What is left of a layer's weight where it yields: a pixel that no other layer can fill stays opaque.
 _TRACE = 1e-12
-# How much more a region may cost if that shows things once and whole, from a layer that has most of it: where
-# flow tells that something moved, and anywhere.
-_ONCE, _WHOLE = 2.0, 1.65
+# How many times as much as a cut it may cost to take a region from one layer that has most of it, which shows
+# things once and whole: of what single.py found, and of any other.
+_SINGLE_FACTOR, _WHOLE_FACTOR = 2.0, 1.65
 
 
 def seam_grid(grid: Grid) -> Grid:
@@ -67,8 +67,8 @@ def residuals(
 ) -> Residuals:
     """What flow and exposure do not explain."""
     cells = seam_grid(grid)
-    mean, square, around = (np.zeros(cells.shape) for _ in range(3))
-    told = np.zeros(cells.shape, bool)
+    mean, square, smooth_square = (np.zeros(cells.shape) for _ in range(3))
+    measured = np.zeros(cells.shape, bool)
     clipped = [clipping(layer) for layer in layers]
     for its, found in _differences(device, layers, fields, pairs, correction, grid, cells, clipped):
         share = found[..., 4:]
@@ -76,12 +76,12 @@ def residuals(
         smooth = (share > 0) * smooth[..., :4] / np.where(share > 0, smooth[..., 4:], 1)
         mean[its] = np.maximum(mean[its], np.abs(smooth[..., :3]).max(-1))
         square[its] = np.maximum(square[its], found[..., 3])
-        around[its] = np.maximum(around[its], smooth[..., 3])
-        told[its] |= share[..., 0] > 0
-    return Residuals(mean, np.sqrt(square), told, np.sqrt(around))
+        smooth_square[its] = np.maximum(smooth_square[its], smooth[..., 3])
+        measured[its] |= share[..., 0] > 0
+    return Residuals(mean, np.sqrt(square), measured, np.sqrt(smooth_square))
 
 
-def lost(
+def clipping_prices(
     device: Device,
     layers: Sequence[WorkingLayer],
     fields: Sequence[Buffer],
@@ -90,33 +90,35 @@ def lost(
     clipped: npt.NDArray[np.float32],
     grid: Grid,
 ) -> Prices | None:
-    """What it costs to take what one layer shows clipped, and another one as bright, but not clipped; None:
-    nothing anywhere.
+    """What it costs to take a cell from a layer that clips it where another one is as bright and not clipped;
+    None: nothing anywhere.
 
     clipped     how much each layer clips of what another one shows (`highlights.Clipped`).
     """
     if not clipped.any():
         return None
     cells = seam_grid(grid)
-    told = np.zeros((len(layers), *cells.shape), bool)
-    all_tells = [(math.inf,) * 4] * len(layers)
-    differences = _differences(device, layers, fields, pairs, correction, grid, cells, all_tells)
+    as_bright = np.zeros((len(layers), *cells.shape), bool)
+    unclipped = [(math.inf,) * 4] * len(layers)  # all pixels count
+    differences = _differences(device, layers, fields, pairs, correction, grid, cells, unclipped)
     for pair, (its, found) in zip(pairs, differences, strict=True):
         brighter, both = found[..., :3].mean(-1), found[..., 4] > 0
-        told[pair.a][its] |= both & (brighter < _DARKER)
-        told[pair.b][its] |= both & (-brighter < _DARKER)
+        as_bright[pair.a][its] |= both & (brighter < _DARKER)
+        as_bright[pair.b][its] |= both & (-brighter < _DARKER)
     row, column = _centres(cells, clipped.shape)
-    prices: Prices = _CLIPPED * told * clipped[:, row[:, None], column]
+    prices: Prices = _CLIPPED * as_bright * clipped[:, row[:, None], column]
     return prices
 
 
-def regions(residual: Residuals, grid: Grid, aligned: bool = True, once: Cells | None = None) -> Cells:
-    """Where layers differ too much to be blended, of the same shape; unless they are aligned, texture differs
-    everywhere and tells nothing. once: cells that belong to a region whatever the layers show there.
+def regions(residual: Residuals, grid: Grid, aligned: bool = True, single: Cells | None = None) -> Cells:
+    """Where layers differ too much to be blended, (height, width) on the seam grid.
+
+    aligned     whether the layers are; else texture differs everywhere and tells nothing.
+    single      what single.py found: cells that belong to a region whatever the layers show there.
     """
     residual = residual if aligned else Residuals(residual.mean, residual.mean)
     nowhere = np.zeros(residual.mean.shape, bool)
-    found = find(residual, seam_grid(grid), nowhere if once is None else once)
+    found = find(residual, seam_grid(grid), nowhere if single is None else single)
     return np.asarray(np.any([nowhere, *found], 0))
 
 
@@ -128,21 +130,26 @@ def cut(
     whole: Cells,
     masks: Masks,
     grid: Grid,
-    once: Cells | None = None,
-    lost: Prices | None = None,
+    single: Cells | None = None,
+    clipping: Prices | None = None,
     choose: Callable[[Choice], tuple[npt.NDArray[np.intp], Gone]] | None = None,
 ) -> tuple[npt.NDArray[np.intp], Gone]:
     """Give each cell of the regions `whole` to one layer: the others lose their colour weight there
-    (fields[...].w, in place). A region is cut in two only if that is clearly better, one that has cells of
-    `once` if it is much better. lost: what each layer costs in a cell besides. choose: in place of the least
-    energy.
+    (fields[...].w, in place).
+
+    single      what single.py found: a region that has cells of it is cut in two only if that is much better,
+                others if it is clearly better.
+    clipping    what each layer costs in a cell besides (`clipping_prices`).
+    choose      the layers of a choice, and who is gone then; default: the least energy, and nobody.
 
     Returns the layer of each cell, (height, width) on the seam grid, elsewhere that which weighs most, -1
-    where none covers it; and who is gone, as `choose` says.
+    where none covers it; and who is gone.
     """
     cells = seam_grid(grid)
-    dearer = np.full(whole.shape, _WHOLE) if once is None else np.where(once, _ONCE, _WHOLE)
-    choice = _choice(layers, fields, residual, whole, masks, grid, cells, _CUT, dearer, lost)
+    factor = np.full(whole.shape, _WHOLE_FACTOR)
+    if single is not None:
+        factor = np.where(single, _SINGLE_FACTOR, _WHOLE_FACTOR)
+    choice = _choice(layers, fields, residual, whole, masks, grid, cells, _CUT, factor, clipping)
     owner, gone = choose(choice) if choose else (choice.owners()[0], Gone())
     yields = [yielded(whole, owner, k, cells.wraps) for k in range(len(layers))]
     for k, at in gone.items():  # wholly: beside a border the softmax hardly knows another layer
@@ -160,7 +167,7 @@ def yielded(whole: Cells, owner: npt.NDArray[np.intp], k: int, wraps: bool) -> n
     return np.ascontiguousarray(averaged((others | beyond).astype(np.float32), wraps))
 
 
-def stay(
+def clamp_displacements(
     device: Device,
     layers: Sequence[WorkingLayer],
     fields: Sequence[Buffer],
@@ -169,19 +176,19 @@ def stay(
     grid: Grid,
     cells: Grid,
 ) -> None:
-    """Displace what is taken from a layer (fields[...].xyz, in place) only as far as the canvas goes, and
-    the layer: else another one would be seen along the border. owner, whole: of `cut`.
+    """Clamp displacements of what is taken from a layer (fields[...].xyz, in place) to the canvas, and to
+    what the layer shows: else another one would be seen along the border. owner, whole: of `cut`.
     """
     for k, (layer, field) in enumerate(zip(layers, fields, strict=True)):
         its = whole & (owner == k)
         if its.any():  # of many layers nearly all
             device.run(
-                "seam", "seam_stay", layer.box[2:], layer.pixels, field, layer.box, grid.border, grid.lonlat,
+                "seam", "seam_clamp", layer.box[2:], layer.pixels, field, layer.box, grid.border, grid.lonlat,
                 device.upload(its.astype(np.uint8)), cells.border,
             )  # fmt: skip
 
 
-def divide(
+def cut_unaligned(
     device: Device,
     layers: Sequence[WorkingLayer],
     fields: Sequence[Buffer],
@@ -193,10 +200,10 @@ def divide(
     """Give each cell of every overlap of layers that are not aligned to one layer, as `cut` does."""
     cells = grid.coarser(_FINE_CELL)
     square = np.zeros(cells.shape)
-    all_tells = [(math.inf,) * 4] * len(layers)
-    for its, found in _differences(device, layers, fields, pairs, correction, grid, cells, all_tells):
-        told = found[..., 4] > 0
-        square[its] = np.maximum(square[its], np.where(told, _SHORTER + found[..., 3], 0))
+    unclipped = [(math.inf,) * 4] * len(layers)  # all pixels count
+    for its, found in _differences(device, layers, fields, pairs, correction, grid, cells, unclipped):
+        measured = found[..., 4] > 0
+        square[its] = np.maximum(square[its], np.where(measured, _SHORTER + found[..., 3], 0))
     whole = square > 0
     choice = _choice(layers, fields, Residuals(square, square), whole, masks, grid, cells, _FINE_CUT)
     owner, _ = choice.owners()
@@ -213,17 +220,17 @@ def _choice(
     grid: Grid,
     cells: Grid,
     cut_price: float,
-    dearer: npt.NDArray[np.float64] | None = None,
-    lost: Prices | None = None,
+    whole_factor: npt.NDArray[np.float64] | None = None,
+    clipping: Prices | None = None,
 ) -> Choice:
-    """What tells which layer each cell of the regions `whole` is taken from."""
+    """The choice of the layer that each cell of the regions `whole` is taken from."""
     cover = on_cells(masks.host, cells, np.logical_and)
     shares = np.stack(
         [_at_centres(f.get()[..., 3], k.box, grid, cells) for f, k in zip(fields, layers, strict=True)]
     )
     shares /= np.maximum(shares.sum(0), 1e-12)
     residual = completed(residual, cover, cells.wraps)
-    return Choice(whole, residual, shares, cover, cells.wraps, cut_price, dearer, lost)
+    return Choice(whole, residual, shares, cover, cells.wraps, cut_price, whole_factor, clipping)
 
 
 def _yield(
@@ -256,9 +263,9 @@ def _differences(
 ) -> Iterator[tuple[tuple[slice, slice], npt.NDArray[np.float64]]]:
     """Of each two corrected layers, rows and columns of the cells that both may be in, and of these
     (height, width, 5): the mean of the layers' difference in r, g, b and the largest mean square of these,
-    where neither is brighter than `clipped`, and the share of the pixels that tell.
+    where neither is brighter than `clipped`, and the share of such pixels.
     """
-    none = device.zeros((*correction.grid.shape, 4))
+    no_gain = device.zeros((*correction.grid.shape, 4))
 
     def start(pair: Pair) -> tuple[Box, Buffer, Buffer]:
         part = shared_cells(layers[pair.a], layers[pair.b], grid, cells)
@@ -266,7 +273,7 @@ def _differences(
         square = device.empty((part.height, part.width))
         sides: list[Any] = []
         for k in (pair.a, pair.b):
-            sides += [layers[k].pixels, fields[k], layers[k].box, correction.gains[k] or none]
+            sides += [layers[k].pixels, fields[k], layers[k].box, correction.gains[k] or no_gain]
         device.run(
             "seam", "seam_difference", (part.width, part.height), *sides, grid.border, grid.lonlat,
             correction.grid.border, cells.border, part.place, correction.shoulder, clipped[pair.a],

@@ -28,10 +28,10 @@ __kernel void highlights_share(__global const float4 *layer, /* (box.w, box.z) r
 }
 
 /* Divide a layer's colour weight by what the cells tell the logarithm of. */
-__kernel void highlights_yield(__global float4 *field,           /* (box.w, box.z) of the working grid; w is scaled */
-                               int4 box, int4 border,            /* place on the working grid, run size; that grid */
-                               __global const float *logarithms, /* (cells.y, cells.x), 0 or more */
-                               int4 cells)                       /* highlights grid, over the same region */
+__kernel void highlights_reduce(__global float4 *field,           /* (box.w, box.z) of the working grid; w is scaled */
+                                int4 box, int4 border,            /* place on the working grid, run size; that grid */
+                                __global const float *logarithms, /* (cells.y, cells.x), 0 or more */
+                                int4 cells)                       /* highlights grid, over the same region */
 {
     const int x = get_global_id(0), y = get_global_id(1);
     if (x >= box.z || y >= box.w)
@@ -43,13 +43,13 @@ __kernel void highlights_yield(__global float4 *field,           /* (box.w, box.
         field[y * box.z + x].w *= exponential(-logarithm);
 }
 
-/* The reverse of highlights_yield, as far as the cells of another grid over the same region tell. */
-__kernel void highlights_regain(__global float4 *field,           /* (box.w, box.z) of the working grid; w is scaled */
-                                int4 box, int4 border,            /* place on the working grid, run size; that grid */
-                                __global const float *logarithms, /* (cells.y, cells.x), 0 or more */
-                                int4 cells,                       /* highlights grid */
-                                __global const float *part,       /* (part_cells.y, part_cells.x), 0..1 */
-                                int4 part_cells)
+/* The reverse of highlights_reduce, as far as the cells of another grid over the same region tell. */
+__kernel void highlights_restore(__global float4 *field,           /* (box.w, box.z) of the working grid; w is scaled */
+                                 int4 box, int4 border,            /* place on the working grid, run size; that grid */
+                                 __global const float *logarithms, /* (cells.y, cells.x), 0 or more */
+                                 int4 cells,                       /* highlights grid */
+                                 __global const float *part,       /* (part_cells.y, part_cells.x), 0..1 */
+                                 int4 part_cells)
 {
     const int x = get_global_id(0), y = get_global_id(1);
     if (x >= box.z || y >= box.w)

@@ -61,14 +61,14 @@ __kernel void seam_yield(__global float4 *field,        /* (box.w, box.z) of the
 /* Halvings in which it is found how far a displacement leads to what a layer shows. */
 #define SEAM_HALVINGS 5
 
-/* Displace what is taken from a layer only as far as the centre of the canvas's last pixel, where that ends, and only
-   as far as the layer shows something. */
-__kernel void seam_stay(__global const float4 *layer, /* (box.w, box.z) */
-                        __global float4 *field,       /* the same; x, y, z change */
-                        int4 box, int4 border,        /* place on the working grid, run size; working grid */
-                        float4 lonlat,
-                        __global const uchar *taken,  /* (cells.y, cells.x): the cells of what is taken from it */
-                        int4 cells)                   /* seam grid, over the same region */
+/* Clamp displacements of what is taken from a layer: to the centre of the canvas's last pixel, where that ends, and to
+   where the layer shows something. */
+__kernel void seam_clamp(__global const float4 *layer, /* (box.w, box.z) */
+                         __global float4 *field,       /* the same; x, y, z change */
+                         int4 box, int4 border,        /* place on the working grid, run size; working grid */
+                         float4 lonlat,
+                         __global const uchar *taken,  /* (cells.y, cells.x): the cells of what is taken from it */
+                         int4 cells)                   /* seam grid, over the same region */
 {
     const int x = get_global_id(0), y = get_global_id(1), at = y * box.z + x;
     if (x >= box.z || y >= box.w || layer[at].w == 0.0f)

@@ -13,13 +13,13 @@ from hugin_abflow import regions
 CUT = 10.0
 
 
-def label(rows, columns, residual, shares, cover, wraps, dearer=None, lost=None) -> np.ndarray:
+def label(rows, columns, residual, shares, cover, wraps, whole_factor=None, clipping=None) -> np.ndarray:
     """The layers of a region's cells, with cuts of that price."""
     shape = residual.mean.shape
-    more = None if dearer is None else np.full(shape, dearer)
+    more = None if whole_factor is None else np.full(shape, whole_factor)
     whole = np.zeros(shape, bool)
     whole[rows, columns] = True
-    return regions.Choice(whole, residual, shares, cover, wraps, CUT, more, lost).label(rows, columns)[0]
+    return regions.Choice(whole, residual, shares, cover, wraps, CUT, more, clipping).label(rows, columns)[0]
 
 
 def energies(labels, rows, columns, residual, shares, cover, wraps) -> np.ndarray:

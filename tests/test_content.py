@@ -210,7 +210,7 @@ def test_where_nothing_tells_layers_do_not_differ(device: Device) -> None:
 def test_somebody_who_is_cut_out_leaves_less_of_a_shade(monkeypatch: pytest.MonkeyPatch) -> None:
     """Red, before a green wall; he walked, is cut between his places, and the photos have different light.
     There the wall is nearly as it would be without him."""
-    monkeypatch.setattr(seam, "_WHOLE", 1.0)  # else he would be taken from one photo
+    monkeypatch.setattr(seam, "_WHOLE_FACTOR", 1.0)  # else he would be taken from one photo
     width, height = 401, 151
     noise = ndimage.gaussian_filter(np.random.default_rng(5).normal(size=(height, width, 1)), (2, 2, 0))
     wall = np.clip((0.3, 0.5, 0.4) + 0.05 * noise / noise.std(), 0, 1)

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from grids import GRIDS, on_device, patches, random_layer
 from pictures import merged, one_device
-from reference.highlights import highlights_regain, highlights_share, highlights_yield
+from reference.highlights import highlights_reduce, highlights_restore, highlights_share
 from scipy import ndimage
 from tolerances import SUM, assert_close
 
@@ -56,9 +56,9 @@ def test_yield_equals_its_twin(device: Device, name: str) -> None:
     field = np.random.default_rng(4).normal(size=(box[3], box[2], 4)).astype(np.float32)
     out = device.upload(field)
     device.run(
-        "highlights", "highlights_yield", box[2:], out, box, grid.border, device.upload(logarithms), cells
+        "highlights", "highlights_reduce", box[2:], out, box, grid.border, device.upload(logarithms), cells
     )
-    expected = highlights_yield(field, box, grid.border, logarithms, cells)
+    expected = highlights_reduce(field, box, grid.border, logarithms, cells)
     assert_close(out.get(), expected, 100 * SUM)
     assert np.array_equal(out.get()[..., :3], field[..., :3])
     assert (expected[..., 3] != field[..., 3]).any()
@@ -75,13 +75,13 @@ def test_regain_equals_its_twin(device: Device, name: str) -> None:
     some = patches(5, 19, 15, 0.5, 3).astype(np.float32)
     for part in (some, np.ones_like(some)):
         out, on_cells = device.upload(field), device.upload(logarithms)
-        device.run("highlights", "highlights_yield", box[2:], out, box, grid.border, on_cells, cells)
+        device.run("highlights", "highlights_reduce", box[2:], out, box, grid.border, on_cells, cells)
         yielded = out.get()
         device.run(
-            "highlights", "highlights_regain", box[2:], out, box, grid.border, on_cells, cells,
+            "highlights", "highlights_restore", box[2:], out, box, grid.border, on_cells, cells,
             device.upload(part), part_cells,
         )  # fmt: skip
-        expected = highlights_regain(yielded, box, grid.border, logarithms, cells, part, part_cells)
+        expected = highlights_restore(yielded, box, grid.border, logarithms, cells, part, part_cells)
         assert np.allclose(out.get(), expected, 1e-4, 0)
     assert (yielded[..., 3] != field[..., 3]).all()
     assert np.allclose(out.get(), field, 1e-4, 0)
@@ -160,8 +160,8 @@ def yielding(device: Device, layers: list, masks: coefficient.Masks) -> tuple[np
     grid = GRIDS["plane"]
     clipped = highlights.measure(device, layers, masks, grid, Settings())
     fields = weighted(device, layers, [1.0] * len(layers))
-    further = highlights.give_way(device, layers, fields, clipped, masks, grid)
-    return further, clipped.excess, np.log([field.get()[..., 3] for field in fields])
+    extra = highlights.reduce_weights(device, layers, fields, clipped, masks, grid)
+    return extra, clipped.excess, np.log([field.get()[..., 3] for field in fields])
 
 
 MORE = highlights._FULL_STRENGTH - highlights._STRENGTH
@@ -173,13 +173,13 @@ def test_what_is_clipped_yields_less_near_what_has_to_be_shown_white(
     """White is alone from column 48 on, in the fourth of the cells of 15.4 px."""
     for far, share in ((40.0, 15.4 / 40), (10.0, 1.0)):
         monkeypatch.setattr(highlights, "_FAR", far)
-        further, _, weights = yielding(device, *strips(device, (0, 48, 0.5), (16, 77, 1.0)))
-        assert not further[0].any()
-        assert further[1, :, 2] == pytest.approx(MORE * share * share * (3 - 2 * share))
-        assert (further[1, :, 1] > further[1, :, 2] - (share == 1)).all()
-        assert not further[1, :, 3:].any()
+        extra, _, weights = yielding(device, *strips(device, (0, 48, 0.5), (16, 77, 1.0)))
+        assert not extra[0].any()
+        assert extra[1, :, 2] == pytest.approx(MORE * share * share * (3 - 2 * share))
+        assert (extra[1, :, 1] > extra[1, :, 2] - (share == 1)).all()
+        assert not extra[1, :, 3:].any()
         # at the centre of a cell
-        assert weights[1, 26, 38] == pytest.approx(-highlights._STRENGTH - further[1, 1, 2], rel=1e-3)
+        assert weights[1, 26, 38] == pytest.approx(-highlights._STRENGTH - extra[1, 1, 2], rel=1e-3)
 
 
 @pytest.mark.parametrize("third", [(32, 77, 0.4), (40, 77, 0.94)])
@@ -187,9 +187,9 @@ def test_what_is_clipped_yields_most_where_others_show_all(
     device: Device, third: tuple[int, int, float]
 ) -> None:
     """Also where a layer is clipped itself, but less: half; all of what it still shows is lost in white."""
-    further, _, _ = yielding(device, *strips(device, (0, 48, 0.5), (16, 77, 1.0), third))
-    assert further[1, :, [1, 2, 4]] == pytest.approx(MORE, rel=1e-5)
-    assert not further[0].any()
+    extra, _, _ = yielding(device, *strips(device, (0, 48, 0.5), (16, 77, 1.0), third))
+    assert extra[1, :, [1, 2, 4]] == pytest.approx(MORE, rel=1e-5)
+    assert not extra[0].any()
 
 
 @pytest.mark.parametrize("third", [(32, 77, 1.0), (32, 77, 0.975), (70, 77, 0.4)])
@@ -197,9 +197,9 @@ def test_layers_that_clip_as_much_or_do_not_reach_far_enough_replace_no_white(
     device: Device, third: tuple[int, int, float]
 ) -> None:
     """Or nearly as much: it must not depend on noise."""
-    further, _, _ = yielding(device, *strips(device, (0, 48, 0.5), (16, 77, 1.0), third))
-    assert (further[1] < 0.5 * MORE).all()
-    assert not further[1, :, 3].any()
+    extra, _, _ = yielding(device, *strips(device, (0, 48, 0.5), (16, 77, 1.0), third))
+    assert (extra[1] < 0.5 * MORE).all()
+    assert not extra[1, :, 3].any()
 
 
 def test_what_is_alone_but_not_white_holds_no_yield_back(device: Device) -> None:
@@ -209,8 +209,8 @@ def test_what_is_alone_but_not_white_holds_no_yield_back(device: Device) -> None
     white[:, 16:] = (0.92, 0.92, 0.92, 1)
     white[:, 16:40, :3] = 1
     layers[1] = on_device(device, white)
-    further, excess, _ = yielding(device, layers, masks)
-    assert further[1] == pytest.approx(MORE * excess[1])
+    extra, excess, _ = yielding(device, layers, masks)
+    assert extra[1] == pytest.approx(MORE * excess[1])
     assert ((excess[1] > 0.1) & (excess[1] < 0.9)).any()
 
 
@@ -289,15 +289,15 @@ def test_what_flow_cannot_explain_is_not_taken_from_the_photo_that_clips_it(
         gains.append(device.upload(values))
     correction = Correction(highlights.highlights_grid(grid), 0.0, tuple(gains))
     clipped = highlights.measure(device, layers, masks, grid, Settings()).excess
-    prices = seam.lost(device, layers, fields, [Pair(0, 1)], correction, clipped, grid)
+    prices = seam.clipping_prices(device, layers, fields, [Pair(0, 1)], correction, clipped, grid)
     assert not prices[0].any()  # grey is never clipped
     assert (prices[1, 4:, 3:5] == (seam._CLIPPED if light > 1 else 0)).all()
     assert not prices[1, :, 7:].any()  # alone
-    assert seam.lost(device, layers, fields, [Pair(0, 1)], correction, 0 * clipped, grid) is None
+    assert seam.clipping_prices(device, layers, fields, [Pair(0, 1)], correction, 0 * clipped, grid) is None
     whole = np.zeros(cells.shape, bool)
     whole[3:, 2:6] = True  # columns 15 to 46, below the white corner
     residual = Residuals(np.full(cells.shape, 0.3), np.zeros(cells.shape))
-    seam.cut(device, layers, fields, residual, whole, masks, grid, lost=prices)
+    seam.cut(device, layers, fields, residual, whole, masks, grid, clipping=prices)
     grey, white = (field.get()[38:48, 29:33, 3] for field in fields)  # both cover all of the grid
     assert (grey > 10 * white).all() if light > 1 else (grey < 1e-3 * white).all()
 
@@ -312,10 +312,10 @@ def test_what_is_cut_out_of_a_layer_that_gave_way_is_that_layers(device: Device)
     residual = Residuals(np.full(cells.shape, 0.3), np.zeros(cells.shape))
     fields = weighted(device, layers, (1.0, 1.0, 0.0))
     clipped = highlights.measure(device, layers, masks, grid, Settings())
-    further = highlights.give_way(device, layers, fields, clipped, masks, grid)
+    extra = highlights.reduce_weights(device, layers, fields, clipped, masks, grid)
     prices = np.zeros((3, *cells.shape))
     prices[[0, 2]] = 5
-    highlights.regain(device, layers, fields, further, whole, grid)
-    seam.cut(device, layers, fields, residual, whole, masks, grid, lost=prices)
+    highlights.restore_weights(device, layers, fields, extra, whole, grid)
+    seam.cut(device, layers, fields, residual, whole, masks, grid, clipping=prices)
     grey, white, _ = (field.get()[38:48, 34, 3] for field in fields)
     assert (white > 100 * grey).all()

@@ -94,12 +94,12 @@ def test_cells_beside_are_as_if_compared(device: Device, name: str, monkeypatch:
         correction = colour.correction(device, measured, Settings())
         residual = seam.residuals(device, layers, fields, pairs, correction, grid)
         excess = np.ones((len(layers), *grid.shape), np.float32)
-        lost = seam.lost(device, layers, fields, pairs, correction, excess, grid)
+        lost = seam.clipping_prices(device, layers, fields, pairs, correction, excess, grid)
         gains = [gain.get() for gain in correction.gains]
-        results.append([*gains, residual.mean, residual.rms, residual.around, residual.told, lost])
+        results.append([*gains, residual.mean, residual.rms, residual.smooth_rms, residual.measured, lost])
         cut = [device.copy(field) for field in fields]
         masks = Masks(grid, tuple(device.upload(mask, np.uint8) for mask in covered), covered)
-        seam.divide(device, layers, cut, pairs, correction, masks, grid)
+        seam.cut_unaligned(device, layers, cut, pairs, correction, masks, grid)
         results[-1] += [field.get() for field in cut]
     for few, every in zip(*results, strict=True):
         assert np.array_equal(few, every)

@@ -117,7 +117,7 @@ def test_what_is_clipped_costs_what_its_price_says() -> None:
     shares = random.dirichlet((1, 1, 1), (9, 13)).transpose(2, 0, 1)
     lost = random.random((3, 9, 13)) * (random.random((3, 9, 13)) < 0.3)
     residual, cover = Residuals(np.full((9, 13), 0.3), np.zeros((9, 13))), np.ones((3, 9, 13), bool)
-    found = label(rows, columns, residual, shares, cover, False, lost=lost)
+    found = label(rows, columns, residual, shares, cover, False, clipping=lost)
     assert np.array_equal(found, (0.3 * (1 - shares) + lost).argmin(0).ravel())
     assert (found != shares.argmax(0).ravel()).mean() > 0.1
 
@@ -197,8 +197,8 @@ def test_texture_that_differs_joins_a_region_but_makes_none() -> None:
     mean[5:12, [5, 19]] = 2 * regions._STRONG
     assert len(found(alike(mean), cells)) == 2
     assert len(found(Residuals(mean, rms), cells)) == 1
-    assert len(found(Residuals(mean, 0 * rms, around=rms), cells)) == 1
-    assert len(found(Residuals(mean, rms, around=mean), cells)) == 2
+    assert len(found(Residuals(mean, 0 * rms, smooth_rms=rms), cells)) == 1
+    assert len(found(Residuals(mean, rms, smooth_rms=mean), cells)) == 2
     for aligned in (True, False):  # between the arms, where texture tells
         assert seam.regions(Residuals(mean, rms), plane(480, 320), aligned)[8, 12] == aligned
 

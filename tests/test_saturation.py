@@ -210,7 +210,7 @@ def test_each_layer_is_compared_up_to_its_own_white(device: Device, clipped: int
     assert (overlap.misfit().max() > 0) == (clipped is None)
     none = colour.Correction(cells, 1.0, (None, None))
     residual = seam.residuals(device, layers, still, [Pair(0, 1)], none, grid)
-    assert residual.told.all() == (clipped is None) == residual.told.any()
+    assert residual.measured.all() == (clipped is None) == residual.measured.any()
 
 
 # The panorama

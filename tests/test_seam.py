@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from grids import GRIDS, patches, plane, random_layer
 from labels import label
-from reference.seam import seam_difference, seam_stay, seam_yield
+from reference.seam import seam_clamp, seam_difference, seam_yield
 from scipy import ndimage
 from tolerances import POSITION, SUM, assert_close
 
@@ -120,10 +120,10 @@ def test_what_stays_equals_its_twin(device: Device, name: str) -> None:
     taken = (patches(2, 10, 7, 0.7, 2) > 0).astype(np.uint8)
     out = device.upload(field)
     device.run(
-        "seam", "seam_stay", box[2:], device.upload(layer), out, box, grid.border, grid.lonlat,
+        "seam", "seam_clamp", box[2:], device.upload(layer), out, box, grid.border, grid.lonlat,
         device.upload(taken), cells.border,
     )  # fmt: skip
-    expected = seam_stay(layer, field, box, grid.border, grid.lonlat, taken, cells.border)
+    expected = seam_clamp(layer, field, box, grid.border, grid.lonlat, taken, cells.border)
     scale = grid.lonlat[1] or 1
     assert_close(out.get() / scale, expected / scale, 10 * POSITION, decisions=0.02)
     changed = (np.abs(expected - field)[..., :3] > 0.1 * scale).any(-1)
@@ -138,7 +138,7 @@ def test_what_stays_moves_along_the_border(device: Device) -> None:
     field[..., :2] = -8.5, -3.25
     layer, out, box = device.upload(np.ones_like(field)), device.upload(field), (0, 0, 60, 40)
     device.run(
-        "seam", "seam_stay", box[2:], layer, out, box, grid.border, grid.lonlat, device.upload(everything),
+        "seam", "seam_clamp", box[2:], layer, out, box, grid.border, grid.lonlat, device.upload(everything),
         grid.resized(8, 5).border,
     )  # fmt: skip
     y, x = np.mgrid[:40, :60] + 0.5
@@ -163,11 +163,11 @@ def test_a_cell_of_which_little_is_seen_tells_as_much_less(monkeypatch: pytest.M
     y, x = np.mgrid[0:9, 0:12]
     weight = np.exp(-0.5 * ((y - 4) ** 2 + (x - 6) ** 2)) * found[..., 4]
     assert np.isclose(residual.mean[4, 6], 0.6 * 0.1 / weight.sum(), rtol=0.01)
-    assert residual.around is not None
-    assert np.isclose(residual.around[4, 6], np.sqrt(0.4 * 0.1 / weight.sum()), rtol=0.01)
-    assert residual.mean[4, 7] == residual.around[4, 7] == residual.rms[4, 7] == 0
+    assert residual.smooth_rms is not None
+    assert np.isclose(residual.smooth_rms[4, 6], np.sqrt(0.4 * 0.1 / weight.sum()), rtol=0.01)
+    assert residual.mean[4, 7] == residual.smooth_rms[4, 7] == residual.rms[4, 7] == 0
     assert residual.rms[4, 6] == residual.rms.sum() == np.sqrt(0.4)
-    assert residual.told is not None and residual.told.sum() == 107 and not residual.told[4, 7]
+    assert residual.measured is not None and residual.measured.sum() == 107 and not residual.measured[4, 7]
 
 
 def test_a_cut_goes_through_a_gap_of_one_cell(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -212,11 +212,11 @@ def test_a_cell_is_told_of_by_any_pair(monkeypatch: pytest.MonkeyPatch) -> None:
     everywhere = [(np.s_[0:9, 0:12], one) for one in found]
     monkeypatch.setattr(seam, "_differences", lambda *given: asked.append(given[-1]) or iter(everywhere))
     residual = seam.residuals(None, LAYERS, [], [seam.Pair(0, 1)] * 2, None, plane(96, 72))
-    assert np.array_equal(residual.told, (found[..., 4] > 0).any(0)) and asked == [
+    assert np.array_equal(residual.measured, (found[..., 4] > 0).any(0)) and asked == [
         [(0.98, 0.98, 0.98, 1.0)] * 2
     ]
     assert np.isclose(residual.rms[3, [3, 8]], [0.3, 0.2]).all()
-    assert residual.around is not None and (residual.around[3, [3, 8]] > 0.05).all()
+    assert residual.smooth_rms is not None and (residual.smooth_rms[3, [3, 8]] > 0.05).all()
 
 
 # Yields

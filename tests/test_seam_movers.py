@@ -42,7 +42,7 @@ def test_what_moved_is_shown_once() -> None:
             problem = (*everywhere(), residual, shares[turned], cover, wraps)
             found = label(*problem).reshape(12, 30)
             assert (found[:, 4:13] == 1 - best).all() and (found[:, 17:26] == best).all()
-            assert (label(*problem, dearer=seam._ONCE) == best).all()
+            assert (label(*problem, whole_factor=seam._SINGLE_FACTOR) == best).all()
 
 
 def test_a_cut_that_is_much_better_is_kept() -> None:
@@ -50,10 +50,10 @@ def test_a_cut_that_is_much_better_is_kept() -> None:
     residual, shares = twice(0.45)
     cover = np.ones((2, 12, 30), bool)
     cut = label(*everywhere(), residual, shares, cover, False)
-    once = label(*everywhere(), residual, shares, cover, False, dearer=seam._ONCE)
+    once = label(*everywhere(), residual, shares, cover, False, whole_factor=seam._SINGLE_FACTOR)
     problem = (*everywhere(), residual, shares, cover, False)
     least, *alone = energies(np.stack([cut, 0 * cut, 0 * cut + 1]), *problem)
-    assert min(alone) > seam._ONCE * least
+    assert min(alone) > seam._SINGLE_FACTOR * least
     assert np.array_equal(once, cut) and 0 < cut.mean() < 1
 
 
@@ -62,7 +62,7 @@ def test_a_cut_that_is_much_better_is_kept() -> None:
 def test_one_layer_of_two_is_taken_if_it_costs_no_more_than_twice_as_much(problem) -> None:
     """One that has more than half of the region, as far as it goes; the other one where it does not."""
     rows, columns, cover = problem[0], problem[1], problem[4]
-    found, cut = label(*problem, dearer=seam._ONCE), label(*problem)
+    found, cut = label(*problem, whole_factor=seam._SINGLE_FACTOR), label(*problem)
     assert cover[found, rows, columns].all()
     there = cover[:, rows, columns]
     if not there.any(1).all():
@@ -74,10 +74,10 @@ def test_one_layer_of_two_is_taken_if_it_costs_no_more_than_twice_as_much(proble
         return
     costs, least = energies(alone, *problem), energies(cut[None], *problem)[0]
     rounding = 5 * rows.size / labelling._UNIT
-    if costs.min() < seam._ONCE * least - rounding:
+    if costs.min() < seam._SINGLE_FACTOR * least - rounding:
         assert np.isclose(energies(found[None], *problem)[0], costs.min())
         assert (found == alone).all(1).any()
-    elif costs.min() > seam._ONCE * least + rounding:
+    elif costs.min() > seam._SINGLE_FACTOR * least + rounding:
         assert np.array_equal(found, cut)
 
 
@@ -87,7 +87,8 @@ def test_cells_that_no_layer_covers_cost_nothing() -> None:
     cover = np.ones((2, 12, 30), bool)
     cover[:, 11, 20:] = False
     cut, once = (
-        label(*everywhere(), residual, shares, cover, False, dearer=more) for more in (None, seam._ONCE)
+        label(*everywhere(), residual, shares, cover, False, whole_factor=more)
+        for more in (None, seam._SINGLE_FACTOR)
     )
     shown = cover.any(0).ravel()
     assert np.array_equal(cut[shown], once[shown]) and 0 < cut[shown].mean() < 1
@@ -101,7 +102,7 @@ def test_where_the_one_layer_ends_another_goes_on() -> None:
     cover = np.ones((3, 12, 30), bool)
     cover[1, :, :3] = False
     problem = (*everywhere(), residual, shares, cover, False)
-    cut, found = (label(*problem, dearer=more).reshape(12, 30) for more in (None, seam._ONCE))
+    cut, found = (label(*problem, whole_factor=more).reshape(12, 30) for more in (None, seam._SINGLE_FACTOR))
     assert np.array_equal(found[:, :3], cut[:, :3]) and (found[:, 3:] == 1).all()
     assert (cut[:, 4:13] == 0).all()
 
@@ -112,7 +113,8 @@ def test_a_third_layer_in_a_corner_does_not_show_what_moved_twice() -> None:
     shares = np.concatenate([shares, 0.1 * shares[:1]])
     cover = np.ones((3, 12, 30), bool)
     cover[2, :, 2:] = False
-    found = label(*everywhere(), residual, shares, cover, False, dearer=seam._ONCE).reshape(12, 30)
+    found = label(*everywhere(), residual, shares, cover, False, whole_factor=seam._SINGLE_FACTOR)
+    found = found.reshape(12, 30)
     assert (found[:, 4:13] == 1).all() and (found[:, 17:26] == 1).all()
 
 
@@ -126,7 +128,7 @@ def test_what_moved_makes_a_region_whatever_the_layers_show() -> None:
         assert not seam.regions(alike(residual), grid, aligned).any()
     residual[6:8, 9] = 0.5 * (regions._WEAK + regions._STRONG)
     residual[30, 30] = 2 * regions._STRONG
-    found = seam.regions(alike(residual), grid, once=moved)
+    found = seam.regions(alike(residual), grid, single=moved)
     assert np.argwhere(found).tolist() == [[y, x] for y in range(5, 9) for x in range(6, 11)]
     assert not seam.regions(alike(residual), grid).any()
 
@@ -148,7 +150,7 @@ def owners(told: np.ndarray, residual: np.ndarray, turn: int = 0) -> np.ndarray:
         [SimpleNamespace(box=(0, 0, 240, 96))] * 2,
         [SimpleNamespace(get=lambda field=field: field) for field in fields],
         Residuals(residual, residual, told), region, SimpleNamespace(host=covers), grid,
-        seam.seam_grid(grid), seam._CUT, seam._ONCE * region,
+        seam.seam_grid(grid), seam._CUT, seam._SINGLE_FACTOR * region,
     )  # fmt: skip
     return np.roll(choice.owners()[0], -turn, 1)
 
@@ -159,7 +161,7 @@ def test_a_region_comes_from_one_layer_and_an_overlap_from_both(
 ) -> None:
     """Of layers that are aligned; without flow, where all of an overlap is a region, it is cut where it shows
     least."""
-    monkeypatch.setattr(seam, "_WHOLE", np.inf)
+    monkeypatch.setattr(seam, "_WHOLE_FACTOR", np.inf)
     grid = plane(240, 96)
     pictures = np.full((2, 96, 240, 4), 0.5, np.float32)
     pictures[..., 3] = 1
@@ -180,7 +182,7 @@ def test_a_region_comes_from_one_layer_and_an_overlap_from_both(
         whole = seam.regions(residual, grid) | np.pad(np.ones((8, 20), bool), ((2, 2), (5, 5)))
         seam.cut(device, layers, fields, residual, whole, masks, grid)
     else:
-        seam.divide(device, layers, fields, pairs, correction, masks, grid)
+        seam.cut_unaligned(device, layers, fields, pairs, correction, masks, grid)
     inside = [field.get()[24:72, 56:184, 3] for field in fields]
     first = inside[0] > inside[1]
     assert first.all() or not first.any() if flow else 0.2 < first.mean() < 0.8

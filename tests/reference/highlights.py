@@ -37,7 +37,7 @@ def _on_pixels(values: Array, cells: Sequence[int], box: Sequence[int], border: 
     return total / share
 
 
-def highlights_yield(
+def highlights_reduce(
     field: Array,
     box: Sequence[int],
     border: Sequence[int],
@@ -50,7 +50,7 @@ def highlights_yield(
     return result
 
 
-def highlights_regain(
+def highlights_restore(
     field: Array,
     box: Sequence[int],
     border: Sequence[int],

@@ -72,7 +72,7 @@ def seam_yield(
     return result
 
 
-def seam_stay(
+def seam_clamp(
     layer: Array,
     field: Array,
     box: Sequence[int],
