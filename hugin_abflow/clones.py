@@ -148,14 +148,14 @@ def _cut(choice: Choice, clone: Clone, look: Callable[[int], Look]) -> Choice | 
     """The same, but with cuts, whatever one layer costs, in regions in which little differs but him; None:
     there are none.
     """
-    if choice.dearer is None:
+    if choice.whole_factor is None:
         return None
     at, both = clone.first | clone.second, choice.cover[clone.a] & choice.cover[clone.b]
     off = both & (_apart(look(clone.a)[..., :3], look(clone.b)[..., :3]) > _DIFFERS)
     his = np.zeros(choice.whole.shape, bool)
     for region in parts(choice.whole, choice.wraps):
         his |= region & ((at & off & region).sum() > _MOSTLY * (off & region).sum())
-    return replace(choice, dearer=np.where(his, 0.0, choice.dearer)) if his.any() else None
+    return replace(choice, whole_factor=np.where(his, 0.0, choice.whole_factor)) if his.any() else None
 
 
 def _prices(gone: Gone, choice: Choice) -> Prices:
