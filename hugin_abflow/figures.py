@@ -55,26 +55,28 @@ def share(overlap: npt.NDArray[np.bool_], cells: Grid, regions: npt.NDArray[np.b
     return float((reached & regions).sum() / max(1, reached.sum()))
 
 
-def tell(
+def report(
     layers: Sequence[WorkingLayer],
     pairs: Sequence[Pair],
     overlaps: Sequence[npt.NDArray[np.bool_]],
-    shifts: Sequence[Parallax],
+    parallaxes: Sequence[Parallax],
     cells: Grid,
     whole: npt.NDArray[np.bool_] | None,
 ) -> None:
-    """Say of each overlap how far things shift in it, and how much of it is one layer's.
+    """Log of each overlap how far things shift in it, and how much of it is taken from one layer.
 
-    The log record has the same as `overlap`, for reports. shifts: empty where there is no flow. whole: where
-    one layer was taken, on the grid `cells`; None: nowhere.
+    The log record has the same as `overlap`, for reports.
+
+    parallaxes  of `pairs`; empty where there is no flow.
+    whole       where one layer was taken, on the grid `cells`; None: nowhere.
     """
     for number, pair in enumerate(pairs):
         names = layers[pair.a].layer.name, layers[pair.b].layer.name
-        one_layer = share(overlaps[number], cells, whole) if shifts else 1.0
+        one_layer = share(overlaps[number], cells, whole) if parallaxes else 1.0
         found: dict[str, object] = {"layers": list(names), "one_layer": round(one_layer, 4)}
         said = f"{one_layer:.0%} from one layer"
-        if shifts:
-            shift = shifts[number]
+        if parallaxes:
+            shift = parallaxes[number]
             found["parallax_median"], found["parallax_max"] = round(shift.median, 2), round(shift.largest, 2)
             found["consistent"] = round(shift.consistent, 4)
             said = (

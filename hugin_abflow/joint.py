@@ -6,7 +6,6 @@ import importlib
 import logging
 import threading
 from collections.abc import Callable, Generator, Iterator, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from functools import partial
@@ -17,16 +16,11 @@ import numpy as np
 import numpy.typing as npt
 
 from hugin_abflow import (
+    alignment,
     blend,
-    clones,
     coefficient,
-    colour,
     figures,
     flow,
-    geometry,
-    highlights,
-    intermediate,
-    membrane,
     memory,
     multiband,
     pairflow,
@@ -35,22 +29,19 @@ from hugin_abflow import (
     saturation,
     seam,
     single,
-    transition,
     working,
 )
 from hugin_abflow.blend import BlendLayer
 from hugin_abflow.cells import SingleSource
 from hugin_abflow.chart import Chart
 from hugin_abflow.coefficient import Masks
-from hugin_abflow.colour import Correction
 from hugin_abflow.content import Unlike
 from hugin_abflow.errors import SettingsError
 from hugin_abflow.geometry import Pair, PairFlow
 from hugin_abflow.guides import Guide, by_pair
 from hugin_abflow.layer import Canvas, Layer
-from hugin_abflow.opencl import Buffer, Device, DeviceMemoryError
+from hugin_abflow.opencl import Device, DeviceMemoryError
 from hugin_abflow.progress import Progress
-from hugin_abflow.regions import Cells
 from hugin_abflow.settings import FlowQuality, Settings
 from hugin_abflow.working import Grid, WorkingLayer
 
@@ -62,13 +53,11 @@ _unused_log = logging.getLogger("hugin_abflow.unused")
 _LEAST_OVERLAP = 64
 # Every so many rows and columns of a mask are looked at first.
 _SAMPLED = 16
-# What only one layer shows first passes for exposure in part: its region grows to its size in a few rounds.
-_SEAM_ROUNDS = 2
 # Bytes that are to come for each working pixel of a layer: a field, an array of coefficients, offsets
 # and what they are made from; for each pixel of charts: flow both ways, and before that as it was found; and
 # of the largest, to solve it.
 _STEP_BYTES, _FLOW_BYTES, _FOUND_BYTES, _SOLVER_BYTES = 16 + 4 + 9, 16, 32, 250
-# What libraries take that are still being loaded (`_making_ready`).
+# What libraries take that are still being loaded (`_loading_ahead`).
 _LIBRARY_BYTES = 50 << 20
 # A weight that nothing brings above 0 (blend.cl lets hidden layers weigh something after all).
 _NEVER = -1e30
@@ -129,7 +118,7 @@ def prepare_in_memory(
     """
     region = working.full_grid(canvas, layers).region
     abreast = min(pairflow.ABREAST, settings.cores) if settings.flow else 1
-    with _making_ready(device, layers[0], settings):
+    with _loading_ahead(device, layers[0], settings):
         while True:
             try:
                 return prepare(device, layers, canvas, settings, progress, guides, abreast)
@@ -165,7 +154,7 @@ def prepare(
     reduced = [everything[i] for i in used]
     masks = masks.only(used)
     order = {id(layer): index for index, layer in enumerate(layers)}
-    numbers = [order[id(one.layer)] for one in reduced]
+    numbers = [order[id(one.layer)] for one in reduced]  # the caller's, which guides have
     overlapping = _overlapping(device, reduced, masks)
     overlaps = coefficient.Overlaps(masks, [(pair.a, pair.b) for pair in overlapping])
     reduced = saturation.with_whites(device, reduced, overlapping)
@@ -173,18 +162,18 @@ def prepare(
     charts = pairflow.charts(shared, masks.grid, grid, settings)
     fast = partial(_of_quality, "fast", full, shared, masks.grid, settings)
     abreast = _check_memory(device, reduced, charts, grid, settings, fast, abreast)
-    its_guides = by_pair(guides if settings.guides else ())
-    flows, shifts, singles = list[PairFlow](), list[figures.Parallax](), list[SingleSource | None]()
+    pair_guides = by_pair(guides if settings.guides else ())
+    flows, parallaxes, singles = list[PairFlow](), list[figures.Parallax](), list[SingleSource | None]()
     if settings.flow:
-        flows, shifts, singles = pairflow.solve(
-            device, reduced, overlapping, charts, grid, progress, settings, its_guides, numbers, abreast,
+        flows, parallaxes, singles = pairflow.solve(
+            device, reduced, overlapping, charts, grid, progress, settings, pair_guides, numbers, abreast,
             partial(relay.inferable, overlapping, shared, masks.grid),
         )  # fmt: skip
     with progress("align", 1) as advance:
-        once = single.on_canvas(singles, [one.chart for one in flows], seam.seam_grid(grid))
-        aligned = _align(device, reduced, overlapping, flows, once, masks, grid, settings)
+        from_one = single.on_canvas(singles, [one.chart for one in flows], seam.seam_grid(grid))
+        aligned = alignment.align(device, reduced, overlapping, flows, from_one, masks, grid, settings)
         if _log.isEnabledFor(logging.INFO):
-            figures.tell(reduced, overlapping, overlaps, shifts, seam.seam_grid(grid), aligned.whole)
+            figures.report(reduced, overlapping, overlaps, parallaxes, seam.seam_grid(grid), aligned.whole)
         del masks, overlaps, shared, fast  # what comes takes the most memory
         offsets, correction = multiband.none(grid, len(reduced)), aligned.correction
         if settings.exposure and overlapping:
@@ -203,9 +192,10 @@ def prepare(
 
 
 @contextmanager
-def _making_ready(device: Device, first: Layer, settings: Settings) -> Iterator[None]:
-    """Load and build what comes after reading, meanwhile: it takes half a second on one core, and several
-    where kernels are compiled for the first time; a process that is to end waits for one step at most.
+def _loading_ahead(device: Device, first: Layer, settings: Settings) -> Iterator[None]:
+    """Load libraries and build kernels for what comes after reading, on another thread: that takes half a
+    second, and several where kernels are compiled for the first time. A process that is to end waits for one
+    step at most.
     """
     libraries = ("scipy.ndimage", "scipy.sparse.csgraph", "scipy.sparse.linalg")
     steps: list[Callable[[], object]] = [partial(device.build, "coefficient")]  # and all without options
@@ -228,98 +218,6 @@ def _making_ready(device: Device, first: Layer, settings: Settings) -> Iterator[
         yield
     finally:
         done.set()
-
-
-@dataclass(frozen=True)
-class _Aligned:
-    """Layers that agree.
-
-    fields      where each is sampled, and its weight. reaches: how far from there, by rows (geometry.py).
-    whole       where one layer was taken, on the seam grid; None: nowhere, or, without flow, everywhere.
-    unlike      where they show different things there; None as well.
-    """
-
-    fields: list[Buffer]
-    reaches: list[list[float]]
-    correction: Correction
-    whole: Cells | None
-    unlike: Unlike | None
-
-
-def _align(
-    device: Device,
-    layers: Sequence[WorkingLayer],
-    pairs: Sequence[Pair],
-    flows: list[PairFlow],
-    once: Cells | None,
-    masks: Masks,
-    grid: Grid,
-    settings: Settings,
-) -> _Aligned:
-    """Geometry and colour that make the layers agree, without flow cuts alone; where nothing does, one
-    layer whole. What flow cannot explain spoils the exposure around it, which is found again without it.
-    `flows` is emptied.
-    """
-    settled = transition.wanted(flows, settings)
-    coefficients = coefficient.coefficients(device, layers, masks, grid, even=settled)
-    clipped = highlights.measure(device, layers, masks, grid, settings)
-    if settled:
-        transition.minimise_strain(
-            device, layers, coefficients, flows, masks, grid, settings, clipped.excess.max(0)
-        )
-    intermediate.replace_flows(device, layers, coefficients, flows, grid, settings)
-    fields = geometry.fields(device, layers, coefficients, flows, grid, settings)
-    del coefficients
-    device.give_back()
-    extra = highlights.reduce_weights(device, layers, fields, clipped, masks, grid)
-    measured = colour.measure(device, layers, fields, pairs, grid, masks.host)
-    device.give_back()  # two solutions at a time take the most memory
-    with ThreadPoolExecutor(2, "gains") as solving:  # each on one core: the device goes on meanwhile
-
-        def gains(how: Settings, ignored: Cells | None, stern: bool = False) -> Future[Correction]:
-            return solving.submit(colour.correction, device, measured, how, ignored, stern)
-
-        # exposure explains a difference whether it is corrected or not
-        exposure, rounds = replace(settings, exposure=True), _SEAM_ROUNDS if settings.seam else 0
-        first = gains(exposure, None, True) if rounds else None
-        # what the layers get, unless something is to be whole, which is rarely known before
-        hoped = gains(settings, None) if settings.flow and once is None and settings.cores > 1 else None
-        reaches = [geometry.reach(device, *one, grid) for one in zip(layers, fields, strict=True)]
-        whole: Cells | None = None
-        unlike: Unlike | None = None
-        for _ in range(rounds):
-            strict = (first if first and whole is None else gains(exposure, whole, True)).result()
-            device.give_back()
-            residual = seam.residuals(device, layers, fields, pairs, strict, grid)
-            found = seam.regions(residual, grid, aligned=settings.flow, single=once)
-            grown = found if whole is None else found | whole
-            if not grown.any() or (whole is not None and np.array_equal(grown, whole)):
-                break
-            whole = grown
-        if rounds and not settings.flow:
-            seam.cut_unaligned(device, layers, fields, pairs, strict, masks, grid)
-            # what is not aligned tells little of exposures; bands of frequencies change over as they are
-            last, whole = gains(replace(settings, exposure=False), None), None
-        elif whole is not None:
-            last = gains(settings, whole)
-            clipping = seam.clipping_prices(device, layers, fields, pairs, strict, clipped.excess, grid)
-            highlights.restore_weights(device, layers, fields, extra, whole, grid)
-            cells = seam.seam_grid(grid)
-            each_once = partial(clones.owners, device, layers, fields, pairs, strict, grid, cells)
-            owner, gone = seam.cut(
-                device, layers, fields, residual, whole, masks, grid, once, clipping,
-                choose=each_once if settings.clones else None,
-            )  # fmt: skip
-            moved = [*gone.values()] + ([] if once is None else [once])
-            unlike = Unlike.of(cells, residual.mean, whole, np.any(moved, 0) if moved else None)
-            for k in membrane.stretch(
-                device, layers, fields, owner, whole, unlike.anywhere, masks, grid, cells
-            ):
-                reaches[k] = geometry.reach(device, layers[k], fields[k], grid)
-            seam.clamp_displacements(device, layers, fields, owner, whole, grid, cells)
-        else:
-            last = hoped or gains(settings, None)
-        return _Aligned(fields, reaches, last.result(), whole, unlike)
 
 
 def _redundant(index: int, layers: Sequence[WorkingLayer], masks: Masks) -> bool:
@@ -391,11 +289,11 @@ def _check_memory(
     charts      on which flow is found; none if there is no flow.
     fast        gives charts, grid and settings of `--flow-quality fast`.
     """
-    there = memory.resident() + device.own_memory + _LIBRARY_BYTES
+    taken = memory.resident() + device.own_memory + _LIBRARY_BYTES
     pixels = sum(layer.box[2] * layer.box[3] for layer in layers)
     limit = memory.limit(settings.max_memory)
     for abreast in range(most, 0, -1):
-        needed = there + _working_bytes(pixels, charts, grid, settings, abreast)
+        needed = taken + _working_bytes(pixels, charts, grid, settings, abreast)
         if needed <= limit:
             break
     _log.info("memory: about %s of %s at working resolution", memory.size(needed), memory.size(limit))
@@ -405,10 +303,11 @@ def _check_memory(
     what = "whose flow takes" if settings.flow else "which take"
     said = f"{given} is too little for these layers, {what} about {memory.size(needed)}"
     if settings.max_memory:
-        fewer, coarser, less = fast()
-        share = coarser.width * coarser.height / (grid.width * grid.height)
-        there -= round((1 - share) * sum(layer.pixels.nbytes for layer in layers))
-        would_do = there + _working_bytes(round(share * pixels), fewer, coarser, less) <= limit
+        fast_charts, fast_grid, fast_settings = fast()
+        share = fast_grid.width * fast_grid.height / (grid.width * grid.height)
+        taken -= round((1 - share) * sum(layer.pixels.nbytes for layer in layers))
+        fast_bytes = _working_bytes(round(share * pixels), fast_charts, fast_grid, fast_settings)
+        would_do = taken + fast_bytes <= limit
         raise SettingsError(f"{said}; {remedy}{', or choose --flow-quality fast' if would_do else ''}")
     _log.warning("%s; going on with that", said)
     return abreast

@@ -22,7 +22,7 @@ from pictures import (
     texture,
 )
 
-from hugin_abflow import chart, coefficient, consistency, joint, merge, single
+from hugin_abflow import alignment, chart, coefficient, consistency, joint, merge, single
 from hugin_abflow.cells import SingleSource
 from hugin_abflow.errors import SettingsError
 from hugin_abflow.layer import Box, Canvas, Layer
@@ -208,14 +208,14 @@ def test_pixels_of_one_layer_are_copied(canvas, dtype, flow):
 def test_pixels_of_one_layer_are_copied_where_the_correction_is_zero(monkeypatch):
     """A correction that the overlap asks for fades out, and ends."""
     seen = []
-    original = joint.colour.correction
+    original = alignment.colour.correction
 
     def remember(device, measured, settings, ignored, strict):
         found = original(device, measured, settings, ignored, strict)
         seen.extend([] if strict else [found])
         return found
 
-    monkeypatch.setattr(joint.colour, "correction", remember)
+    monkeypatch.setattr(alignment.colour, "correction", remember)
     canvas = Canvas.plane(601, 101)
     masks = [columns(canvas, 0, 131), columns(canvas, 90, 601)]
     pixels = [layer.read(0, 101) for layer in (moved(canvas, masks[0], 0), moved(canvas, masks[1], 0))]
@@ -348,7 +348,7 @@ def test_only_transitions_do_without_distances(monkeypatch, canvas, strain):
 def test_every_pair_is_mended_with_its_own_images(monkeypatch, looked_for):
     """Each with what is taken whole, whatever others are worked on meanwhile, and told in their order."""
     sampled, weighed, mended, found, given = [], {}, {}, {}, []
-    sample, weigh, mend, align = chart.sample, consistency.weigh, consistency.fill, joint._align
+    sample, weigh, mend, align = chart.sample, consistency.weigh, consistency.fill, alignment.align
 
     def spy_sample(device, layer, grid, chart):
         level = sample(device, layer, grid, chart)
@@ -376,7 +376,7 @@ def test_every_pair_is_mended_with_its_own_images(monkeypatch, looked_for):
     monkeypatch.setattr(chart, "sample", spy_sample)
     monkeypatch.setattr(consistency, "weigh", spy_weigh)
     monkeypatch.setattr(consistency, "fill", spy_mend)
-    monkeypatch.setattr(joint, "_align", spy_align)
+    monkeypatch.setattr(alignment, "align", spy_align)
     merged(moving(SPHERE), SPHERE, movers=looked_for, foreground=False)
     [(layers, pairs, flows)] = given
     assert len(flows) == len(weighed) == len(sampled) // 2 > 3

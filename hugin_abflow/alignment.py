@@ -1,0 +1,217 @@
+"""Layers that agree: geometry and colour that bring them together, and one layer, whole, where nothing does.
+
+What flow cannot explain spoils the exposure around it. So regions of it are found after a stricter
+correction, and the final one is solved without them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from functools import partial
+
+import numpy as np
+
+from hugin_abflow import (
+    clones,
+    coefficient,
+    colour,
+    geometry,
+    highlights,
+    intermediate,
+    membrane,
+    seam,
+    transition,
+)
+from hugin_abflow.coefficient import Masks
+from hugin_abflow.colour import Correction
+from hugin_abflow.content import Unlike
+from hugin_abflow.gains import Measured
+from hugin_abflow.geometry import Pair, PairFlow
+from hugin_abflow.highlights import Clipped, PerLayer
+from hugin_abflow.opencl import Buffer, Device
+from hugin_abflow.regions import Cells, Residuals
+from hugin_abflow.settings import Settings
+from hugin_abflow.working import Grid, WorkingLayer
+
+# What only one layer shows first passes for exposure in part: its region grows to its size in a few rounds.
+_SEAM_ROUNDS = 2
+
+
+@dataclass(frozen=True)
+class Aligned:
+    """Layers that agree.
+
+    fields      where each is sampled, and its weight. reaches: how far from there, by rows (geometry.py).
+    whole       where one layer was taken, on the seam grid; None: nowhere, or, without flow, everywhere.
+    unlike      where they show different things there; None as well.
+    """
+
+    fields: list[Buffer]
+    reaches: list[list[float]]
+    correction: Correction
+    whole: Cells | None
+    unlike: Unlike | None
+
+
+def align(
+    device: Device,
+    layers: Sequence[WorkingLayer],
+    pairs: Sequence[Pair],
+    flows: list[PairFlow],
+    single: Cells | None,
+    masks: Masks,
+    grid: Grid,
+    settings: Settings,
+) -> Aligned:
+    """Align layers by flow and exposure, without flow by cuts alone.
+
+    flows       of `pairs`; emptied.
+    single      what single.py found, on the seam grid; None: nothing.
+    """
+    clipped = highlights.measure(device, layers, masks, grid, settings)
+    fields = _fields(device, layers, flows, clipped, masks, grid, settings)
+    extra = highlights.reduce_weights(device, layers, fields, clipped, masks, grid)
+    measured = colour.measure(device, layers, fields, pairs, grid, masks.host)
+    device.give_back()  # two solutions at a time take the most memory
+    scene = _Scene(device, layers, pairs, fields, masks, grid, settings)
+    with ThreadPoolExecutor(2, "gains") as threads:  # each on one core: the device goes on meanwhile
+        gains = _Gains(threads, device, measured, settings)
+        strict = gains.strict(None) if settings.seam else None
+        # before it is known whether there are regions, which is rare
+        early = gains.final(None) if settings.flow and single is None and settings.cores > 1 else None
+        reaches = [geometry.reach(device, *one, grid) for one in zip(layers, fields, strict=True)]
+        regions = _find_regions(scene, gains, strict, single) if strict else None
+        if regions and not settings.flow:
+            seam.cut_unaligned(device, layers, fields, pairs, regions.correction, masks, grid)
+            # what is not aligned tells little of exposures; bands of frequencies change over as they are
+            return Aligned(fields, reaches, gains.none().result(), None, None)
+        if regions is None or regions.whole is None:
+            return Aligned(fields, reaches, (early or gains.final(None)).result(), None, None)
+        final = gains.final(regions.whole)
+        unlike = _cut(scene, regions, regions.whole, single, clipped, extra, reaches)
+        return Aligned(fields, reaches, final.result(), regions.whole, unlike)
+
+
+def _fields(
+    device: Device,
+    layers: Sequence[WorkingLayer],
+    flows: list[PairFlow],
+    clipped: Clipped,
+    masks: Masks,
+    grid: Grid,
+    settings: Settings,
+) -> list[Buffer]:
+    """Where each layer is sampled, and its weight (`geometry.fields`). `flows` is emptied."""
+    least_strain = transition.wanted(flows, settings)
+    coefficients = coefficient.coefficients(device, layers, masks, grid, even=least_strain)
+    if least_strain:
+        unlike = clipped.excess.max(0)
+        transition.minimise_strain(device, layers, coefficients, flows, masks, grid, settings, unlike)
+    intermediate.replace_flows(device, layers, coefficients, flows, grid, settings)
+    fields = geometry.fields(device, layers, coefficients, flows, grid, settings)
+    del coefficients
+    device.give_back()
+    return fields
+
+
+@dataclass(frozen=True)
+class _Scene:
+    """Layers, pairs of them that overlap, and their fields: what is corrected and cut."""
+
+    device: Device
+    layers: Sequence[WorkingLayer]
+    pairs: Sequence[Pair]
+    fields: list[Buffer]
+    masks: Masks
+    grid: Grid
+    settings: Settings
+
+
+@dataclass(frozen=True)
+class _Gains:
+    """Solves for corrections, each on a thread of its own."""
+
+    threads: ThreadPoolExecutor
+    device: Device
+    measured: Measured
+    settings: Settings
+
+    def strict(self, ignored: Cells | None) -> Future[Correction]:
+        """That by which regions are found: exposure explains a difference whether it is corrected or not."""
+        return self._solve(replace(self.settings, exposure=True), ignored, True)
+
+    def final(self, ignored: Cells | None) -> Future[Correction]:
+        """That which the layers get."""
+        return self._solve(self.settings, ignored, False)
+
+    def none(self) -> Future[Correction]:
+        """No correction."""
+        return self._solve(replace(self.settings, exposure=False), None, False)
+
+    def _solve(self, settings: Settings, ignored: Cells | None, strict: bool) -> Future[Correction]:
+        return self.threads.submit(colour.correction, self.device, self.measured, settings, ignored, strict)
+
+
+@dataclass(frozen=True)
+class _Regions:
+    """Where layers differ though they are aligned.
+
+    whole       the cells of all regions; None: there are none.
+    residual    how far layers differ. correction: the strict one after which they do.
+    """
+
+    whole: Cells | None
+    residual: Residuals
+    correction: Correction
+
+
+def _find_regions(scene: _Scene, gains: _Gains, first: Future[Correction], single: Cells | None) -> _Regions:
+    """Regions, found in rounds, each after a correction that ignores those found before.
+
+    first       the correction that ignores none.
+    """
+    device, grid = scene.device, scene.grid
+    whole: Cells | None = None
+    for _ in range(_SEAM_ROUNDS):
+        correction = (first if whole is None else gains.strict(whole)).result()
+        device.give_back()
+        residual = seam.residuals(device, scene.layers, scene.fields, scene.pairs, correction, grid)
+        found = seam.regions(residual, grid, aligned=scene.settings.flow, single=single)
+        grown = found if whole is None else found | whole
+        if not grown.any() or (whole is not None and np.array_equal(grown, whole)):
+            break
+        whole = grown
+    return _Regions(whole, residual, correction)
+
+
+def _cut(
+    scene: _Scene,
+    regions: _Regions,
+    whole: Cells,
+    single: Cells | None,
+    clipped: Clipped,
+    extra: PerLayer,
+    reaches: list[list[float]],
+) -> Unlike:
+    """Take the regions `whole` from one layer each, smoothly displaced: fields change, and with them
+    `reaches`.
+
+    extra       of `highlights.reduce_weights`: there is none where one layer is taken.
+    """
+    device, layers, fields, masks, grid = scene.device, scene.layers, scene.fields, scene.masks, scene.grid
+    compared = (device, layers, fields, scene.pairs, regions.correction)
+    cells = seam.seam_grid(grid)
+    clipping = seam.clipping_prices(*compared, clipped.excess, grid)
+    highlights.restore_weights(device, layers, fields, extra, whole, grid)
+    owner, gone = seam.cut(
+        device, layers, fields, regions.residual, whole, masks, grid, single, clipping,
+        choose=partial(clones.owners, *compared, grid, cells) if scene.settings.clones else None,
+    )  # fmt: skip
+    moved = [*gone.values()] + ([] if single is None else [single])
+    unlike = Unlike.of(cells, regions.residual.mean, whole, np.any(moved, 0) if moved else None)
+    for k in membrane.stretch(device, layers, fields, owner, whole, unlike.anywhere, masks, grid, cells):
+        reaches[k] = geometry.reach(device, layers[k], fields[k], grid)
+    seam.clamp_displacements(device, layers, fields, owner, whole, grid, cells)
+    return unlike
