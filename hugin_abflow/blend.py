@@ -44,8 +44,8 @@ _BLOCK = 64
 # A row of the table of layers: `blend_layer` of kernels/blend.cl.
 _LAYER = np.dtype(
     [
-        *((box, np.int32, 4) for box in ("place", "way", "gain", "offset")),
-        *((number, np.int32) for number in ("ways", "gains", "offsets", "ring", "turn", "unused")),
+        *((box, np.int32, 4) for box in ("place", "field", "gain", "offset")),
+        *((number, np.int32) for number in ("fields", "gains", "offsets", "ring", "turn", "unused")),
         ("rows", np.int64),
     ]
 )
@@ -194,15 +194,12 @@ def _bands(
     together, options = _pixels_together(device), build_options(device, first)
     share = _QUARTER_LEVEL.get(first.dtype, _QUARTER_FINE_LEVEL)
     whole = (0, 0, gain_grid.width, gain_grid.height)
-    fields = [(layer.box, layer.field) for layer in layers]
-    gains = [None if layer.gain is None else (whole, layer.gain) for layer in layers]
-    offsets = [layer.offset for layer in layers]
-    longitudes = _turn(device, full.lonlat[0], full.lonlat[1], crop.left - region.left, crop.width)
+    longitudes = _sines_cosines(device, full.lonlat[0], full.lonlat[1], crop.left - region.left, crop.width)
     plan = _plan(layers, full, grid, crop, height)
-    ways, gained, added = (
-        _Slices(device, arrays, coarse, plan)
-        for arrays, coarse in ((fields, grid), (gains, gain_grid), (offsets, offset_grid))
-    )
+    fields = _Slices(device, [(layer.box, layer.field) for layer in layers], grid, plan)
+    corrections = [None if layer.gain is None else (whole, layer.gain) for layer in layers]
+    gains = _Slices(device, corrections, gain_grid, plan)
+    offsets = _Slices(device, [layer.offset for layer in layers], offset_grid, plan)
     with _Store(
         device, [layer.layer for layer in layers], [band.rows for band in plan], settings.cores
     ) as store:
@@ -211,9 +208,9 @@ def _bands(
             size = part.width, part.height
             groups = -(-part.width // together), part.height
             store.next()
-            places = [slices.take(part) for slices in (ways, gained, added)]
+            places = [slices.take(part) for slices in (fields, gains, offsets)]
             top, bottom = _coarse_rows((0, 0, grid.width, grid.height), part, grid.row_height)
-            hidden.mark(device, ways.values, places[0], (0, top, grid.width, bottom - top), share)
+            hidden.mark(device, fields.values, places[0], (0, top, grid.width, bottom - top), share)
             table = np.zeros(len(layers), _LAYER)
             for row, layer, ring, (start, end) in zip(
                 table, layers, store.shelves.rings, band.rows, strict=True
@@ -221,31 +218,32 @@ def _bands(
                 box = layer.layer.box
                 row["place"] = box.left - region.left, box.top - region.top + start, box.width, end - start
                 row["rows"], row["ring"], row["turn"] = ring.start, ring.rows, start % ring.rows
-            for name, its_places in zip(("way", "gain", "offset"), places, strict=True):
+            for name, its_places in zip(("field", "gain", "offset"), places, strict=True):
                 table[name], table[name + "s"] = its_places[:, :4], its_places[:, 4]
             used = [k for k, (start, end) in enumerate(band.rows) if start < end]
             touched = device.upload(table[used])
-            marks = _mark(device, store.rows, touched, ways.values, full, grid, part, options)
-            latitudes = _turn(device, full.lonlat[2], -full.lonlat[3], part.top, part.height)
+            marks = _mark(device, store.rows, touched, fields.values, full, grid, part, options)
+            latitudes = _sines_cosines(device, full.lonlat[2], -full.lonlat[3], part.top, part.height)
             out = device.empty((part.height, part.width, first.channels + 1), device_dtype(first))
             device.run(
-                "blend", "blend_band", groups, store.rows, touched, len(used), ways.values, gained.values,
-                added.values, longitudes, latitudes, full.border, full.lonlat, grid.border, gain_grid.border,
-                offset_grid.border, (part.left, part.top, *size), (region.left, region.top), shoulder,
-                int(settings.interpolation == "nearest"), share, marks, marks.shape[-1], out, options=options,
+                "blend", "blend_band", groups, store.rows, touched, len(used), fields.values, gains.values,
+                offsets.values, longitudes, latitudes, full.border, full.lonlat, grid.border,
+                gain_grid.border, offset_grid.border, (part.left, part.top, *size), (region.left, region.top),
+                shoulder, int(settings.interpolation == "nearest"), share, marks, marks.shape[-1], out,
+                options=options,
             )  # fmt: skip
             yield _stored(out.get(), first.dtype)
 
 
 def _stored(values: npt.NDArray[Any], dtype: np.dtype[Any]) -> npt.NDArray[Any]:
-    """Samples as the layers have them; light that is more than half floats hold is all that they do."""
+    """Samples as the layers have them; light beyond what half floats hold becomes the most that they do."""
     if dtype == np.float16:
         most = np.finfo(np.float16).max
         np.clip(values, -most, most, out=values)
     return values.astype(dtype, copy=False)
 
 
-def _turn(device: Device, angle: float, step: float, first: int, count: int) -> Buffer:
+def _sines_cosines(device: Device, angle: float, step: float, first: int, count: int) -> Buffer:
     """Sine and cosine at the centres of pixels, float32 (n, 2); angle: of the border of pixel 0."""
     angles = angle + (np.arange(first, first + count) + 0.5) * step
     return device.upload(np.stack([np.sin(angles), np.cos(angles)], -1).astype(np.float32))
@@ -290,7 +288,7 @@ def _mark(
     device: Device,
     rows: Buffer,
     layers: Buffer,
-    ways: Buffer,
+    fields: Buffer,
     full: Grid,
     grid: Grid,
     part: Box,
@@ -304,7 +302,7 @@ def _mark(
     marks = device.empty((part.height, blocks, 2, words), np.uint32)
     band = part.left, part.top, part.width, part.height
     device.run(
-        "blend", "blend_mark", (blocks, part.height), rows, layers, count, ways, full.border, grid.border,
+        "blend", "blend_mark", (blocks, part.height), rows, layers, count, fields, full.border, grid.border,
         band, words, marks, options=options,
     )  # fmt: skip
     return marks

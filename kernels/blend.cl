@@ -183,7 +183,7 @@ static inline int blend_weighs(blend_lines lines, blend_between columns, int2 sp
    band touches are nowhere near, and mostly one alone is left. Bit k % 32 of word k / 32 is layer k's. */
 __kernel void blend_mark(
     __global const pixel_stored *stored, __global const blend_layer *layers, int count, /* as blend_band has them */
-    __global const float4 *ways, int4 border, int4 field_border,                        /* so are these */
+    __global const float4 *fields, int4 border, int4 field_border,                      /* so are these */
     int4 band,             /* its place: left, top, width, height; run size: blocks, rows */
     int words,             /* for a bit of each layer */
     __global uint *marks)  /* (band.w, blocks, 2, words): shown, weighing */
@@ -205,8 +205,8 @@ __kernel void blend_mark(
             if (!blend_shows(stored, layers + k, place, width))
                 continue;
             seen |= 1u << (k & 31);
-            const blend_lines beside = blend_beside(ways + layers[k].ways, layers[k].way, row);
-            if (blend_weighs(beside, columns, layers[k].way.xz, field_border))
+            const blend_lines beside = blend_beside(fields + layers[k].fields, layers[k].field, row);
+            if (blend_weighs(beside, columns, layers[k].field.xz, field_border))
                 weighing |= 1u << (k & 31);
         }
         shown[word] = seen;
@@ -220,7 +220,7 @@ __kernel void blend_mark(
 __kernel void blend_band(
     __global const pixel_stored *stored, /* a ring of rows for each layer: (ring, width) */
     __global const blend_layer *layers, int count, /* those that the band may touch */
-    __global const float4 *ways,         /* per layer, (way.w, way.z): displacement, weight, from hidden_mark */
+    __global const float4 *fields,       /* per layer, (field.w, field.z): displacement, weight, from hidden_mark */
     __global const float4 *gains,        /* per corrected layer, (gain.w, gain.z), whole rows of their grid */
     __global const float4 *offsets,      /* per layer with offsets, (offset.w, offset.z) */
     __global const float2 *columns,      /* (band.z) sine and cosine of longitude; plane: not used */
@@ -282,19 +282,19 @@ __kernel void blend_band(
                 blend_int seen = open & (c.FOURTHS != 0.0f);
                 if (!BLEND_SOME(seen))
                     continue;
-                const int4 span = layers[k].way;
-                const blend_lines beside = blend_beside(ways + layers[k].ways, span, py / scale.y);
-                const blend_samples way = blend_read(beside, blend_within(column, span.xz, field_border));
-                blend_real w = way.FOURTHS + hidden;
+                const int4 span = layers[k].field;
+                const blend_lines beside = blend_beside(fields + layers[k].fields, span, py / scale.y);
+                const blend_samples field = blend_read(beside, blend_within(column, span.xz, field_border));
+                blend_real w = field.FOURTHS + hidden;
                 seen &= w > 0.0f;
                 if (!BLEND_SOME(seen))
                     continue;
                 w = seen ? w : 0.0f;
                 total += w;
-                const blend_int moved = seen & blend_any(way);
+                const blend_int moved = seen & blend_any(field);
                 if (BLEND_SOME(moved)) {
                     blend_real qx, qy;
-                    blend_positions(px, py, way, scale, lonlat, sl, cl, sp, cp, &qx, &qy);
+                    blend_positions(px, py, field, scale, lonlat, sl, cl, sp, cp, &qx, &qy);
                     blend_sample_all(stored, layers + k, qx, qy, moved, border, nearest, &c);
                 }
                 /* a sample that falls outside its layer counts smoothly less */

@@ -92,11 +92,11 @@ static inline blend_between blend_split(blend_real q) {
 
 /* One layer as a band needs it: 96 bytes, made by hugin_abflow/blend.py. */
 typedef struct {
-    int4 place;               /* of its stored rows: left, top, width, height */
-    int4 way, gain, offset;   /* of the rows at hand of its field, gains and offsets, each on its grid */
-    int ways, gains, offsets; /* where these begin; gains, offsets -1: none */
-    int ring, turn, unused;   /* its stored rows are a ring of so many; the first one there */
-    long rows;                /* where they begin: there may be more than 2^31 pixels */
+    int4 place;                 /* of its stored rows: left, top, width, height */
+    int4 field, gain, offset;   /* of the rows at hand of its field, gains and offsets, each on its grid */
+    int fields, gains, offsets; /* where these begin; of gains and offsets -1: none */
+    int ring, turn, unused;     /* its stored rows are a ring of so many; the first one there */
+    long rows;                  /* where they begin: there may be more than 2^31 pixels */
 } blend_layer;
 
 /* How many columns and rows of one grid there are per one of another. */

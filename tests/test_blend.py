@@ -122,7 +122,7 @@ def test_a_band_of_three_layers_equals_its_twin(
         if dtype == np.float32:
             rows[26:29, 5:36, :-1] -= 0.8
     options, white = options_of(Layer.from_array("a", stored[0]), together)
-    ways = [field.astype(np.float32) for field in hidden_mark(fields, boxes, share)]
+    marked_fields = [field.astype(np.float32) for field in hidden_mark(fields, boxes, share)]
 
     table = np.zeros((3, 24), np.int32)
     table[:, :4], table[:, 4:8], table[:, 8:12] = places, boxes, (0, 0, 7, 5)
@@ -144,7 +144,7 @@ def test_a_band_of_three_layers_equals_its_twin(
     out = device.zeros((37, width, channels + 1), dtype)  # a row more than is made
     packed = [
         np.concatenate([a.reshape(-1, a.shape[-1]) for a in arrays])
-        for arrays in (turned, ways, gains[1:], offsets)
+        for arrays in (turned, marked_fields, gains[1:], offsets)
     ]
     rows, lines, factors, summands = (device.upload(a) for a in packed)
     touched, blocks = device.upload(table), -(-width // BLOCK)
@@ -154,7 +154,7 @@ def test_a_band_of_three_layers_equals_its_twin(
         marks, options=options,
     )  # fmt: skip
     marked = [
-        twin.blend_mark(stored, places, ways, boxes, full.border, grid.border, band, BLOCK, white),
+        twin.blend_mark(stored, places, marked_fields, boxes, full.border, grid.border, band, BLOCK, white),
         np.full((36, blocks, 2, 1), 0b111),
     ]
     assert np.array_equal(marks.get(), np.concatenate([marked[0], np.full((1, blocks, 2, 1), MARK)]))
@@ -170,8 +170,8 @@ def test_a_band_of_three_layers_equals_its_twin(
     assert np.array_equal(*made)  # what is not marked changes nothing
     raised = [(spans[0], offsets[0]), None, (spans[1], offsets[1])]
     expected = twin.blend_band(
-        stored, places, ways, boxes, gains, raised, full.border, full.lonlat, grid.border, cells.border,
-        halves.border, band, origin, shoulder, nearest, share, white,
+        stored, places, marked_fields, boxes, gains, raised, full.border, full.lonlat, grid.border,
+        cells.border, halves.border, band, origin, shoulder, nearest, share, white,
     )  # fmt: skip
     result, beyond = np.split(made[0], [36])
     assert not beyond.any()

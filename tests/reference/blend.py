@@ -105,7 +105,7 @@ def correct(colour: Array, gain: Array, offset: Array, white: float, shoulder: f
 def blend_mark(
     stored: Sequence[Array],
     places: Sequence[Sequence[int]],
-    ways: Sequence[Array],
+    fields: Sequence[Array],
     boxes: Sequence[Sequence[int]],
     border: Sequence[int],
     field_border: Sequence[int],
@@ -119,7 +119,7 @@ def blend_mark(
     left, top, width, height = band
     count = -(-width // block)
     marks = np.zeros((height, count, 2, max(1, -(-len(stored) // 32))), np.int64)
-    for k, (rows, place, way, box) in enumerate(zip(stored, places, ways, boxes, strict=True)):
+    for k, (rows, place, field, box) in enumerate(zip(stored, places, fields, boxes, strict=True)):
         valid = np.zeros((height, count * block), bool)
         columns, lines = pixels(width, height, left, top)
         valid[:, :width] = take(opaque(rows, white), place, columns, lines)[..., 3] > 0
@@ -133,7 +133,7 @@ def blend_mark(
             first, last = np.clip(q, 0, box[2] - 1).astype(int)
             q = math.floor((y + top + 0.5) * field_border[1] / border[1] - 0.5) - box[1]
             upper, lower = (min(max(row, 0), box[3] - 1) for row in (q, q + 1))
-            weighs = all_round or last < first or (way[[upper, lower], first : last + 1, 3] > 0).any()
+            weighs = all_round or last < first or (field[[upper, lower], first : last + 1, 3] > 0).any()
             marks[y, b, :, k // 32] |= np.array([1, weighs]) << (k % 32)
     return marks
 
@@ -141,7 +141,7 @@ def blend_mark(
 def blend_band(
     stored: Sequence[Array],
     places: Sequence[Sequence[int]],
-    ways: Sequence[Array],
+    fields: Sequence[Array],
     boxes: Sequence[Sequence[int]],
     gains: Sequence[Array | None],
     offsets: Sequence[tuple[Sequence[int], Array] | None],
@@ -160,7 +160,7 @@ def blend_band(
     """Samples of the band, float64 but rounded and within 0..white for integer layers.
 
     stored, places      rows of each layer and their box.
-    ways, boxes         of `hidden_mark`, and their boxes on the working grid.
+    fields, boxes       of `hidden_mark`, and their boxes on the working grid.
     gains               on the whole colour grid.
     offsets             and their boxes on their grid.
     """
@@ -168,14 +168,14 @@ def blend_band(
     x, y = columns + 0.5, rows + 0.5
     scale = border[0] / field_border[0], border[1] / field_border[1]
     seen = []
-    every = zip(stored, places, ways, boxes, gains, offsets, strict=True)
+    every = zip(stored, places, fields, boxes, gains, offsets, strict=True)
 
     def read(field: Array, box: Sequence[int], grid: Sequence[int]) -> Array:
         return read_field(field, box, x * grid[0] / border[0], y * grid[1] / border[1], grid)
 
-    for pixels_, place, way, box, gain, offset in every:
+    for pixels_, place, field, box, gain, offset in every:
         opaque_ = opaque(pixels_, white)
-        f = read(way, box, field_border)
+        f = read(field, box, field_border)
         exposure, raised = np.zeros((2, *x.shape, 3))
         if gain is not None:
             exposure = read(gain, (0, 0, *gain_border[:2]), gain_border)[..., :3]
