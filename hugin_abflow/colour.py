@@ -114,9 +114,9 @@ def correction(
     differences = measured.differences
     unknown = None if ignored is None else on_cells(ignored[None], cells, np.logical_or)[0]
     if unknown is not None:
-        differences = tuple(_weighed(d, ~unknown[d.cells]) for d in differences)
+        differences = tuple(_weighted(d, ~unknown[d.cells]) for d in differences)
     if settings.flow:  # without, layers are not mixed but cut, somewhere
-        differences = tuple(_weighed(d, d.mixing + _UNSEEN) for d in differences)
+        differences = tuple(_weighted(d, d.mixing + _UNSEEN) for d in differences)
     if not any(np.any(v[..., :3] * v[..., 3:]) for d in differences for v in (d.values, d.beyond)):
         return none
     gains = solve(replace(measured, differences=differences), strict, unknown)
@@ -134,8 +134,8 @@ def correction(
     return replace(none, gains=tuple(result))
 
 
-def _weighed(difference: Difference, weight: npt.NDArray[Any]) -> Difference:
-    """The same, believed as far as (height, width) says."""
+def _weighted(difference: Difference, weight: npt.NDArray[Any]) -> Difference:
+    """The same, weighted by (height, width) besides."""
     scale = np.stack([np.ones(weight.shape)] * 3 + [weight], -1)
     return replace(difference, values=difference.values * scale, beyond=difference.beyond * scale)
 

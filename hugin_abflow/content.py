@@ -1,8 +1,9 @@
-"""Where aligned layers show different things, how they differ is told from beside (kernels/content.cl).
+"""How layers would differ if they showed the same, where they show different things (kernels/content.cl).
 
 Somebody whom one layer shows, in a place that is taken from another, is no difference of exposure: blended
 over wide bands he would leave his colours beside him, as a shade on what is behind. What the layers would
-differ by if both showed that is told by places around, where they do: by the nearest that tell enough.
+differ by if both showed that is extrapolated from places around, where they do: from the nearest of them that
+are enough.
 
 Differences that are completed so need not sum to nothing by their weights, as others do.
 
@@ -26,7 +27,8 @@ from hugin_abflow.working import Grid, Place, cells_under
 _ALIKE, _UNLIKE = 0.06, 0.15
 # Cells of the Gaussians that places around are averaged with, the widest first.
 _SIGMAS = (16.0, 8.0, 4.0, 2.0)
-# Places around tell all if they are this share of what is averaged; if less, the next wider ones do in part.
+# Places around are enough if they are this share of what is averaged; if less, the next wider ones count in
+# part.
 _ENOUGH = 0.05
 # Sigmas to the end of a Gaussian.
 _REACH = 3
@@ -63,8 +65,8 @@ class Unlike:
         taken from one layer; all (height, width) on `grid`.
         """
         other = whole * np.clip((residual - _ALIKE) / (_UNLIKE - _ALIKE), 0, 1)
-        told = np.zeros(whole.shape, bool) if moved is None else moved
-        return cls(grid, told.astype(np.float32), other.astype(np.float32))
+        anywhere = np.zeros(whole.shape, bool) if moved is None else moved
+        return cls(grid, anywhere.astype(np.float32), other.astype(np.float32))
 
 
 def complete(
@@ -90,10 +92,10 @@ def complete(
         "content", "content_gather", cells.border[:2],
         difference, share, box, grid.border, mean, moved, other, cells.border, shoulder, sums,
     )  # fmt: skip
-    told = device.upload(_told(sums.get(), cells.wraps))
+    expected = device.upload(_from_beside(sums.get(), cells.wraps))
     device.run(
         "content", "content_complete", box[2:],
-        difference, share, box, grid.border, mean, moved, other, told, cells.border, shoulder,
+        difference, share, box, grid.border, mean, moved, other, expected, cells.border, shoulder,
     )  # fmt: skip
 
 
@@ -108,8 +110,10 @@ def _any(unlike: Unlike, box: Place, grid: Grid) -> bool:
     return bool(unlike.anywhere[there].any())
 
 
-def _told(sums: Values, wraps: bool) -> Values:
-    """What layers differ by, (height, width, 4), everywhere: from sums of `content_gather`."""
+def _from_beside(sums: Values, wraps: bool) -> Values:
+    """What layers would differ by, (height, width, 4), everywhere, by what is measured beside: from sums of
+    `content_gather`.
+    """
     result = np.zeros_like(sums)
     for sigma in _SIGMAS:
         by = int(_REACH * sigma)

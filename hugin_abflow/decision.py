@@ -1,11 +1,11 @@
-"""Which flow is kept: the one without, or the one with what a search found, on the host.
+"""Which flow is kept: that without a search, or that with what a search found (on the host).
 
-What was found is kept if the images are clearly more alike by it, since where patterns repeat much fits a
-little, and if it is no thing that moved by itself: somebody who walked would be torn from what is behind. It
-did not if it moves as what stands still does, seen by a camera that moved (epipolar.py), or if it is a large
-part of what they show and leads back from one image to the other: what fits by chance fits one way. Of what
-is kept, a part that explains less than no search did is dropped: a chair is found, and beside it bars of a
-banister are taken for the next ones.
+What was found has to make the images clearly more alike, since where patterns repeat much fits a little. And
+it must be no thing that moved by itself: somebody who walked would be torn from what is behind. It is none if
+it moves as what stands still does for a camera that moved (epipolar.py), or if it is a large part of what the
+images show and is consistent: what fits by chance fits in one direction. Of what is kept, a part that
+explains less than flow without a search is dropped: a chair is found, and beside it bars of a banister are
+taken for the next ones.
 """
 
 from __future__ import annotations
@@ -42,8 +42,8 @@ class Candidate:
 
 @dataclass(frozen=True)
 class Refused:
-    """Flow that a search found, and that explains something, but not much, nor is known to be of what stands
-    still.
+    """Flow that a search found and that was refused: it explains something, but not much, and is not known to
+    be of what stands still.
 
     flows   both ways, float32 (2, height, width, 2), px of `level`.
     """
@@ -60,16 +60,16 @@ class Refused:
 
 @dataclass(frozen=True)
 class Decision:
-    """found: whether the one that was found may be taken. refused: what was found and may not."""
+    """found: whether flow with what a search found may be taken. refused: what may not."""
 
     found: bool
     refused: tuple[Refused, ...] = ()
 
 
-def believed(plain: Candidate, found: Candidate, gap: float, wraps: bool) -> npt.NDArray[np.float32]:
-    """(2, height, width): the misfit of `found`, no less than that of `plain` where it does not lead back.
+def trusted_misfit(plain: Candidate, found: Candidate, gap: float, wraps: bool) -> npt.NDArray[np.float32]:
+    """(2, height, width): the misfit of `found`, but no less than that of `plain` where it is not consistent.
 
-    gap     px of the level between start and return from which on it does not.
+    gap     px of the level between start and return from which on it is not.
     wraps   whether the last column is beside the first one.
     """
     ways, height, width = found.misfit.shape
@@ -103,7 +103,7 @@ def decide(
     if not apart.any():
         return Decision(False)
     gain = parameters.gain if last else parameters.hope
-    trusted = believed(plain, found, parameters.gap, wraps)
+    trusted = trusted_misfit(plain, found, parameters.gap, wraps)
     gained = trusted[common].mean() <= gain * plain.misfit[common].mean()
     if gained and (not last or apart.sum() >= parameters.widely * common.sum()):
         return Decision(True)

@@ -219,11 +219,11 @@ def _choose(
     reach: px of the level up to which motion is searched; 0: not at all.
     """
     how = parameters.search
-    descriptors = a, b = [search.descriptor(device, one, grid, how) for one in _apart(device, features)]
-    flows = others = _apart(device, stacked)
+    descriptors = a, b = [search.descriptor(device, one, grid, how) for one in _unstacked(device, features)]
+    flows = others = _unstacked(device, stacked)
     if reach:
         others = search.exhaustive(device, a, b, flows, grid, reach, how)
-    return _together(
+    return _stacked(
         device,
         [
             search.choose(device, descriptors[i], descriptors[1 - i], flow, others[i], grid, level, how)
@@ -232,7 +232,7 @@ def _choose(
     )
 
 
-def _better(
+def _decide(
     device: Device,
     features: Buffer,
     flows: list[Buffer],
@@ -274,8 +274,8 @@ def _misfit(
     return misfit.get()
 
 
-def _apart(device: Device, stacked: Buffer) -> list[Buffer]:
-    """Copies of the arrays that lie one behind the other in a buffer."""
+def _unstacked(device: Device, stacked: Buffer) -> list[Buffer]:
+    """Copies of the arrays that are stacked in a buffer."""
     shape = stacked.shape[1:]
     parts, count = [device.empty(shape) for _ in range(stacked.shape[0])], math.prod(shape[:-1])
     for index, part in enumerate(parts):
@@ -283,8 +283,8 @@ def _apart(device: Device, stacked: Buffer) -> list[Buffer]:
     return parts
 
 
-def _together(device: Device, parts: Sequence[Buffer]) -> Buffer:
-    """The opposite of `_apart`."""
+def _stacked(device: Device, parts: Sequence[Buffer]) -> Buffer:
+    """The opposite of `_unstacked`."""
     shape = parts[0].shape
     stacked, count = device.empty((len(parts), *shape)), math.prod(shape[:-1])
     for index, part in enumerate(parts):
@@ -335,7 +335,7 @@ def solve(
         if flows:
             flows = [_expand(device, one, grid) for one in flows]
         else:
-            flows = [_together(device, start.flows) if start else device.zeros((2, grid[1], grid[0], 2))]
+            flows = [_stacked(device, start.flows) if start else device.zeros((2, grid[1], grid[0], 2))]
         always = parameters.search.always and level <= max(searched, default=-1)
         followed = always or len(flows) > 1
         if level in searched or (followed and level >= parameters.choose_from):
@@ -345,9 +345,9 @@ def solve(
         pulls = start.pulls if start else (None, None)
         flows = [_refine(device, features, one, grid, level, parameters, pulls) for one in flows]
         if len(flows) > 1:
-            flows, dropped = _better(device, features, flows, grid, level, bearings, parameters)
+            flows, dropped = _decide(device, features, flows, grid, level, bearings, parameters)
             refused += dropped
-    forward, backward = _apart(device, flows[0])
+    forward, backward = _unstacked(device, flows[0])
     return Solution(forward, backward, tuple(refused))
 
 
@@ -360,9 +360,9 @@ def refine(
     how = parameters.search
     how = replace(how, steps=(how.refined_steps,), patience=how.refined_patience)
     features = _features(device, [(image, pyramid.reduce(device, image)) for image in (a, b)], parameters)
-    start = _expand(device, _together(device, (forward, backward)), a.grid)
+    start = _expand(device, _stacked(device, (forward, backward)), a.grid)
     chosen = _choose(device, features, start, a.grid, 0, 0, replace(parameters, search=how))
-    flows = _apart(device, _refine(device, features, chosen, a.grid, 0, parameters, (None, None)))
+    flows = _unstacked(device, _refine(device, features, chosen, a.grid, 0, parameters, (None, None)))
     return flows[0], flows[1]
 
 

@@ -151,7 +151,7 @@ def _alike(
 def _nearest(mask: Mask, wraps: bool) -> tuple[npt.NDArray[np.intp], npt.NDArray[np.intp]]:
     """Rows and columns of the cell of a mask that is nearest to each cell."""
     indices = partial(scipy.ndimage.distance_transform_edt, return_distances=False, return_indices=True)
-    row, column = _all_around(indices, ~mask, wraps)
+    row, column = _wrapped(indices, ~mask, wraps)
     return row, column % mask.shape[1]
 
 
@@ -164,7 +164,7 @@ def _width(masks: tuple[Mask, Mask], wraps: bool) -> npt.NDArray[np.float64]:
         within = own | ~other
         if within.all():
             return np.full(total.shape, np.inf)
-        total += _all_around(scipy.ndimage.distance_transform_edt, within, wraps)
+        total += _wrapped(scipy.ndimage.distance_transform_edt, within, wraps)
     return CELL * total
 
 
@@ -173,10 +173,10 @@ def _filled(mask: Mask, wraps: bool) -> Mask:
     wider = grown(np.pad(mask, ((_CLOSED, _CLOSED), (0, 0))), _CLOSED, wraps)
     modes = "constant", "wrap" if wraps else "constant"
     closed = scipy.ndimage.minimum_filter(wider, 2 * _CLOSED + 1, mode=modes, cval=1)[_CLOSED:-_CLOSED]
-    return _all_around(scipy.ndimage.binary_fill_holes, closed, wraps)
+    return _wrapped(scipy.ndimage.binary_fill_holes, closed, wraps)
 
 
-def _all_around(function: Callable[[Mask], Any], mask: Mask, wraps: bool) -> npt.NDArray[Any]:
-    """What a function of SciPy that knows no columns which wrap makes of a mask, (..., height, width)."""
+def _wrapped(function: Callable[[Mask], Any], mask: Mask, wraps: bool) -> npt.NDArray[Any]:
+    """What a function of SciPy, which knows no columns that wrap, makes of a mask: (..., height, width)."""
     columns = mask.shape[1]
     return np.asarray(function(np.tile(mask, 3))[..., columns : 2 * columns] if wraps else function(mask))

@@ -75,13 +75,13 @@ def _stretch(
     around, all_of_it = (averaged(one * 1.0, cells.wraps) for one in (free, known))
     # a third at a straight outline, all a cell from there; what is beyond the layer is no outline
     far = (free * np.clip(2 * around / np.maximum(all_of_it, 0.1) - 1, 0, 1))[..., None]
-    told = np.concatenate([far * _harmonic(means[..., :3], free, known, cells), far], -1)
+    smooth = np.concatenate([far * _harmonic(means[..., :3], free, known, cells), far], -1)
     # beside the layer as in it: its last pixels are read between
-    beside = averaged(told, cells.wraps) / np.maximum(around, 0.1)[..., None]
-    told = np.where(known[..., None], told, beside)
+    beside = averaged(smooth, cells.wraps) / np.maximum(around, 0.1)[..., None]
+    smooth = np.where(known[..., None], smooth, beside)
     device.run(
         "membrane", "membrane_stretch", layer.box[2:], field, layer.box, grid.border,
-        device.upload(np.ascontiguousarray(told, np.float32)), cells.border,
+        device.upload(np.ascontiguousarray(smooth, np.float32)), cells.border,
     )  # fmt: skip
     return True
 

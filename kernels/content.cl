@@ -1,5 +1,5 @@
-/* Where aligned layers show different things, how they differ tells nothing of exposure: it is told from beside. Layers
-   are levels of multiband.cl: arrays on a box of a grid. */
+/* Where aligned layers show different things, how they differ tells nothing of exposure: it is extrapolated from
+   beside. Layers are levels of multiband.cl: arrays on a box of a grid. */
 
 /* The brightest channel, of an integer image, up to which what a layer shows may be the dark of anything, as at the rim
    of a lens, and from which on it surely is something. */
@@ -56,7 +56,7 @@ __kernel void content_gather(__global const float4 *difference,  /* (box.w, box.
 __kernel void content_complete(__global float4 *difference, __global const float *share, /* (box.w, box.z) */
                                int4 box, int4 grid, /* place, run size; its grid */
                                __global const float4 *mean, __global const float *moved, __global const float *unlike,
-                               __global const float4 *told, /* (cells.y, cells.x): e, unused */
+                               __global const float4 *expected, /* (cells.y, cells.x): e, unused */
                                int4 cells, float shoulder)
 {
     const int x = get_global_id(0), y = get_global_id(1), at = y * box.z + x;
@@ -68,6 +68,6 @@ __kernel void content_complete(__global float4 *difference, __global const float
     const float same = content_same(d, m, rest, place, moved, unlike, cells, shoulder);
     if (same == 1.0f)
         return;
-    const float4 e = bilinear_colour(told, place, cells);
+    const float4 e = bilinear_colour(expected, place, cells);
     difference[at].xyz = same * d + (1.0f - same) * rest * e.xyz;
 }

@@ -23,14 +23,14 @@ __kernel void membrane_mean(__global const float4 *layer, __global const float4 
 /* In place of a layer's displacements, as far as cells tell others, these; bilinear between the cells' centres. */
 __kernel void membrane_stretch(__global float4 *field,        /* (box.w, box.z) of the working grid; x, y, z change */
                                int4 box, int4 border,         /* place on the working grid, run size; that grid */
-                               __global const float4 *told,   /* (cells.y, cells.x): displacement times how far, 0..1;
+                               __global const float4 *smooth, /* (cells.y, cells.x): displacement times how far, 0..1;
                                                                  how far */
                                int4 cells)                    /* over the same region */
 {
     const int x = get_global_id(0), y = get_global_id(1);
     if (x >= box.z || y >= box.w)
         return;
-    const float4 other = bilinear_colour(told, grid_place(x + box.x, y + box.y, border, cells), cells);
+    const float4 other = bilinear_colour(smooth, grid_place(x + box.x, y + box.y, border, cells), cells);
     if (other.w > 0.0f) {
         const float4 own = field[y * box.z + x];
         field[y * box.z + x] = (float4)((1.0f - other.w) * own.xyz + other.xyz, own.w);

@@ -118,9 +118,9 @@ __kernel void transition_relax(__global float *share,       /* in place */
                                __global const float *east,  /* (cells.y, cells.x) links to the next column, */
                                __global const float *south, /* (cells.y, cells.x) to the next row; 0: none */
                                __global const float *well,  /* (cells.y, cells.x) */
-                               float deep,                  /* part of the well that counts */
+                               float depth,                 /* part of the well that counts */
                                int colour,                  /* 0 or 1 */
-                               float over)                  /* 1 to 2 */
+                               float relaxation)            /* 1 to 2 */
 {
     const int y = get_global_id(1), x = 2 * get_global_id(0) + ((y + colour) & 1);
     if (x >= cells.x || y >= cells.y)
@@ -135,14 +135,14 @@ __kernel void transition_relax(__global float *share,       /* in place */
     const float sum = link.x + link.y + link.z + link.w;
     if (sum <= 0.0f)
         return;
-    const float scale = 1.0f / GREATEST(sum - deep * well[at], TRANSITION_WEAKEST * sum);
+    const float scale = 1.0f / GREATEST(sum - depth * well[at], TRANSITION_WEAKEST * sum);
     for (int s = begin; s < end; ++s) {
         const int k = owner[s];
         const float pull = link.x * transition_share(share, first, owner, left, k) +
                            link.y * transition_share(share, first, owner, right, k) +
                            link.z * transition_share(share, first, owner, up, k) +
                            link.w * transition_share(share, first, owner, down, k);
-        share[s] += over * (pull * scale - share[s]);
+        share[s] += relaxation * (pull * scale - share[s]);
     }
     transition_project(share, begin, end);
 }

@@ -80,12 +80,12 @@ def test_what_does_not_lead_back_explains_nothing(wraps: bool) -> None:
     """It fits by chance, and counts for no more than flow without a search."""
     plain, found = candidates((LARGE, 6, 0.02), (SMALL, 6, 0.3))
     columns = np.arange(WIDTH)
-    believed = decision.believed(plain, found, 2, wraps)
+    believed = decision.trusted_misfit(plain, found, 2, wraps)
     for way, there in enumerate(((columns >= 10) & (columns < 44), (columns >= 16) & (columns < 50))):
         expected = np.full((HEIGHT, WIDTH), 0.1, np.float32)
         expected[LARGE[0], there], expected[SMALL] = 0.02, 0.3  # which is no better
         assert np.array_equal(believed[way], expected)
-    assert np.array_equal(decision.believed(plain, found, 6.1, wraps), found.misfit)
+    assert np.array_equal(decision.trusted_misfit(plain, found, 6.1, wraps), found.misfit)
 
 
 def test_a_large_part_has_to_lead_back_unless_it_moves_as_what_stands_still() -> None:
@@ -101,7 +101,7 @@ def test_what_leads_over_the_border_leads_back_only_where_columns_wrap(wraps: bo
     plain, found = candidates()
     found.flows[0, :, WIDTH - 4 :, 0], found.flows[1, :, 2:6, 0] = 6, -6
     found.misfit[0, :, WIDTH - 4 :] = 0.02
-    believed = decision.believed(plain, found, 2, wraps)[0, :, WIDTH - 4 :]
+    believed = decision.trusted_misfit(plain, found, 2, wraps)[0, :, WIDTH - 4 :]
     assert np.all(believed == np.float32(0.02 if wraps else 0.1))
 
 
@@ -110,9 +110,9 @@ def test_return_is_read_at_the_pixel_that_flow_leads_to(way: int) -> None:
     plain, found = candidates()
     found.flows[way, 20, 30] = (2.6, -4.4)
     found.misfit[way, 20, 30] = 0.02
-    assert decision.believed(plain, found, 2, False)[way, 20, 30] == np.float32(0.1)
+    assert decision.trusted_misfit(plain, found, 2, False)[way, 20, 30] == np.float32(0.1)
     found.flows[1 - way, 16, 33] = (-2.6, 4.4)
-    assert decision.believed(plain, found, 2, False)[way, 20, 30] == np.float32(0.02)
+    assert decision.trusted_misfit(plain, found, 2, False)[way, 20, 30] == np.float32(0.02)
 
 
 @pytest.mark.parametrize("wraps", [False, True])

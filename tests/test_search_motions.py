@@ -107,11 +107,11 @@ def test_of_what_is_found_a_part_that_fits_worse_is_dropped(device: Device) -> N
         found[way, patch] = 7, -4
     flows = [device.upload(one) for one in (plain, found)]
     grid = images[0].grid
-    left, refused = flow._better(device, features, flows, grid, 1, None, FlowParameters())
+    left, refused = flow._decide(device, features, flows, grid, 1, None, FlowParameters())
     assert not refused
     found[:, patch] = 0
     assert np.array_equal(left[0].get(), found) and len(left) == 1
-    (both, also), _ = flow._better(device, features, flows, grid, 2, None, FlowParameters())
+    (both, also), _ = flow._decide(device, features, flows, grid, 2, None, FlowParameters())
     assert both is flows[0] and also is flows[1]  # it is not decided there
 
 
