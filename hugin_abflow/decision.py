@@ -93,7 +93,7 @@ def decide(
 ) -> Decision:
     """Whether flow as `found` may be taken for `plain`, without a search, after a level.
 
-    last_level  the level on which that is decided at last; on coarser ones there is only little to hope for.
+    last_level  the level on which that is decided at last; on coarser ones what gains too little is dropped.
     textured    gives (2, height, width): where the images tell motion.
     wraps       whether the last column is beside the first one.
     """
@@ -102,10 +102,10 @@ def decide(
     apart = common & (_difference(plain, found) > distance)
     if not apart.any():
         return Decision(False)
-    gain = parameters.gain if last else parameters.hope
+    gain = parameters.gain if last else parameters.early_gain
     trusted = trusted_misfit(plain, found, parameters.gap, wraps)
     gained = trusted[common].mean() <= gain * plain.misfit[common].mean()
-    if gained and (not last or apart.sum() >= parameters.widely * common.sum()):
+    if gained and (not last or apart.sum() >= parameters.wide * common.sum()):
         return Decision(True)
     remains, before = found.misfit[apart].mean(), plain.misfit[apart].mean()
     if bearings and remains <= parameters.gain_apart * before:

@@ -38,21 +38,25 @@ class GuidanceParameters:
     """How guides lead."""
 
     agreement: float = 3.0  # chart px: a guide so near to the flow changes nothing
-    radius: float = 0.08  # of the canvas's width: how far neighbours vouch for each other
+    radius: float = 0.08  # of the canvas's width: how far away neighbours confirm a guide
     pulls: tuple[float, ...] = (0.0, 2.0, 8.0)  # strength of the spring per level, finest first
-    least_sigma: float = 32.0  # chart px around a guide that it leads: its distance from the flow, because
-    most_sigma: float = 128.0  # smaller things are found alone, or a share of the way to one that moves alike
+    # Sigma, chart px, within which a guide leads: its distance from the flow, because smaller things are
+    # found without it, or this share of the distance to a guide that moves alike, if that is more
+    least_sigma: float = 32.0
+    most_sigma: float = 128.0
     spacing: float = 0.6
     evidence: float = 20.0  # weight of a difference in cost beside a link of neighbours
     trust: float = 20.0  # weight of a guide's own place beside a link of neighbours
-    contrast: float = 0.05  # step of h that parts neighbours
+    contrast: float = 0.05  # step of h across which a link falls to 1/e
     sweeps: int = 200  # of the vote
-    witness: float = 6.0  # px: sigma of the window around a guide in which the images are heard about it
-    gain: float = 0.75  # of the old cost there: the images confirm a guide that brings it below, ...
-    misfit: float = 1.25  # of the images' contrast there, if it is not worse than none, ...
-    fit: float = 0.5  # or below this share, however well the old flow fits, ...
-    blank: float = 0.06  # or if there is less contrast than this: nobody but the guide knows
-    heard: float = 0.25  # share of the window that both images must show, to be heard at all
+    # The images confirm a guide if, in a window around it, the new flow costs less than `gain` of the old one
+    # and `misfit` of the contrast there, or less than `fit` of the contrast, or if that is less than `blank`
+    window: float = 6.0  # px: sigma
+    gain: float = 0.75
+    misfit: float = 1.25
+    fit: float = 0.5
+    blank: float = 0.06
+    seen: float = 0.25  # the share of the window that both images must show to confirm anything
 
 
 @dataclass(frozen=True)
@@ -307,12 +311,12 @@ def _refusals(
     rivals: Sequence[_Rivals], ways: Sequence[_DirectedGuides], parameters: GuidanceParameters
 ) -> list[str]:
     """Why guides are ignored after all, "" where they are not: what the images say around each of them."""
-    radius = math.ceil(2 * parameters.witness)
+    radius = math.ceil(2 * parameters.window)
     steps = np.arange(-radius, radius + 1)
-    weights = np.exp(-0.5 * (steps / parameters.witness) ** 2)
+    weights = np.exp(-0.5 * (steps / parameters.window) ** 2)
     window = weights[:, None] * weights
     count = len(ways[0].places)
-    costs, contrast, moved, heard = np.zeros((count, 2)), np.zeros(count), np.zeros(count), np.zeros(count)
+    costs, contrast, moved, shown = np.zeros((count, 2)), np.zeros(count), np.zeros(count), np.zeros(count)
     for rival, way in zip(rivals, ways, strict=True):
         feature, *brought = (buffer.get()[0] for buffer in (rival.feature, *rival.brought))
         shift = np.linalg.norm(rival.new.get() - rival.old.get(), axis=-1)
@@ -325,7 +329,7 @@ def _refusals(
             at = np.ix_(np.clip(rows, 0, height - 1), columns % width)
             seen = inside & (feature[at][..., 3] * brought[0][at][..., 3] * brought[1][at][..., 3] > 0)
             share = window * seen
-            heard[i] = max(heard[i], share.sum() / window.sum())
+            shown[i] = max(shown[i], share.sum() / window.sum())
             contrast[i] += (share * _cost(feature[at], 0 * feature[at])).sum() / max(share.sum(), 1.0)
             for k in (0, 1):
                 costs[i, k] += (share * _cost(feature[at], brought[k][at])).sum() / max(share.sum(), 1.0)
@@ -337,7 +341,7 @@ def _refusals(
     reasons = np.where(better | fits | plain, "", "the images do not confirm it")
     reasons = np.where(moved < parameters.agreement, "the images lead back", reasons)
     # a place that one photo does not show has no contrast, but is not plain
-    reasons = np.where(heard < parameters.heard, "one of the photos does not show the place", reasons)
+    reasons = np.where(shown < parameters.seen, "one of the photos does not show the place", reasons)
     return [str(reason) for reason in reasons]
 
 

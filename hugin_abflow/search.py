@@ -28,42 +28,35 @@ class SearchParameters:
     """How large motion is searched. Costs are misfits of descriptors, 0 to 1."""
 
     coarse: float = 9.0  # px: displacements are tried on the finest level on which reach is at most this
-    # px: and nothing beyond this is tried, where the coarsest level is too fine for that; and how far on the
-    # levels below, which show what is too fine for it
+    # px: the largest displacement tried there (reach is more if the coarsest level is too fine for it), and
+    # on the next finer levels, which show finer texture
     furthest: tuple[int, ...] = (10, 7)
     noise: float = 0.05  # amplitude of h that is no texture
     outside: float = 0.5  # cost, on the coarse level, of what the other image does not show
     couplings: tuple[float, ...] = (0.001, 0.01, 0.03, 0.1, 0.3)  # of a squared pixel, in turns
     tolerance: float = 2.5  # px: by how much both directions may disagree
     distinct: float = 0.1  # how much less the one found costs than any other more than 2 px away
-    own_outside: float = 0.25  # the same for a pixel's own flow, which is not given up for want of evidence
-    other_outside: float = 0.75  # and for a flow that it may take over
+    own_outside: float = 0.25  # `outside` for a pixel's own flow, which is not given up for want of evidence
+    other_outside: float = 0.75  # `outside` for a flow that it may take over
     patience: float = 0.06  # by how much a flow from elsewhere must fit better
     # px, at most 4, per level, finest first, the last for all coarser: of the window in which two flows are
     # compared; thin things show on finer levels alone, whose windows would hold too little if not larger
     radius: tuple[int, ...] = (4, 4, 2)
     focus: float = 4.0  # e-folds by which a pixel counts less there, for a difference of 1 from the middle
-    # what a search found is dropped on a level where more than this share of the misfit without it remains,
-    # and kept if no more than this remains at last, and it leads elsewhere by so many px (of the level on
-    # which that is decided) in so large a share of the pixels that both images show; for both, what ends so
-    # many px of its level from where it started, there and back, explains no more than flow without a search
-    hope: float = 0.95
-    gain: float = 0.82
-    apart: float = 1.5
-    widely: float = 0.25
-    gap: float = 2.0
-    # or if no more than this remains where it leads elsewhere, and motion there is that of what stands still,
-    # as gradients of h of at least this tell
-    gain_apart: float = 0.75
-    textured: float = 0.02
+    # Which flow is kept (decision.py). Gains: the share of the misfit without a search that may remain.
+    early_gain: float = 0.95  # on levels before the last decision
+    gain: float = 0.82  # at last, if it leads elsewhere in a large share of the overlap
+    apart: float = 1.5  # px of the level of the last decision, from which on flow leads elsewhere
+    wide: float = 0.25  # the share of the overlap that is large
+    gain_apart: float = 0.75  # where it leads elsewhere, if motion there is that of what stands still
+    textured: float = 0.02  # gradient of h from which on a pixel tells motion
+    gap: float = 2.0  # px of a level between start and return from which on flow is not consistent
     always: bool = False  # keep what is found, whatever becomes of it
-    # px from which flow is taken over, in turns, likewise: short on finer levels, where the rails of a chair
-    # in the sample room took over what fits them by chance (benchmarks/RESULTS.md, Parts)
+    # px from which flow is taken over, in turns, per level as for `radius`: short on finer levels, where the
+    # rails of a chair in the sample room took over what fits them by chance (benchmarks/RESULTS.md, Parts)
     steps: tuple[tuple[int, ...], ...] = ((6, 3, 1), (6, 3, 1), (16, 8, 4, 2, 1))
-    # and where found flow is refined, and thin things are wider; by how much another has to fit better there:
-    # with less, outlines of what moves far get ragged
-    refined_steps: tuple[int, ...] = (12, 6, 3, 1)
-    refined_patience: float = 0.2
+    refined_steps: tuple[int, ...] = (12, 6, 3, 1)  # where flow is refined, and thin things are wider
+    refined_patience: float = 0.2  # likewise; with less, outlines of what moves far get ragged
 
     def __post_init__(self) -> None:
         if max(self.radius) > _LARGEST_RADIUS:

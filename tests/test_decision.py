@@ -47,7 +47,7 @@ def test_a_large_part_that_explains_much_is_kept() -> None:
     assert decided((LARGE, 6, 0.02)) == decision.Decision(True)
     assert not decided((LARGE, 6, 0.08)).found
     assert not decided((LARGE, 1.2, 0.02)).found  # the same as without a search
-    assert decided((LARGE, 6, 0.08), level=2).found  # there is hope
+    assert decided((LARGE, 6, 0.08), level=2).found  # it gains a little
     assert decided((LARGE, 1.2, 0.02), level=2).found  # twice as much on the level on which it is decided
 
 
