@@ -101,51 +101,79 @@ def lead(
     circumference   of the canvas in px of the chart.
     """
     parameters, count = parameters or GuidanceParameters(), len(guides)
-    ways = list(_directed(images[0].grid, (flows[0].get(), flows[1].get()), guides))
-    wrong = _wrong(ways, parameters.agreement)
-    if not wrong.any():
-        return flows
-    period = _period(images[0].grid)
-    reasons = doubts(guides.at_a, ways[0].moves, parameters.radius * circumference, period)
-    for name, reason, counts in zip(guides.names, reasons, wrong, strict=True):
-        if reason and counts:
-            _log.info("%s is ignored: %s", name, reason)
-    leading = wrong & np.array([not reason for reason in reasons])
+    directed = _directed(images[0].grid, (flows[0].get(), flows[1].get()), guides)
+    leading = _leading(guides, directed, images[0].grid, parameters.radius * circumference, parameters)
     if not leading.any():
         return flows
-    guides, ways = guides.only(leading), [way.only(leading) for way in ways]
-    solved = FlowParameters()
-    level = min(len(parameters.pulls), flow.levels(images[0], solved)) - 1
-    found = [device.copy(one) for one in flows]  # what wins is put into them
-    springs = [_Springs(device, images[0], *pair, parameters) for pair in zip(found, ways, strict=True)]
-    start = Start(
-        level, (springs[0].start(level), springs[1].start(level)), (springs[0].pull, springs[1].pull)
-    )
-    new = flow.pair_flow(device, *images, solved, start)
-    features = [flow.finest_features(device, image, solved) for image in images]
-    rivals = [
-        _Rivals.of(device, features[i], features[1 - i], images[i].grid, found[i], new[i]) for i in (0, 1)
-    ]
-    reasons = _refusals(rivals, ways, parameters)
-    for name, reason in zip(guides.names, reasons, strict=True):
-        if reason:
-            _log.info("%s is ignored: %s", name, reason)
-    kept = np.array([not reason for reason in reasons])
+    guides, directed = guides.only(leading), (directed[0].only(leading), directed[1].only(leading))
+    rivals = _rivals(device, images, flows, directed, parameters)
+    kept = _confirmed(guides, rivals, directed, parameters)
     if not kept.any():
         return flows
     _log.info("%d of %d control points of a pair lead its flow", np.count_nonzero(kept), count)
-    springs = [
-        _Springs(device, images[0], rival.old, way.only(kept), parameters)
-        for rival, way in zip(rivals, ways, strict=True)
+    nearness = [
+        _Springs(device, images[0], rival.old, its.only(kept), parameters).at(0)[1]
+        for rival, its in zip(rivals, directed, strict=True)
     ]
-    nearness = [spring.at(0)[1] for spring in springs]
     for rival, near in zip(rivals, nearness, strict=True):
         _choose(device, rival, near, parameters)
-    refined = flow.pair_flow(device, *images, solved, Start(0, (found[0], found[1])))
+    refined = flow.pair_flow(device, *images, FlowParameters(), Start(0, (rivals[0].old, rivals[1].old)))
     for one, near, result in zip(refined, nearness, flows, strict=True):
         grid = images[0].grid
         device.run("guidance", "guidance_blend", grid[:2], one, near, grid, result)
     return flows
+
+
+def _leading(
+    guides: ChartGuides,
+    directed: Sequence[_DirectedGuides],
+    grid: tuple[int, int, int, int],
+    radius: float,
+    parameters: GuidanceParameters,
+) -> npt.NDArray[np.bool_]:
+    """Which guides contradict the flow, and are not to be doubted. radius: as of `guides.doubts`."""
+    wrong = _wrong(directed, parameters.agreement)
+    if not wrong.any():
+        return wrong
+    reasons = doubts(guides.at_a, directed[0].moves, radius, _period(grid))
+    for name, reason, counts in zip(guides.names, reasons, wrong, strict=True):
+        if reason and counts:
+            _log.info("%s is ignored: %s", name, reason)
+    return np.asarray(wrong & [not reason for reason in reasons])
+
+
+def _rivals(
+    device: Device,
+    images: tuple[Level, Level],
+    flows: tuple[Buffer, Buffer],
+    directed: tuple[_DirectedGuides, _DirectedGuides],
+    parameters: GuidanceParameters,
+) -> list[_Rivals]:
+    """In both directions, copies of the flow as it is, and the flow that starts where guides send it."""
+    solver = FlowParameters()
+    level = min(len(parameters.pulls), flow.levels(images[0], solver)) - 1
+    old = [device.copy(one) for one in flows]  # what wins is put into them
+    springs = [_Springs(device, images[0], *pair, parameters) for pair in zip(old, directed, strict=True)]
+    start = Start(
+        level, (springs[0].start(level), springs[1].start(level)), (springs[0].pull, springs[1].pull)
+    )
+    new = flow.pair_flow(device, *images, solver, start)
+    features = [flow.finest_features(device, image, solver) for image in images]
+    return [_Rivals.of(device, features[i], features[1 - i], images[i].grid, old[i], new[i]) for i in (0, 1)]
+
+
+def _confirmed(
+    guides: ChartGuides,
+    rivals: Sequence[_Rivals],
+    directed: Sequence[_DirectedGuides],
+    parameters: GuidanceParameters,
+) -> npt.NDArray[np.bool_]:
+    """Which guides the images confirm."""
+    reasons = _refusals(rivals, directed, parameters)
+    for name, reason in zip(guides.names, reasons, strict=True):
+        if reason:
+            _log.info("%s is ignored: %s", name, reason)
+    return np.array([not reason for reason in reasons])
 
 
 def contradict(
@@ -173,21 +201,23 @@ def held(
     to b and back.
     """
     agreement = (parameters or GuidanceParameters()).agreement
-    ways = _directed(images[0].grid, (flows[0].get(), flows[1].get()), guides)
+    directed = _directed(images[0].grid, (flows[0].get(), flows[1].get()), guides)
     agree = np.ones(len(guides), bool)
-    for image, way in zip(images, ways, strict=True):
-        inside, (row, column) = pixels_at(way.places, image.grid)
+    for image, its in zip(images, directed, strict=True):
+        inside, (row, column) = pixels_at(its.places, image.grid)
         agree &= inside & (image.mask.get()[row * inside, column * inside] > 0)
-        agree &= np.linalg.norm(way.residuals, axis=1) <= agreement
-    there, back = (np.hstack([way.places, way.moves])[agree] for way in ways)
+        agree &= np.linalg.norm(its.residuals, axis=1) <= agreement
+    there, back = (np.hstack([its.places, its.moves])[agree] for its in directed)
     return there, back
 
 
 @dataclass(frozen=True)
 class _DirectedGuides:
-    """The guides in one direction: places, moves and what the flow there lacks to them, (n, 2) px.
+    """The guides in one direction, (n, 2) px.
 
-    A residual is 0 where the place is not on the chart.
+    places      on the image on which the flow starts.
+    moves       from there to the place on the other image.
+    residuals   moves less the flow there; 0 where the place is not on the chart.
     """
 
     places: Points
@@ -198,9 +228,9 @@ class _DirectedGuides:
         return _DirectedGuides(self.places[chosen], self.moves[chosen], self.residuals[chosen])
 
 
-def _wrong(ways: Sequence[_DirectedGuides], agreement: float) -> npt.NDArray[np.bool_]:
+def _wrong(directed: Sequence[_DirectedGuides], agreement: float) -> npt.NDArray[np.bool_]:
     """Which guides lie farther than that from the flow in one direction."""
-    far = [np.linalg.norm(way.residuals, axis=1) > agreement for way in ways]
+    far = [np.linalg.norm(its.residuals, axis=1) > agreement for its in directed]
     return np.asarray(np.any(far, axis=0))
 
 
@@ -211,12 +241,12 @@ def _directed(
     moves = guides.at_b - guides.at_a
     if wraps:
         moves[:, 0] -= width * np.rint(moves[:, 0] / width)
-    ways = []
-    for field, places, way in zip(flows, (guides.at_a, guides.at_b), (moves, -moves), strict=True):
+    directed = []
+    for field, places, its in zip(flows, (guides.at_a, guides.at_b), (moves, -moves), strict=True):
         inside, (row, column) = pixels_at(places, grid)
         found = field[row * inside, column * inside]
-        ways.append(_DirectedGuides(places, way, np.where(inside[:, None], way - found, 0.0)))
-    return ways[0], ways[1]
+        directed.append(_DirectedGuides(places, its, np.where(inside[:, None], its - found, 0.0)))
+    return directed[0], directed[1]
 
 
 class _Springs:
@@ -227,14 +257,14 @@ class _Springs:
         device: Device,
         image: Level,
         found: Buffer,
-        way: _DirectedGuides,
+        guides: _DirectedGuides,
         parameters: GuidanceParameters,
     ) -> None:
         self._device, self._image, self._found, self._parameters = device, image, found, parameters
-        way = way.only(np.any(way.residuals, axis=1))  # the others are not on the chart
-        table = np.concatenate([way.places, way.residuals], 1)
+        guides = guides.only(np.any(guides.residuals, axis=1))  # the others are not on the chart
+        table = np.concatenate([guides.places, guides.residuals], 1)
         self._guides = device.upload(table, np.float32)
-        sigmas = _sigmas(way, _period(image.grid), parameters)
+        sigmas = _sigmas(guides, _period(image.grid), parameters)
         self._sigmas = device.upload(sigmas, np.float32)
 
     def at(self, level: int) -> tuple[Buffer, Buffer]:
@@ -263,14 +293,14 @@ class _Springs:
         )  # fmt: skip
 
 
-def _sigmas(way: _DirectedGuides, period: float, parameters: GuidanceParameters) -> Values:
+def _sigmas(guides: _DirectedGuides, period: float, parameters: GuidanceParameters) -> Values:
     """How far each guide leads, px; `period`: as of `guides.doubts`."""
-    lengths = np.linalg.norm(way.residuals, axis=1)
+    lengths = np.linalg.norm(guides.residuals, axis=1)
     sigmas = lengths.copy()
     for i in range(len(lengths)):
-        alike = np.linalg.norm(way.moves - way.moves[i], axis=1) < _ALIKE * lengths[i]
+        alike = np.linalg.norm(guides.moves - guides.moves[i], axis=1) < _ALIKE * lengths[i]
         alike[i] = False
-        spaced = parameters.spacing * distances(way.places, i, period)[alike].min(initial=np.inf)
+        spaced = parameters.spacing * distances(guides.places, i, period)[alike].min(initial=np.inf)
         if spaced <= parameters.most_sigma:  # one that is farther away is on something else
             sigmas[i] = max(sigmas[i], spaced)
     clipped: Values = np.clip(sigmas, parameters.least_sigma, parameters.most_sigma)
@@ -308,21 +338,21 @@ class _Rivals:
 
 
 def _refusals(
-    rivals: Sequence[_Rivals], ways: Sequence[_DirectedGuides], parameters: GuidanceParameters
+    rivals: Sequence[_Rivals], directed: Sequence[_DirectedGuides], parameters: GuidanceParameters
 ) -> list[str]:
     """Why guides are ignored after all, "" where they are not: what the images say around each of them."""
     radius = math.ceil(2 * parameters.window)
     steps = np.arange(-radius, radius + 1)
     weights = np.exp(-0.5 * (steps / parameters.window) ** 2)
     window = weights[:, None] * weights
-    count = len(ways[0].places)
+    count = len(directed[0].places)
     costs, contrast, moved, shown = np.zeros((count, 2)), np.zeros(count), np.zeros(count), np.zeros(count)
-    for rival, way in zip(rivals, ways, strict=True):
+    for rival, its in zip(rivals, directed, strict=True):
         feature, *brought = (buffer.get()[0] for buffer in (rival.feature, *rival.brought))
         shift = np.linalg.norm(rival.new.get() - rival.old.get(), axis=-1)
         width, height, wraps, _ = rival.grid
-        for i in np.flatnonzero(way.residuals.any(1)):
-            column, row = np.floor(way.places[i]).astype(int)
+        for i in np.flatnonzero(its.residuals.any(1)):
+            column, row = np.floor(its.places[i]).astype(int)
             columns, rows = column + steps, row + steps
             inside = (rows[:, None] >= 0) & (rows[:, None] < height)
             inside = inside & (bool(wraps) | ((columns >= 0) & (columns < width)))
