@@ -27,13 +27,13 @@ CELL = 4
 # Cells by which what is found is grown: flow is smooth across outlines.
 GROWN = 3
 # Cells of a thing, at least.
-LEAST = 20
+LEAST_CELLS = 20
 # Chart pixels between start and return of a flow that is consistent.
 CONSISTENT = 1.0
 
-# Cells of a thing that may lie at a photo's border, beyond which the other photo goes on, for it still to
-# show the whole, and their share of those at the other's border; and how far from a border lies at it.
-_FEW, _FEWER, _AT = 2, 0.15, 2
+# A photo shows all of a thing if so many cells of it, and this share of those at the other photo's border,
+# lie at its border, beyond which the other photo goes on. Cells from a border that still lie at it.
+_FEW_AT_BORDER, _SHARE_AT_BORDER, _BORDER = 2, 0.15, 2
 
 
 @dataclass(frozen=True)
@@ -168,10 +168,10 @@ def ends_within(
     """Which things one photo shows as far as the other one does: they cross the other's border alone."""
     crossing = np.zeros((2, count))
     for number, (own, other) in enumerate((masks, masks[::-1])):
-        border = grown(own & ~other, _AT, wraps)
+        border = grown(own & ~other, _BORDER, wraps)
         for its in shown:
             crossing[number] += np.bincount(its[border], minlength=count)
-    within: npt.NDArray[np.bool_] = crossing.min(0) <= _FEW + _FEWER * crossing.max(0)
+    within: npt.NDArray[np.bool_] = crossing.min(0) <= _FEW_AT_BORDER + _SHARE_AT_BORDER * crossing.max(0)
     within[0] = False
     return within
 

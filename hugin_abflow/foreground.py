@@ -22,7 +22,7 @@ import scipy
 
 from hugin_abflow.cells import (
     CELL,
-    LEAST,
+    LEAST_CELLS,
     CellFlow,
     Flows,
     Mask,
@@ -92,7 +92,7 @@ def _near_things(
     own = np.linalg.norm(flow.vectors - around, axis=-1)
     longer = np.linalg.norm(flow.vectors, axis=-1) > np.linalg.norm(around, axis=-1)
     parts = connected((own > _APART) & longer & flow.shown, flow.period > 0)
-    kept = np.bincount(parts[flow.consistent], minlength=parts.max() + 1) >= LEAST
+    kept = np.bincount(parts[flow.consistent], minlength=parts.max() + 1) >= LEAST_CELLS
     kept[0] = False
     kept[flow.confirmed(parts, control_points)] = False
     numbers = np.flatnonzero(kept)

@@ -135,8 +135,8 @@ def shown_at(
 
 
 def reach(device: Device, layer: WorkingLayer, field: Buffer, grid: Grid) -> list[float]:
-    """Per row of the layer's box a bound, in working pixels, of how far from a place between it and the rows
-    beside it, or at the box's rim, the row lies that is sampled there.
+    """For each row of the layer's box, a bound in working px of how many rows away the layer is sampled for
+    places between it and the rows beside it, or at the box's rim.
     """
     found = device.empty((layer.box[3], 2))
     device.run("geometry", "geometry_reach", (layer.box[3], 1), field, layer.box, grid.lonlat, found)
@@ -160,10 +160,11 @@ def reach(device: Device, layer: WorkingLayer, field: Buffer, grid: Grid) -> lis
 
 
 def _beyond(latitudes: npt.NDArray[np.float64], aside: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
-    """How far beyond a latitude a mean of points lies at most of which none does. aside: sine of how far in
-    longitude they lie from its meridian.
+    """How far beyond a latitude the mean of points may lie, none of which lies beyond it.
 
-    The mean's height is the points', but it lies nearer to the axis, by the cosine of that angle at most.
+    aside       sine of how far in longitude the points lie from its meridian, at most.
+
+    The mean is as high as the points, but nearer to the axis, by the cosine of that angle at most.
     """
     tangents = np.tan(latitudes) / np.sqrt(1 - aside**2)
     return np.where(latitudes < math.pi / 2, np.maximum(np.arctan(tangents) - latitudes, 0), math.inf)

@@ -22,7 +22,7 @@ from hugin_abflow.cells import (
     CELL,
     CONSISTENT,
     GROWN,
-    LEAST,
+    LEAST_CELLS,
     CellFlow,
     Flows,
     Mask,
@@ -135,7 +135,7 @@ def _moved(
     """The cells of what moved by itself; off_parallax: by how much each misses parallax, of the limit."""
     things = connected(off_parallax > _WEAK, flow.period > 0)
     clear = np.bincount(things[(off_parallax > 1) & flow.shown], minlength=things.max() + 1)
-    kept = clear >= np.maximum(LEAST, _CLEAR * np.bincount(things.ravel()))
+    kept = clear >= np.maximum(LEAST_CELLS, _CLEAR * np.bincount(things.ravel()))
     kept[flow.confirmed(things, control_points)] = False
     for thing in np.flatnonzero(kept):
         its = things == thing
@@ -164,13 +164,13 @@ def _differs(here: View, there: View, flow: CellFlow, thing: Mask) -> bool:
     wider = grown(thing, GROWN, wraps=False)
     ring = np.nonzero(grown(wider, _RING, wraps=False) & ~wider & flow.consistent)
     its = np.nonzero(thing & flow.shown)
-    if min(len(ring[0]), len(its[0])) < LEAST:
+    if min(len(ring[0]), len(its[0])) < LEAST_CELLS:
         return False
     unknown = wider | ~flow.consistent
     nearest = scipy.ndimage.distance_transform_edt(unknown, return_distances=False, return_indices=True)
     beside = _difference(here, there, ring, flow.vectors[ring])
     inside = _difference(here, there, its, flow.vectors[tuple(nearest[:, its[0], its[1]])])
-    if min(beside.size, inside.size) < LEAST:
+    if min(beside.size, inside.size) < LEAST_CELLS:
         return False
     # each from its own median: exposure may be another one there, and change faster than anything tells
     off, around = (np.abs(one - np.median(one)).mean() for one in (inside, beside))

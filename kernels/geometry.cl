@@ -16,9 +16,9 @@ static inline float geometry_share(__global const float *blend_j, int4 box_j, __
     return w < GEOMETRY_NEGLIGIBLE || layer_k[y * box_k.z + x].w == 0.0f ? 0.0f : w;
 }
 
-/* From four points q the ways that flow leads, by its chart; moves: where it leads anywhere. */
-static inline points4 geometry_ways(points4 q, __global const float2 *flow, int4 grid, const float16 *chart,
-                                    int4 *moves) {
+/* Where flow leads from four points q, by its chart, as differences of points; moves: where it leads anywhere. */
+static inline points4 geometry_steps(points4 q, __global const float2 *flow, int4 grid, const float16 *chart,
+                                     int4 *moves) {
     const bool plane = chart->sd == 0.0f;
     float4 u, v;
     if (plane) {
@@ -70,7 +70,7 @@ __kernel void geometry_add(__global const float *blend_j,   /* (box_j.w, box_j.z
     const float4 py = (float4)(y + box_k.y + 0.5f);
     const points4 q = lonlat.y == 0.0f ? (points4){px, py, (float4)(0.0f)} : canvas_sphere4(px, py, lonlat);
     int4 moves;
-    const points4 d = geometry_ways(q, flow, grid, &chart, &moves);
+    const points4 d = geometry_steps(q, flow, grid, &chart, &moves);
     const float3 way[GEOMETRY_CHUNK] = {(float3)(d.x.x, d.y.x, d.z.x), (float3)(d.x.y, d.y.y, d.z.y),
                                         (float3)(d.x.z, d.y.z, d.z.z), (float3)(d.x.w, d.y.w, d.z.w)};
     const int moved[GEOMETRY_CHUNK] = {moves.x, moves.y, moves.z, moves.w};

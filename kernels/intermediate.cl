@@ -2,23 +2,23 @@
    of b: the flow V(p) comes from p - s V(p), where layer a shows what is to be at p, and goes to p + (1 - s) V(p),
    where layer b shows it. */
 
-/* Squared px of a chart: the two flows' difference up to which there is nothing to choose, and how far the flows at
-   a way's ends lead elsewhere where it is doubted by half of the most. */
+/* Squared px of a chart: the difference of the two flows that start at a place up to which there is nothing to choose;
+   and the misses at the ends of a motion that give it half of the largest doubt. */
 #define INTERMEDIATE_ALIKE 1.0f
 #define INTERMEDIATE_OFF 16.0f
-/* Doubt is from 1 to one more than this; a way counts by the other one's squared. */
+/* Doubt is from 1 to one more than this; a motion is weighted by the square of the other one's. */
 #define INTERMEDIATE_DOUBT 6.0f
 
-/* Squared px of a chart: how far a flow that leads back may miss its start, and the flows at a way's ends may lead
-   elsewhere, if it is trusted; and by how much a way has to differ from what is there already. */
+/* Squared px of a chart: how far a consistent flow may miss its start, and a trusted motion the flows at its ends; and
+   by how much a motion has to differ from what is there already. */
 #define INTERMEDIATE_TRUSTED 4.0f
 #define INTERMEDIATE_APART 4.0f
-/* Of a squared difference what two launches agree on. */
+/* The part of a squared difference on which two launches surely agree. */
 #define INTERMEDIATE_SAME 0.99999f
 /* Steps in which it is found where a flow passes. */
 #define INTERMEDIATE_STEPS 4
-/* Of a pixel and its eight neighbours so many have to be alike for what passes it to stay, and of its neighbours so many
-   to be passed for it to become so. */
+/* So many of a pixel and its eight neighbours have to be alike for what passes it to be kept, and so many of its
+   neighbours to be kept for it to take over their mean. */
 #define INTERMEDIATE_KEEP 4
 #define INTERMEDIATE_GROW 3
 
@@ -58,8 +58,8 @@ __kernel void intermediate_share(__global const float *blend_a, int4 box_a, /* (
     }
 }
 
-/* How far the flows at the ends of a way through u lead elsewhere, squared px: in x where it comes from, F_ab, and in y
-   where it goes to, F_ba. */
+/* How far the flows at the ends of a motion through u miss it, squared px: in x F_ab where it comes from, in y F_ba
+   where it goes to. */
 static inline float2 intermediate_off(__global const float2 *flow, __global const float2 *back, float2 u, float2 way,
                                       float share, int4 grid) {
     return (float2)(square2(bilinear_flow(flow, u - share * way, grid) - way),
@@ -71,11 +71,11 @@ static inline float intermediate_doubt(float2 off) {
     return 1.0f + INTERMEDIATE_DOUBT * both * both / (both * both + INTERMEDIATE_OFF * INTERMEDIATE_OFF);
 }
 
-/* What the two flows that start at a place itself tell of the one that passes through it. With g a flow's gradient
-   along itself and f its length, F_ab misses V by g f s, and -F_ba on the other side by g f (1 - s): so of F_ab a
-   share of 1 - s counts, and of -F_ba one of s; that leaves nothing of these. Beside things that hide others, where
-   flow is no change but a step, one of the two may be the thing's and the other that of what is behind: the one counts
-   that is the same at both ends. */
+/* The flow that passes through a place, estimated from the two that start there. With g a flow's gradient along itself
+   and f its length, F_ab misses V by g f s, and -F_ba misses it on the other side by g f (1 - s). So F_ab is weighted
+   by 1 - s and -F_ba by s, by which both errors cancel. At the outlines of things that hide others flow changes by a
+   step: one of the two may be the thing's, the other that of what is behind. The one counts that is the same at both
+   ends. */
 __kernel void intermediate_direct(__global const float2 *flow, /* (grid.y, grid.x) F_ab, px */
                                   __global const float2 *back, /* (grid.y, grid.x) F_ba, px */
                                   int4 grid,                   /* chart; run size */
@@ -104,8 +104,8 @@ static inline int intermediate_nearest(float2 u, int4 grid) {
     return grid_index((int2)(grid.z ? p.x : LIMITED(p.x, 0, grid.x - 1), LIMITED(p.y, 0, grid.y - 1)), grid);
 }
 
-/* Where a flow that leads back passes: the first of the four pixels around that place, by its number in a grid that has
-   a column and a row more, in front; -1 for others. */
+/* Where a consistent flow passes: the first of the four pixels around that place, by its number in a grid that has one
+   column and one row more, in front; -1 for other flows. */
 __kernel void intermediate_follow(__global const float2 *flow, /* (grid.y, grid.x) F_ab, px */
                                   __global const float2 *back, /* (grid.y, grid.x) F_ba, px */
                                   int4 grid,                   /* chart; run size: grid.x, grid.y, 2 */
@@ -133,10 +133,10 @@ __kernel void intermediate_follow(__global const float2 *flow, /* (grid.y, grid.
         places[at] = (corner.y + 1) * (grid.x + 1) + corner.x + 1;
 }
 
-/* Where a thing that is narrower than its way passes, no flow that starts there is the thing's. So each flow that leads
-   back tells the four pixels around the place through which it passes; of those that differ from what is there already
-   a pixel listens to the one that differs most. It is called to find by how much, and then once more, to find the
-   flows. */
+/* Where a thing that is narrower than its motion passes, no flow that starts there is the thing's. So each consistent
+   flow is offered to the four pixels around the place through which it passes. Of those offered that differ from what
+   is there already a pixel takes the one that differs most. A first call finds by how much that differs, a second one
+   which flow it is. */
 __kernel void intermediate_pass(__global const float2 *flow, /* (grid.y, grid.x) F_ab, px */
                                 __global const float2 *back, /* (grid.y, grid.x) F_ba, px */
                                 int4 grid,                   /* chart; run size: grid.x, grid.y, 2 */
@@ -169,8 +169,8 @@ __kernel void intermediate_pass(__global const float2 *flow, /* (grid.y, grid.x)
     }
 }
 
-/* What hides the other of two flows that both pass through u: in how many layers the other one leads from what it shows
-   to where the first one's thing is. A thing that is hidden by what moves otherwise is seen beside it. */
+/* How surely, 0 to 2, the first of two flows that pass through u hides the other one: in how many layers the other
+   starts and leads to where the first one's thing is in the other layer, which hides there what is seen here. */
 static inline int intermediate_hides(__global const float2 *flow, __global const float2 *back, float2 u, float2 way,
                                      float2 hidden, float share, int4 grid) {
     const float2 a = u - share * way, b = a + way;
@@ -178,9 +178,9 @@ static inline int intermediate_hides(__global const float2 *flow, __global const
            (square2(bilinear_flow(back, a + hidden, grid) + hidden) < INTERMEDIATE_TRUSTED);
 }
 
-/* What passes is seen where it is the same at both of its ends, and what is there already is not, or is hidden by it. A
-   pixel has listened to one way alone, and where outlines meet, that of what is behind may differ most: so it listens
-   once more, when that is there, for what hides it. */
+/* What passes replaces what is there already if it agrees with the flows at both of its ends, and that does not, or is
+   hidden by it. A pixel is offered one flow alone; where outlines meet, that of what is behind may differ most. So
+   there is another round, in which that is there and may be hidden. */
 __kernel void intermediate_choose(__global const float2 *flow,    /* (grid.y, grid.x) F_ab, px */
                                   __global const float2 *back,    /* (grid.y, grid.x) F_ba, px */
                                   int4 grid,                      /* chart; run size */
@@ -209,7 +209,7 @@ __kernel void intermediate_choose(__global const float2 *flow,    /* (grid.y, gr
     seen[at] = 1;
 }
 
-/* What passes single pixels is chance: where it differs from what is around. */
+/* What passes single pixels, unlike what is around, is chance: it is not kept. */
 __kernel void intermediate_keep(__global const float2 *passing, /* (grid.y, grid.x) what is there, px */
                                 __global const uchar *seen,     /* (grid.y, grid.x) where that is what passes */
                                 int4 grid,                      /* chart; run size */
@@ -228,8 +228,8 @@ __kernel void intermediate_keep(__global const float2 *passing, /* (grid.y, grid
     kept[at] = alike >= INTERMEDIATE_KEEP;
 }
 
-/* What passes where it is seen, and its mean beside that: holes are filled, and an outline is a pixel further out, where
-   the photos have its soft edge. Both ways, as flows at p itself. */
+/* What passes where it is kept, and its mean beside that: holes are filled, and outlines are a pixel further out, where
+   the photos have their soft edge. In both directions, as flows at p itself. */
 __kernel void intermediate_fill(__global const float2 *direct,  /* (grid.y, grid.x) what starts there, px */
                                 __global const float2 *passing, /* (grid.y, grid.x) what passes, px */
                                 __global const uchar *kept,     /* (grid.y, grid.x) where that is seen */

@@ -1,7 +1,7 @@
-/* Flow of a pair by way of a third layer, and how far flows are to be believed. Found flow: flow in px, trust,
-   brightness as consistency_trust gives them. Cells: squares of so many pixels of a chart, the last ones less. */
+/* Flow of a pair composed by way of a third layer, and the weights of flows. Found flow: flow in px, trust, brightness,
+   as consistency_trust gives them. Cells: squares of so many pixels of a chart, the last ones less. */
 
-/* By how much brightness may be off its mean: what differs by more tells no more. */
+/* Deviations of brightness from its mean are limited to this, so that none outweighs the others. */
 #define RELAY_MOST 0.3f
 
 /* Brightness of the pair's other layer where flow leads from pixel p; EXCLUDED where it is not known. */
@@ -65,7 +65,7 @@ __kernel void relay_cells(__global const float4 *found, /* (grid.y, grid.x) from
             off /= known;
         }
     }
-    const float told = texture + known * noise * noise, fit = told / (told + 2.0f * misfit);
+    const float signal = texture + known * noise * noise, fit = signal / (signal + 2.0f * misfit);
     const int at = middle.y * grid.x + middle.x;
     const float4 own = found[at];
     const bool shown = own.w != 0.0f && own.w < EXCLUDED && other[at].w != 0.0f;
@@ -73,8 +73,8 @@ __kernel void relay_cells(__global const float4 *found, /* (grid.y, grid.x) from
                                      known < 0.2f * cell * cell ? -1.0f : fit * fit * fit * fit);
 }
 
-/* Where flow leads from position u of its chart, in place; and how far that is to be believed there: trust times fit,
-   0 beside the chart and where not both layers show something: flow is carried on there, and leads back as well. */
+/* Moves position u of a chart to where flow leads from there, in place; returns the weight of that: trust times fit, 0
+   beside the chart and where not both layers show something (flow continues there, and is consistent as well). */
 static inline float relay_follow(__global const float4 *found, __global const float4 *back,
                                  __global const float4 *cells, int4 grid, int cell, float2 *u) {
     if (!(u->x >= 0.0f && u->y >= 0.0f && u->x < grid.x && u->y < grid.y))
@@ -98,8 +98,8 @@ static inline float3 relay_point(float2 u, const float16 *chart) {
     return (float3)(q.x, q.y, q.z);
 }
 
-/* Add the flow from a to c by way of b, F_ab(q) and then F_bc where that leads, at every step-th pixel of their
-   chart, weighted by how far both are believed. */
+/* Add the flow from a to c composed by way of b, F_ab(q) and then F_bc where that leads, at every step-th pixel of
+   their chart, times the weights of both. */
 __kernel void relay_add(__global const float4 *first,        /* (first_grid.y, first_grid.x) found, from a to b */
                         __global const float4 *first_back,   /* (first_grid.y, first_grid.x) from b to a */
                         __global const float4 *first_cells,  /* of relay_cells */
@@ -110,7 +110,7 @@ __kernel void relay_add(__global const float4 *first,        /* (first_grid.y, f
                         int cell,
                         int4 grid, float16 chart,            /* of a and c */
                         int step, int2 size,                 /* run size */
-                        float share,                         /* what it counts */
+                        float share,                         /* another weight */
                         __global float4 *sum) /* (size.y, size.x) weighted flow, px of their chart, and weights */
 {
     const int x = get_global_id(0), y = get_global_id(1);
@@ -133,14 +133,14 @@ __kernel void relay_add(__global const float4 *first,        /* (first_grid.y, f
     sum[y * size.x + x] += (float4)(weight * way, weight, 0.0f);
 }
 
-/* How two ways agree that lie so far apart: 1, or 1/4 where it is `agrees` px. */
+/* How two flows agree whose ends lie so far apart: 1, or 1/4 where that is `agrees` px. */
 static inline float relay_agreement(float2 off, float agrees) {
     const float a = 1.0f + square2(off) / (agrees * agrees);
     return 1.0f / (a * a);
 }
 
-/* How far control points hold found flow, 0..1, into the last of a sum: how near one is, and how flow agrees with its
-   move. */
+/* How far control points hold found flow, 0..1, into the last component of a sum: the largest product of how near a
+   point is and of how flow agrees with its move. */
 __kernel void relay_hold(__global const float4 *points, /* (count) place, move, px of the chart */
                          int count,
                          float sigma,                   /* px */
@@ -164,13 +164,13 @@ __kernel void relay_hold(__global const float4 *points, /* (count) place, move, 
     sum[at].w = most;
 }
 
-/* Found flow becomes that by way of others where they know it, and it leads elsewhere or is not trusted, in place; not
-   where control points hold it, as far as it is trusted, nor in the place of what is taken from one photo. */
+/* Found flow is replaced, in place, by composed flow where there is any, and found flow leads elsewhere or is not
+   trusted; not where control points hold it, as far as it is trusted, nor where it is excluded. */
 __kernel void relay_take(__global const float4 *sum, /* (grid.y, grid.x) of relay_add, with a step of 1 */
                          int4 grid,                  /* run size */
-                         float enough,               /* weight of others from which on they are sure */
+                         float enough,               /* weight of composed flow from which on it is sure */
                          float agrees,               /* px between both that leave a quarter of their agreement */
-                         float counts,               /* what found flow's trust counts: 0 or 1 */
+                         float counts,               /* weight of found flow's trust: 0 or 1 */
                          __global float4 *found)     /* (grid.y, grid.x) */
 {
     const int x = get_global_id(0), y = get_global_id(1);
@@ -180,11 +180,11 @@ __kernel void relay_take(__global const float4 *sum, /* (grid.y, grid.x) of rela
     const float4 its = sum[at], own = found[at];
     if (own.w >= EXCLUDED)
         return;
-    const float held = its.w * own.z, told = (1.0f - held) * LEAST(its.z / enough, 1.0f);
+    const float held = its.w * own.z, sure = (1.0f - held) * LEAST(its.z / enough, 1.0f);
     const float2 other = its.z > 0.0f ? its.xy / its.z : own.xy;
     const float agreement = relay_agreement(other - own.xy, agrees);
-    const float kept = GREATEST(counts, its.w) * own.z * (1.0f - told * (1.0f - agreement));
-    const float taken = told * (1.0f - kept);
+    const float kept = GREATEST(counts, its.w) * own.z * (1.0f - sure * (1.0f - agreement));
+    const float taken = sure * (1.0f - kept);
     if (taken > 0.0f)
         found[at].xy = (kept * own.xy + taken * other) / (kept + taken);
     found[at].z = kept + taken;

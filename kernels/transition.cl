@@ -3,11 +3,11 @@
    Shares. In each cell of a grid the layers that cover it have shares, which sum to 1: share[s] is that of layer
    owner[s], and a cell's are those from first[cell] to first[cell + 1], by ascending layer. */
 
-/* A share that nothing is left of, so that something else can be made of it: of layers that a coarser grid does not
-   know in a place, and where only layers are that have none beside it. */
+/* Kept of every share, so that the shares of a place never sum to 0: of layers that a coarser grid does not have there,
+   and where only layers are that have no share beside it. */
 #define TRANSITION_TRACE 1e-6f
 
-/* A cell's links may be weakened by its well to this part of them. */
+/* The well of a cell weakens its links to no less than this part of them: else its parabola would have no minimum. */
 #define TRANSITION_WEAKEST 0.25f
 
 /* Squared parallax of a pair in cells, in working px: the longest flow, either way, at places where both layers are. */

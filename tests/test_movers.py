@@ -12,7 +12,7 @@ from rooms import Thing
 from scenes import LEFT, UP, Scene, scene
 from scipy import ndimage
 
-from hugin_abflow.cells import CELL, LEAST, SingleSource
+from hugin_abflow.cells import CELL, LEAST_CELLS, SingleSource
 
 Array = np.ndarray
 
@@ -206,7 +206,7 @@ def test_a_few_cells_are_no_thing() -> None:
     for size, expected in ((0.07, False), (0.1, True)):
         one = scene(Thing(AHEAD, UP, size))
         assert (one.found() is not None) == expected
-        assert (one.shown[0][0].sum() / CELL**2 > LEAST) == expected
+        assert (one.shown[0][0].sum() / CELL**2 > LEAST_CELLS) == expected
 
 
 def test_a_small_step_is_no_step() -> None:
