@@ -249,8 +249,8 @@ def _decide(
 
     def textured() -> decision.Mask:
         slopes: npt.NDArray[np.float32] = features.get()[..., 1:3]
-        told: decision.Mask = (slopes**2).sum(-1) > how.textured**2
-        return told
+        clear: decision.Mask = (slopes**2).sum(-1) > how.textured**2
+        return clear
 
     decided = decision.decide(plain, found, level, last_level, textured, bearings, wraps, how)
     if not decided.found:

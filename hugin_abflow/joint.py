@@ -148,44 +148,44 @@ def prepare(
     """
     full = working.full_grid(canvas, layers)
     grid = working.working_grid(full, settings)
-    everything = reading.read(device, layers, grid, progress, settings)
-    masks = coefficient.masks(device, everything, grid)
-    used = [i for i in range(len(everything)) if not _redundant(i, everything, masks)]
-    reduced = [everything[i] for i in used]
+    reduced = reading.read(device, layers, grid, progress, settings)
+    masks = coefficient.masks(device, reduced, grid)
+    used = [i for i in range(len(reduced)) if not _redundant(i, reduced, masks)]
+    blended = [reduced[i] for i in used]
     masks = masks.only(used)
     order = {id(layer): index for index, layer in enumerate(layers)}
-    numbers = [order[id(one.layer)] for one in reduced]  # the caller's, which guides have
-    overlapping = _overlapping(device, reduced, masks)
-    overlaps = coefficient.Overlaps(masks, [(pair.a, pair.b) for pair in overlapping])
-    reduced = saturation.with_whites(device, reduced, overlapping)
-    shared = overlaps if settings.flow else ()
-    charts = pairflow.charts(shared, masks.grid, grid, settings)
-    fast = partial(_of_quality, "fast", full, shared, masks.grid, settings)
-    abreast = _check_memory(device, reduced, charts, grid, settings, fast, abreast)
+    numbers = [order[id(one.layer)] for one in blended]  # the caller's, which guides have
+    pairs = _overlapping(device, blended, masks)
+    overlaps = coefficient.Overlaps(masks, [(pair.a, pair.b) for pair in pairs])
+    blended = saturation.with_whites(device, blended, pairs)
+    flow_overlaps = overlaps if settings.flow else ()
+    charts = pairflow.charts(flow_overlaps, masks.grid, grid, settings)
+    fast = partial(_work_of_quality, "fast", full, flow_overlaps, masks.grid, settings)
+    abreast = _check_memory(device, blended, _Work(charts, grid, settings), fast, abreast)
     pair_guides = by_pair(guides if settings.guides else ())
     flows, parallaxes, singles = list[PairFlow](), list[figures.Parallax](), list[SingleSource | None]()
     if settings.flow:
         flows, parallaxes, singles = pairflow.solve(
-            device, reduced, overlapping, charts, grid, progress, settings, pair_guides, numbers, abreast,
-            partial(relay.inferable, overlapping, shared, masks.grid),
+            device, blended, pairs, charts, grid, progress, settings, pair_guides, numbers, abreast,
+            partial(relay.inferable, pairs, flow_overlaps, masks.grid),
         )  # fmt: skip
     with progress("align", 1) as advance:
         from_one = single.on_canvas(singles, [one.chart for one in flows], seam.seam_grid(grid))
-        aligned = alignment.align(device, reduced, overlapping, flows, from_one, masks, grid, settings)
+        aligned = alignment.align(device, blended, pairs, flows, from_one, masks, grid, settings)
         if _log.isEnabledFor(logging.INFO):
-            figures.report(reduced, overlapping, overlaps, parallaxes, seam.seam_grid(grid), aligned.whole)
-        del masks, overlaps, shared, fast  # what comes takes the most memory
-        offsets, correction = multiband.none(grid, len(reduced)), aligned.correction
-        if settings.exposure and overlapping:
-            offsets = multiband.offsets(device, reduced, aligned.fields, correction, grid, aligned.unlike)
+            figures.report(blended, pairs, overlaps, parallaxes, seam.seam_grid(grid), aligned.whole)
+        del masks, overlaps, flow_overlaps, fast  # what comes takes the most memory
+        offsets, correction = multiband.none(grid, len(blended)), aligned.correction
+        if settings.exposure and pairs:
+            offsets = multiband.offsets(device, blended, aligned.fields, correction, grid, aligned.unlike)
         final = [
             BlendLayer(layer.layer, layer.box, field, reach, gain, offset)
             for layer, field, reach, gain, offset in zip(
-                reduced, aligned.fields, aligned.reaches, correction.gains, offsets.layers, strict=True
+                blended, aligned.fields, aligned.reaches, correction.gains, offsets.layers, strict=True
             )
         ]
         advance(1)
-    final += [_unblended(device, everything[i]) for i in range(len(everything)) if i not in used]
+    final += [_unblended(device, reduced[i]) for i in range(len(reduced)) if i not in used]
     return Prepared(
         tuple(final), full, grid, correction.grid, offsets.grid, correction.shoulder, aligned.unlike
     )
@@ -207,9 +207,8 @@ def _loading_ahead(device: Device, first: Layer, settings: Settings) -> Iterator
 
     def load() -> None:
         for step in steps:
-            with suppress(
-                Exception
-            ):  # told where it is needed; imports fail if another thread's is interrupted
+            # raised again where it is needed; imports fail if another thread's is interrupted
+            with suppress(Exception):
                 if not done.is_set():
                     step()
 
@@ -261,39 +260,56 @@ def _overlapping(device: Device, layers: Sequence[WorkingLayer], masks: Masks) -
     return result
 
 
-def _of_quality(
+@dataclass(frozen=True)
+class _Work:
+    """What is calculated at working resolution. charts: on which flow is found; none if there is no flow."""
+
+    charts: Sequence[Chart]
+    grid: Grid
+    settings: Settings
+
+    def bytes(self, pixels: int, abreast: int = 1) -> int:
+        """What flow, and what is found from it, take.
+
+        pixels: of all layers. abreast: how many pairs' flow is found at a time.
+        """
+        finest = pairflow.finest(self.charts, self.grid, self.settings)
+        sizes = sorted(chart.width * chart.height for chart in finest)
+        at_last, meanwhile = _STEP_BYTES * pixels, _SOLVER_BYTES * sum(sizes[-abreast:])
+        return max(_FLOW_BYTES * sum(sizes) + at_last, _FOUND_BYTES * sum(sizes) + meanwhile)
+
+
+def _work_of_quality(
     quality: FlowQuality,
     full: Grid,
     overlaps: Sequence[npt.NDArray[np.bool_]],
     masks: Grid,
     settings: Settings,
-) -> tuple[Sequence[Chart], Grid, Settings]:
-    """Charts, working grid and settings of another quality."""
+) -> _Work:
+    """The work of another quality."""
     settings = replace(settings, flow_quality=quality)
     grid = working.working_grid(full, settings)
-    return pairflow.charts(overlaps, masks, grid, settings), grid, settings
+    return _Work(pairflow.charts(overlaps, masks, grid, settings), grid, settings)
 
 
 def _check_memory(
     device: Device,
     layers: Sequence[WorkingLayer],
-    charts: Sequence[Chart],
-    grid: Grid,
-    settings: Settings,
-    fast: Callable[[], tuple[Sequence[Chart], Grid, Settings]],
+    work: _Work,
+    fast: Callable[[], _Work],
     most: int,
 ) -> int:
     """How many pairs' flow may be found at a time, `most` at most. A limit that is too low even for one is
     refused: the working canvas must not depend on it.
 
-    charts      on which flow is found; none if there is no flow.
-    fast        gives charts, grid and settings of `--flow-quality fast`.
+    fast        gives the work of `--flow-quality fast`.
     """
+    settings = work.settings
     taken = memory.resident() + device.own_memory + _LIBRARY_BYTES
     pixels = sum(layer.box[2] * layer.box[3] for layer in layers)
     limit = memory.limit(settings.max_memory)
     for abreast in range(most, 0, -1):
-        needed = taken + _working_bytes(pixels, charts, grid, settings, abreast)
+        needed = taken + work.bytes(pixels, abreast)
         if needed <= limit:
             break
     _log.info("memory: about %s of %s at working resolution", memory.size(needed), memory.size(limit))
@@ -303,23 +319,10 @@ def _check_memory(
     what = "whose flow takes" if settings.flow else "which take"
     said = f"{given} is too little for these layers, {what} about {memory.size(needed)}"
     if settings.max_memory:
-        fast_charts, fast_grid, fast_settings = fast()
-        share = fast_grid.width * fast_grid.height / (grid.width * grid.height)
+        faster = fast()
+        share = faster.grid.width * faster.grid.height / (work.grid.width * work.grid.height)
         taken -= round((1 - share) * sum(layer.pixels.nbytes for layer in layers))
-        fast_bytes = _working_bytes(round(share * pixels), fast_charts, fast_grid, fast_settings)
-        would_do = taken + fast_bytes <= limit
+        would_do = taken + faster.bytes(round(share * pixels)) <= limit
         raise SettingsError(f"{said}; {remedy}{', or choose --flow-quality fast' if would_do else ''}")
     _log.warning("%s; going on with that", said)
     return abreast
-
-
-def _working_bytes(
-    pixels: int, charts: Sequence[Chart], grid: Grid, settings: Settings, abreast: int = 1
-) -> int:
-    """What flow, and what is found from it, take at working resolution.
-
-    pixels: of all layers. abreast: how many pairs' flow is found at a time.
-    """
-    sizes = sorted(chart.width * chart.height for chart in pairflow.finest(charts, grid, settings))
-    at_last, meanwhile = _STEP_BYTES * pixels, _SOLVER_BYTES * sum(sizes[-abreast:])
-    return max(_FLOW_BYTES * sum(sizes) + at_last, _FOUND_BYTES * sum(sizes) + meanwhile)

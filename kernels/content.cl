@@ -6,7 +6,7 @@
 #define CONTENT_BLACK 0.03f
 #define CONTENT_SEEN 0.15f
 
-/* Share of others of which nothing is told. */
+/* Least share of the other layers, below which nothing is known of them. */
 #define CONTENT_LITTLE 1e-3f
 
 /* How surely layers show the same at a place of a grid, 0..1. d: how one of them differs from the mean of all, of
