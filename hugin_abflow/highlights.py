@@ -60,7 +60,7 @@ class Clipped:
 
 
 def highlights_grid(grid: Grid) -> Grid:
-    """The coarse grid, over the region of the working grid, on which it is told what is clipped."""
+    """The coarse grid, over the region of the working grid, of what is clipped."""
     return grid.coarser(_CELL)
 
 

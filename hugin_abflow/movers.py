@@ -81,10 +81,10 @@ def find(
     for candidate in refused:
         finest = candidate.finest(chart.width, chart.height)
         gap = CONSISTENT * max(1.0, 2.0 ** (candidate.level - 1))
-        matches += [_Matches.of(chart, finest, views, index, gap) for index in (0, 1)]
-    for number, one in enumerate(matches):
+        matches += [_Matches.of(chart, finest, views, index, gap, refused=True) for index in (0, 1)]
+    for one in matches:
         off_parallax = one.off_parallax(direction, scale, limit)
-        if number > 1:  # of what was refused only what is certain
+        if one.refused:  # only what is certain
             off_parallax *= one.flow.consistent
         here, there = one.index, 1 - one.index
         moved = _moved(
@@ -101,21 +101,24 @@ class _Matches:
     """What flow from photo `index` of a pair matches, by cells.
 
     seen        in what directions the first and the second photo show it: unit vectors (height * width, 3).
+    refused     whether it is flow that a search found and that was refused.
     """
 
     index: int
     flow: CellFlow
     seen: tuple[epipolar.Points, epipolar.Points]
+    refused: bool
 
     @classmethod
     def of(
-        cls, chart: Chart, flows: Flows, views: tuple[View, View], index: int, gap: float = CONSISTENT
-    ) -> _Matches:
+        cls, chart: Chart, flows: Flows, views: tuple[View, View], index: int, gap: float = CONSISTENT,
+        refused: bool = False,
+    ) -> _Matches:  # fmt: skip
         """Of a chart whose projection is known; gap: as of `CellFlow.of`."""
         assert chart.projection is not None
         flow = CellFlow.of(chart, flows, views, index, gap)
         start, end = (chart.projection.bearings(one.reshape(-1, 2)) for one in (flow.starts, flow.ends))
-        return cls(index, flow, (end, start) if index else (start, end))
+        return cls(index, flow, (end, start) if index else (start, end), refused)
 
     def off_parallax(self, direction: epipolar.Points, scale: float, limit: float) -> Places:
         """By how much each cell's motion misses parallax, of the limit, (height, width), for a camera that

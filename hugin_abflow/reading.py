@@ -31,7 +31,7 @@ def read(
     """
     lock = threading.Lock()
 
-    def told(rows: int) -> None:
+    def progressed(rows: int) -> None:
         with lock:
             advance(rows)
 
@@ -48,7 +48,9 @@ def read(
             parts = [one.parts(count) for one in started]
             # the first of all layers, then the second: one thread at a time keeps rows of a layer (spool.py)
             turns = sorted((turn, which) for which, its in enumerate(parts) for turn in range(len(its)))
-            jobs = [decoders.submit(started[which].read, *parts[which][turn], told) for turn, which in turns]
+            jobs = [
+                decoders.submit(started[which].read, *parts[which][turn], progressed) for turn, which in turns
+            ]
             for job in jobs:
                 job.result()
             reduced = [one.result() for one in started]

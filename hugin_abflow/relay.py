@@ -62,8 +62,8 @@ _HELD = 64.0
 # Third layers that are asked about a pair, those with the largest overlaps: where many overlap each other,
 # all triangles would be too many.
 _MOST = 4
-# How much larger the overlaps of a third layer have to be than one for whose flow they stand, and how much of
-# it they have to show.
+# How much larger than a small overlap those of a third layer have to be, for its flow to be inferred, and how
+# much of it they have to show.
 _MUCH, _ALL = 3.0, 0.95
 
 Values = npt.NDArray[np.float64]
@@ -79,7 +79,7 @@ class _DirectedFlow:
     vectors     (height, width, 2) in cells, px of the chart.
     overlap     (height, width): which cells lie in the overlap.
     trust       (height, width), 0..1; 0 beside the overlap.
-    fit         its mean.
+    fit         mean of how well both layers fit by it, 0..1.
     """
 
     chart: Chart
