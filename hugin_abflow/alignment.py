@@ -111,6 +111,7 @@ def _fields(
         transition.minimise_strain(device, layers, coefficients, flows, masks, grid, settings, unlike)
     intermediate.replace_flows(device, layers, coefficients, flows, grid, settings)
     fields = geometry.fields(device, layers, coefficients, flows, grid, settings)
+    geometry.keep_within(device, layers, fields, grid)
     del coefficients
     device.give_back()
     return fields
@@ -211,7 +212,9 @@ def _cut(
     )  # fmt: skip
     moved = [*gone.values()] + ([] if single is None else [single])
     unlike = Unlike.of(cells, regions.residual.mean, whole, np.any(moved, 0) if moved else None)
-    for k in membrane.stretch(device, layers, fields, owner, whole, unlike.anywhere, masks, grid, cells):
+    stretched = membrane.stretch(device, layers, fields, owner, whole, unlike.anywhere, masks, grid, cells)
+    geometry.keep_within(device, [layers[k] for k in stretched], [fields[k] for k in stretched], grid)
+    for k in stretched:
         reaches[k] = geometry.reach(device, layers[k], fields[k], grid)
     seam.clamp_displacements(device, layers, fields, owner, whole, grid, cells)
     return unlike

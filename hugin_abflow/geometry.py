@@ -86,6 +86,16 @@ def fields(
     return result
 
 
+def keep_within(device: Device, layers: Sequence[WorkingLayer], fields: Sequence[Buffer], grid: Grid) -> None:
+    """Displace layers towards a border of the canvas by half of the way there at most (fields[...].xyz, in
+    place): what lies beyond is cut off from all of them.
+    """
+    if grid.wraps and grid.poles == 3:  # nothing lies beyond
+        return
+    for layer, field in zip(layers, fields, strict=True):
+        device.run("geometry", "geometry_within", layer.box[2:], field, layer.box, grid.border, grid.lonlat)
+
+
 def _displacement(
     device: Device,
     index: int,

@@ -176,8 +176,8 @@ def clamp_displacements(
     grid: Grid,
     cells: Grid,
 ) -> None:
-    """Clamp displacements of what is taken from a layer (fields[...].xyz, in place) to the canvas, and to
-    what the layer shows: else another one would be seen along the border. owner, whole: of `cut`.
+    """Clamp displacements of what is taken from a layer (fields[...].xyz, in place) to what the layer shows:
+    else another one would be seen along its border. owner, whole: of `cut`.
     """
     for k, (layer, field) in enumerate(zip(layers, fields, strict=True)):
         its = whole & (owner == k)

@@ -79,6 +79,36 @@ __kernel void geometry_add(__global const float *blend_j,   /* (box_j.w, box_j.z
             field[at + k].xyz += share[k] * way[k];
 }
 
+/* Displace a layer towards a border of the canvas by half of the way to its last pixels' centres at most: what it would
+   show from beyond is cut off, and another layer would take over along a hard edge. */
+__kernel void geometry_within(__global float4 *field, /* (box.w, box.z); x, y, z change */
+                              int4 box, int4 border,  /* place on the working grid, run size; working grid */
+                              float4 lonlat)
+{
+    const int x = get_global_id(0), y = get_global_id(1), at = y * box.z + x;
+    if (x >= box.z || y >= box.w)
+        return;
+    const float4 own = field[at];
+    if (square3(own.xyz) == 0.0f)
+        return;
+    const float2 q = (float2)(x + box.x + 0.5f, y + box.y + 0.5f);
+    float2 there = layer_position(q, own.xyz, lonlat);
+    if (lonlat.y != 0.0f) { /* longitudes jump where they go once around */
+        const float around = 2.0f * M_PI_F / lonlat.y;
+        there.x -= around * floor_int((there.x - q.x) / around + 0.5f);
+    }
+    const float2 size = (float2)(border.x, border.y), least = 0.5f * q + 0.25f, most = 0.5f * (q + size) - 0.25f;
+    float2 inside = there;
+    if (!border.z)
+        inside.x = LIMITED(there.x, least.x, most.x);
+    if (!(border.w & 1))
+        inside.y = GREATEST(there.y, least.y);
+    if (!(border.w & 2))
+        inside.y = LEAST(inside.y, most.y);
+    if (inside.x != there.x || inside.y != there.y)
+        field[at].xyz = canvas_point(inside, lonlat) - canvas_point(q, lonlat);
+}
+
 /* a_k = sharpness * w_k * (1 + magnitude * f_k / width), with f_k = |displacement| / (1 - w_k); and the maximum
    over the layers, without which exp overflows. */
 __kernel void geometry_activation(__global float4 *field,        /* (box.w, box.z); a_k goes to w */

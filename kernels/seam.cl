@@ -61,8 +61,7 @@ __kernel void seam_yield(__global float4 *field,        /* (box.w, box.z) of the
 /* Halvings in which it is found how far a displacement leads to what a layer shows. */
 #define SEAM_HALVINGS 5
 
-/* Clamp displacements of what is taken from a layer: to the centre of the canvas's last pixel, where that ends, and to
-   where the layer shows something. */
+/* Clamp displacements of what is taken from a layer to where the layer shows something. */
 __kernel void seam_clamp(__global const float4 *layer, /* (box.w, box.z) */
                          __global float4 *field,       /* the same; x, y, z change */
                          int4 box, int4 border,        /* place on the working grid, run size; working grid */
@@ -78,21 +77,7 @@ __kernel void seam_clamp(__global const float4 *layer, /* (box.w, box.z) */
     if (!taken[min(cell.y, cells.y - 1) * cells.x + min(cell.x, cells.x - 1)])
         return;
     const float4 own = field[at];
-    float2 there = layer_position(q, own.xyz, lonlat);
-    if (lonlat.y != 0.0f) { /* longitudes jump where they go once around */
-        const float around = 2.0f * M_PI_F / lonlat.y;
-        there.x -= around * floor_int((there.x - q.x) / around + 0.5f);
-    }
-    float2 inside = there;
-    if (!border.z)
-        inside.x = LIMITED(there.x, 0.5f, border.x - 0.5f);
-    if (!(border.w & 1))
-        inside.y = GREATEST(there.y, 0.5f);
-    if (!(border.w & 2))
-        inside.y = LEAST(inside.y, border.y - 0.5f);
     float3 d = own.xyz;
-    if (inside.x != there.x || inside.y != there.y)
-        d = canvas_point(inside, lonlat) - canvas_point(q, lonlat);
     if (layer_sample(layer, box, layer_position(q, d, lonlat), border).w == 0.0f) {
         float part = 0.0f, step = 0.5f;
         for (int i = 0; i < SEAM_HALVINGS; ++i, step *= 0.5f)

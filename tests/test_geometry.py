@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import math
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from grids import GRIDS, on_device, patches, plane, random_layer, sphere, whole, whole_chart
+from pictures import masked, merged, one_device, pixel_places, texture
 from reference import common
 from reference import geometry as twin
 from scipy import ndimage
@@ -15,7 +17,7 @@ from tolerances import POSITION, SUM, TRIGONOMETRY, assert_close
 from hugin_abflow import geometry
 from hugin_abflow.chart import Chart, pair_chart
 from hugin_abflow.geometry import PairFlow
-from hugin_abflow.layer import Box
+from hugin_abflow.layer import Box, Canvas
 from hugin_abflow.opencl import Device
 from hugin_abflow.settings import Settings
 from hugin_abflow.working import Grid
@@ -85,6 +87,57 @@ def test_add_equals_its_twin(device: Device, name: str, first: int) -> None:
     assert np.array_equal(kernel[~moved], field[~moved])
     # a flow read beyond the chart's rim falls from its last value to 0 at once
     assert_close(kernel, expected, 10 * flow_error(grid) + SUM, decisions=1e-3)
+
+
+@pytest.mark.parametrize("name", list(GRIDS))
+def test_within_equals_its_twin(device: Device, name: str) -> None:
+    """Of a layer that is displaced by up to some pixels, also beyond the canvas."""
+    grid = GRIDS[name]
+    box = (0, 0, grid.width, grid.height)
+    field = ndimage.gaussian_filter(np.random.default_rng(3).normal(size=(*grid.shape, 4)), (4, 4, 0))
+    field = (60 * field * (grid.lonlat[1] or 1)).astype(np.float32)
+    if not grid.lonlat[1]:
+        field[..., 2] = 0
+    field[5:9] = 0
+    out = device.upload(field)
+    device.run("geometry", "geometry_within", box[2:], out, box, grid.border, grid.lonlat)
+    expected = twin.geometry_within(field, box, grid.border, grid.lonlat)
+    scale = grid.lonlat[1] or 1
+    assert_close(out.get() / scale, expected / scale, 10 * POSITION, decisions=0.02)
+    changed = (np.abs(expected - field)[..., :3] > 0.1 * scale).any(-1)
+    assert changed.mean() < 0.5 and changed.any() == (not (grid.wraps and grid.poles == 3))
+    assert np.array_equal(out.get()[..., 3], field[..., 3])
+
+
+def test_what_leads_beyond_the_canvas_goes_half_of_the_way_to_its_border(device: Device) -> None:
+    """And as far as it did along the border; farther in it is left as it is."""
+    grid = plane(60, 40)
+    field = np.zeros((40, 60, 4), np.float32)
+    field[..., :2] = -8.5, 3.25
+    layers = [SimpleNamespace(box=(0, 0, 60, 40))]
+    out = device.upload(field)
+    geometry.keep_within(device, layers, [out], grid)
+    y, x = np.mgrid[:40, :60] + 0.5
+    found = out.get()
+    assert np.allclose(x + found[..., 0], np.maximum(x - 8.5, (x + 0.5) / 2), atol=1e-5)
+    assert np.allclose(y + found[..., 1], np.minimum(y + 3.25, (y + 39.5) / 2), atol=1e-5)
+
+
+@pytest.mark.usefixtures(one_device.__name__)
+def test_no_other_layer_shows_along_the_border_of_the_canvas() -> None:
+    """Where the brighter of two layers that lie some rows apart is displaced beyond the canvas."""
+    canvas = Canvas.plane(400, 160)
+    y, x = pixel_places(canvas.height, canvas.width)
+    layers = []
+    for down, brighter, mask in ((-5, 0, x < 280), (5, 40, x >= 120)):
+        picture = texture(y + down, x, np.uint8)
+        picture[..., :3] = 80 + brighter + picture[..., :3] // 3
+        layers.append(masked(picture, mask))
+    result = merged(layers, canvas, exposure=False, seam=False)[..., :3].mean(-1)
+    smooth = ndimage.gaussian_filter(result, (1, 12))
+    for rim in (smooth[:3], smooth[-3:]):
+        inside = np.median(smooth[20:-20], 0)
+        assert np.abs(rim - inside)[:, 130:270].max() < 20
 
 
 @pytest.mark.parametrize("name", ["plane", "sphere"])

@@ -108,7 +108,7 @@ def test_cells_read_what_lies_at_their_centres(size: tuple[int, int]) -> None:
 
 @pytest.mark.parametrize("name", list(GRIDS))
 def test_what_stays_equals_its_twin(device: Device, name: str) -> None:
-    """Of a layer with holes, displaced by up to some pixels, also beyond the canvas."""
+    """Of a layer with holes, displaced by up to some pixels, also beyond itself."""
     grid = GRIDS[name]
     cells = grid.resized(10, 7)
     box = (0, 0, grid.width, grid.height)
@@ -129,22 +129,6 @@ def test_what_stays_equals_its_twin(device: Device, name: str) -> None:
     changed = (np.abs(expected - field)[..., :3] > 0.1 * scale).any(-1)
     assert 0.01 < changed.mean() < 0.5
     assert np.array_equal(out.get()[..., 3], field[..., 3])
-
-
-def test_what_stays_moves_along_the_border(device: Device) -> None:
-    """As far as it did: only what leads beyond is cut off, and what is farther in is left as it is."""
-    grid, everything = plane(60, 40), np.ones((5, 8), np.uint8)
-    field = np.zeros((40, 60, 4), np.float32)
-    field[..., :2] = -8.5, -3.25
-    layer, out, box = device.upload(np.ones_like(field)), device.upload(field), (0, 0, 60, 40)
-    device.run(
-        "seam", "seam_clamp", box[2:], layer, out, box, grid.border, grid.lonlat, device.upload(everything),
-        grid.resized(8, 5).border,
-    )  # fmt: skip
-    y, x = np.mgrid[:40, :60] + 0.5
-    found = out.get()
-    assert np.allclose(found[..., 0], np.maximum(x - 8.5, 0.5) - x, atol=1e-5)
-    assert np.allclose(found[..., 1], np.maximum(y - 3.25, 0.5) - y, atol=1e-5)
 
 
 # Residuals

@@ -53,6 +53,24 @@ def geometry_add(
     return result
 
 
+def geometry_within(field: Array, box: Sequence[int], border: Sequence[int], lonlat: Numbers) -> Array:
+    """The field with displacements that lead half of the way to the grid's last pixels' centres at most."""
+    columns, rows = pixels(box[2], box[3], box[0], box[1])
+    x, y = columns + 0.5, rows + 0.5
+    own = canvas_point(x, y, lonlat)
+    there_x, there_y = canvas_position(own + field[..., :3], lonlat)
+    if lonlat[1]:
+        around = 2 * np.pi / lonlat[1]
+        there_x = there_x - around * np.round((there_x - x) / around)
+    inside_x = there_x if border[2] else there_x.clip(x / 2 + 0.25, (x + border[0]) / 2 - 0.25)
+    inside_y = there_y if border[3] & 1 else np.maximum(there_y, y / 2 + 0.25)
+    inside_y = inside_y if border[3] & 2 else np.minimum(inside_y, (y + border[1]) / 2 - 0.25)
+    moved = (inside_x != there_x) | (inside_y != there_y)
+    result = field.astype(np.float64)
+    result[moved, :3] = (canvas_point(inside_x, inside_y, lonlat) - own)[moved]
+    return result
+
+
 def geometry_activation(
     field: Array,
     blend: Array,

@@ -10,8 +10,6 @@ from reference.common import (
     Array,
     Numbers,
     bilinear,
-    canvas_point,
-    canvas_position,
     cell_parts,
     layer_look,
     layer_seen,
@@ -81,26 +79,16 @@ def seam_clamp(
     taken: Array,
     cells: Sequence[int],
 ) -> Array:
-    """The field, in the cells that are taken, with displacements that end at the centres of the grid's last
-    pixels, where it ends, and, found by five halvings, where the layer shows something."""
+    """The field, in the cells that are taken, with displacements that end, found by five halvings, where the
+    layer shows something."""
     columns, rows = pixels(box[2], box[3], box[0], box[1])
     x, y = columns + 0.5, rows + 0.5
     its = taken[
         np.minimum(np.floor(y * cells[1] / border[1]).astype(int), cells[1] - 1),
         np.minimum(np.floor(x * cells[0] / border[0]).astype(int), cells[0] - 1),
     ]
-    own = canvas_point(x, y, lonlat)
-    there_x, there_y = canvas_position(own + field[..., :3], lonlat)
-    if lonlat[1]:
-        around = 2 * np.pi / lonlat[1]
-        there_x = there_x - around * np.round((there_x - x) / around)
-    inside_x = there_x if border[2] else there_x.clip(0.5, border[0] - 0.5)
-    top, bottom = -np.inf if border[3] & 1 else 0.5, np.inf if border[3] & 2 else border[1] - 0.5
-    inside_y = there_y.clip(top, bottom)
     its = (its > 0) & (layer[..., 3] > 0)
-    moved = its & ((inside_x != there_x) | (inside_y != there_y))
     result = field.astype(np.float64)
-    result[moved, :3] = (canvas_point(inside_x, inside_y, lonlat) - own)[moved]
 
     def shown(part: Array) -> Array:
         there = np.concatenate([part[..., None] * result[..., :3], result[..., 3:]], -1).astype(np.float32)
