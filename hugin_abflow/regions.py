@@ -28,6 +28,10 @@ from hugin_abflow.working import Grid, connected
 _STRONG, _WEAK = 0.2, 0.045
 # From the first less this to it and this more, a cell counts from not at all to wholly as strong.
 _DOUBT = 0.05
+# Where layers differ in texture as well, and not in brightness alone, as exposures do, less is enough: the
+# residual up to which a cell counts not at all, and from which wholly; and its share of that of all
+# frequencies up to which there is texture, and from which there is none.
+_FAINT, _TEXTURED = (0.08, 0.14), (0.7, 0.8)
 # Strong cells, of the equator's size, that a region has at least: fewer are an edge that is a pixel off.
 _LEAST = 4.5
 # No layer is taken where it is not.
@@ -148,7 +152,9 @@ def find(residual: Residuals, cells: Grid, single: Cells) -> list[Cells]:
     smooth_rms = residual.rms if residual.smooth_rms is None else residual.smooth_rms
     weak = (residual.mean > _WEAK) | (smooth_rms > _STRONG) | single
     strong = np.interp(residual.mean, (_STRONG - _DOUBT, _STRONG + _DOUBT), (0, 1))
-    strong *= cells.row_widths[:, None]
+    share = residual.mean / np.maximum(smooth_rms, 1e-12)
+    textured = np.interp(share, _TEXTURED, (1, 0)) * np.interp(residual.mean, _FAINT, (0, 1))
+    strong = np.maximum(strong, textured) * cells.row_widths[:, None]
     return [
         region
         for region in parts(grown(weak, 1, cells.wraps), cells.wraps)

@@ -203,6 +203,20 @@ def test_texture_that_differs_joins_a_region_but_makes_none() -> None:
         assert seam.regions(Residuals(mean, rms), plane(480, 320), aligned)[8, 12] == aligned
 
 
+@pytest.mark.parametrize(("mean", "texture", "count", "counts"), [
+    (0.14, 0.65, 4, False), (0.14, 0.65, 5, True), (0.11, 0.5, 8, False), (0.11, 0.5, 10, True),
+    (0.08, 0.5, 60, False), (0.14, 0.8, 60, False), (0.14, 0.75, 8, False), (0.14, 0.75, 10, True),
+])  # fmt: skip
+def test_less_is_strong_where_texture_differs_too(
+    mean: float, texture: float, count: int, counts: bool
+) -> None:
+    """Somebody in pale clothes before a pattern. texture: the share of low frequencies in all."""
+    residual = np.zeros((40, 60))
+    residual[20, :count] = mean + 1e-9
+    found_there = found(Residuals(residual, residual / texture), plane(480, 320).resized(60, 40))
+    assert len(found_there) == counts
+
+
 def test_a_region_across_the_border_is_one() -> None:
     residual = np.zeros((40, 60))
     residual[5:9, 58:] = residual[5:8, :1] = 2.0  # neither side is enough alone
