@@ -154,11 +154,12 @@ def find(residual: Residuals, cells: Grid, single: Cells) -> list[Cells]:
     strong = np.interp(residual.mean, (_STRONG - _DOUBT, _STRONG + _DOUBT), (0, 1))
     share = residual.mean / np.maximum(smooth_rms, 1e-12)
     textured = np.interp(share, _TEXTURED, (1, 0)) * np.interp(residual.mean, _FAINT, (0, 1))
-    strong = np.maximum(strong, textured) * cells.row_widths[:, None]
+    # one or the other: what exposures leave is not made a thing by a little texture in it
+    either = np.stack([strong, textured]) * cells.row_widths[:, None]
     return [
         region
         for region in parts(grown(weak, 1, cells.wraps), cells.wraps)
-        if strong[region].sum() >= _LEAST or single[region].any()
+        if either[:, region].sum(1).max() >= _LEAST or single[region].any()
     ]
 
 
