@@ -87,8 +87,8 @@ def fields(
 
 
 def keep_within(device: Device, layers: Sequence[WorkingLayer], fields: Sequence[Buffer], grid: Grid) -> None:
-    """Displace layers towards a border of the canvas by half of the way there at most (fields[...].xyz, in
-    place): what lies beyond is cut off from all of them.
+    """Displace layers towards a border of the canvas by half of the way there at most (fields, in place):
+    what lies beyond is cut off from all of them. Who is shortened for that weighs less.
     """
     if grid.wraps and grid.poles == 3:  # nothing lies beyond
         return

@@ -79,9 +79,13 @@ __kernel void geometry_add(__global const float *blend_j,   /* (box_j.w, box_j.z
             field[at + k].xyz += share[k] * way[k];
 }
 
-/* Displace a layer towards a border of the canvas by half of the way to its last pixels' centres at most: what it would
-   show from beyond is cut off, and another layer would take over along a hard edge. */
-__kernel void geometry_within(__global float4 *field, /* (box.w, box.z); x, y, z change */
+/* By how much of its logarithm a weight falls for each pixel that a displacement is shortened by. */
+#define GEOMETRY_SHORTENED 0.7f
+
+/* Displace a layer towards a border of the canvas by half of the way to its last pixels' centres at most, and have it
+   weigh the less the more it is shortened for that: what it would show from beyond is cut off, and another layer, which
+   shows it, would take over along a hard edge. */
+__kernel void geometry_within(__global float4 *field, /* (box.w, box.z), in place */
                               int4 box, int4 border,  /* place on the working grid, run size; working grid */
                               float4 lonlat)
 {
@@ -105,8 +109,10 @@ __kernel void geometry_within(__global float4 *field, /* (box.w, box.z); x, y, z
         inside.y = GREATEST(there.y, least.y);
     if (!(border.w & 2))
         inside.y = LEAST(inside.y, most.y);
-    if (inside.x != there.x || inside.y != there.y)
-        field[at].xyz = canvas_point(inside, lonlat) - canvas_point(q, lonlat);
+    const float shortened = ROOT(square2(inside - there));
+    if (shortened > 0.0f)
+        field[at] = (float4)(canvas_point(inside, lonlat) - canvas_point(q, lonlat),
+                             own.w * exponential(-LEAST(GEOMETRY_SHORTENED * shortened, 80.0f)));
 }
 
 /* a_k = sharpness * w_k * (1 + magnitude * f_k / width), with f_k = |displacement| / (1 - w_k); and the maximum
