@@ -204,7 +204,7 @@ def _cut(
     device, layers, fields, masks, grid = scene.device, scene.layers, scene.fields, scene.masks, scene.grid
     compared = (device, layers, fields, scene.pairs, regions.correction)
     cells = seam.seam_grid(grid)
-    clipping = seam.clipping_prices(*compared, clipped.excess, grid)
+    clipping = seam.clipping_prices(*compared, clipped.excess, whole, grid)
     highlights.restore_weights(device, layers, fields, extra, whole, grid)
     owner, gone = seam.cut(
         device, layers, fields, regions.residual, whole, masks, grid, single, clipping,

@@ -88,16 +88,20 @@ def clipping_prices(
     pairs: Sequence[Pair],
     correction: Correction,
     clipped: npt.NDArray[np.float32],
+    whole: Cells,
     grid: Grid,
 ) -> Prices | None:
-    """What it costs to take a cell from a layer that clips it where another one is as bright and not clipped;
-    None: nothing anywhere.
+    """What it costs to take a cell of the regions `whole` from a layer that clips it where another one is as
+    bright and not clipped; None: nothing anywhere.
 
     clipped     how much each layer clips of what another one shows (`highlights.Clipped`).
     """
-    if not clipped.any():
-        return None
     cells = seam_grid(grid)
+    row, column = _centres(cells, clipped.shape)
+    clips = clipped[:, row[:, None], column] * whole
+    pairs = [pair for pair in pairs if clips[[pair.a, pair.b]].any()]
+    if not pairs:
+        return None
     as_bright = np.zeros((len(layers), *cells.shape), bool)
     unclipped = [(math.inf,) * 4] * len(layers)  # all pixels count
     differences = _differences(device, layers, fields, pairs, correction, grid, cells, unclipped)
@@ -105,8 +109,7 @@ def clipping_prices(
         brighter, both = found[..., :3].mean(-1), found[..., 4] > 0
         as_bright[pair.a][its] |= both & (brighter < _DARKER)
         as_bright[pair.b][its] |= both & (-brighter < _DARKER)
-    row, column = _centres(cells, clipped.shape)
-    prices: Prices = _CLIPPED * as_bright * clipped[:, row[:, None], column]
+    prices: Prices = _CLIPPED * as_bright * clips
     return prices
 
 

@@ -289,13 +289,21 @@ def test_what_flow_cannot_explain_is_not_taken_from_the_photo_that_clips_it(
         gains.append(device.upload(values))
     correction = Correction(highlights.highlights_grid(grid), 0.0, tuple(gains))
     clipped = highlights.measure(device, layers, masks, grid, Settings()).excess
-    prices = seam.clipping_prices(device, layers, fields, [Pair(0, 1)], correction, clipped, grid)
+    given = device, layers, fields, [Pair(0, 1)], correction
+    everywhere = np.ones(cells.shape, bool)
+    prices = seam.clipping_prices(*given, clipped, everywhere, grid)
     assert not prices[0].any()  # grey is never clipped
     assert (prices[1, 4:, 3:5] == (seam._CLIPPED if light > 1 else 0)).all()
     assert not prices[1, :, 7:].any()  # alone
-    assert seam.clipping_prices(device, layers, fields, [Pair(0, 1)], correction, 0 * clipped, grid) is None
+    assert seam.clipping_prices(*given, 0 * clipped, everywhere, grid) is None
     whole = np.zeros(cells.shape, bool)
     whole[3:, 2:6] = True  # columns 15 to 46, below the white corner
+    there = seam.clipping_prices(*given, clipped, whole, grid)
+    assert np.array_equal(there, prices * whole) and there.any() == (light > 1)
+    whole[:] = np.arange(cells.width) >= 9  # alone
+    assert seam.clipping_prices(*given, clipped, whole, grid) is None
+    whole[:] = False
+    whole[3:, 2:6] = True
     residual = Residuals(np.full(cells.shape, 0.3), np.zeros(cells.shape))
     seam.cut(device, layers, fields, residual, whole, masks, grid, clipping=prices)
     grey, white = (field.get()[38:48, 29:33, 3] for field in fields)  # both cover all of the grid

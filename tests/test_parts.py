@@ -94,7 +94,8 @@ def test_cells_beside_are_as_if_compared(device: Device, name: str, monkeypatch:
         correction = colour.correction(device, measured, Settings())
         residual = seam.residuals(device, layers, fields, pairs, correction, grid)
         excess = np.ones((len(layers), *grid.shape), np.float32)
-        lost = seam.clipping_prices(device, layers, fields, pairs, correction, excess, grid)
+        everywhere = np.ones(seam.seam_grid(grid).shape, bool)
+        lost = seam.clipping_prices(device, layers, fields, pairs, correction, excess, everywhere, grid)
         gains = [gain.get() for gain in correction.gains]
         results.append([*gains, residual.mean, residual.rms, residual.smooth_rms, residual.measured, lost])
         cut = [device.copy(field) for field in fields]
