@@ -111,7 +111,8 @@ def _fields(
         transition.minimise_strain(device, layers, coefficients, flows, masks, grid, settings, unlike)
     intermediate.replace_flows(device, layers, coefficients, flows, grid, settings)
     fields = geometry.fields(device, layers, coefficients, flows, grid, settings)
-    geometry.keep_within(device, layers, fields, grid)
+    if settings.intermediate:  # else as published
+        geometry.keep_within(device, layers, fields, grid)
     del coefficients
     device.give_back()
     return fields

@@ -56,7 +56,8 @@ class Settings:
     working_pixels      upper bound of the pixels of the working canvas (flow, coefficients, colour), 1024
                         to 90 million; 0: chosen by flow_quality.
     intermediate        where layer k is sampled is told by the flows that pass through p on their way from
-                        one layer to the other; else by F_jk, which starts at p, as published.
+                        one layer to the other, and kept within the canvas; else by F_jk, which starts at p,
+                        as published.
     band_rows           rows of a full-resolution band; 0: chosen from the canvas width and `max_memory`.
     max_memory          bytes that host and device may take together; 0: half of the machine's memory. It
                         changes no pixel.
