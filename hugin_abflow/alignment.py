@@ -206,7 +206,7 @@ def _cut(
     compared = (device, layers, fields, scene.pairs, regions.correction)
     cells = seam.seam_grid(grid)
     clipping = seam.clipping_prices(*compared, clipped.excess, whole, grid)
-    highlights.restore_weights(device, layers, fields, extra, whole, grid)
+    highlights.restore_weights(device, layers, fields, extra, whole, grid, cells)
     owner, gone = seam.cut(
         device, layers, fields, regions.residual, whole, masks, grid, single, clipping,
         choose=partial(clones.owners, *compared, grid, cells) if scene.settings.clones else None,

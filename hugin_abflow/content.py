@@ -19,9 +19,8 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from hugin_abflow.layer import Box
 from hugin_abflow.opencl import Buffer, Device
-from hugin_abflow.working import Grid, Place, cells_under
+from hugin_abflow.working import Grid, Place, any_around
 
 # Residuals up to which layers surely show the same, and from which on surely not.
 _ALIKE, _UNLIKE = 0.06, 0.15
@@ -84,7 +83,7 @@ def complete(
     difference  float32 (height, width, 4) on a box of `grid`: colour, valid. share: its own in the mean.
     mean        float32 (height, width, 4) on all of the grid. shoulder: of the exposure scale, 0: of floats.
     """
-    if not _any(unlike, box, grid):  # of many layers nearly all
+    if not any_around(unlike.anywhere, box, grid, unlike.grid):  # of many layers nearly all
         return
     cells, sums = unlike.grid, device.empty((*unlike.grid.shape, 4))
     moved, other = device.upload(unlike.moved), device.upload(unlike.other)
@@ -97,17 +96,6 @@ def complete(
         "content", "content_complete", box[2:],
         difference, share, box, grid.border, mean, moved, other, expected, cells.border, shoulder,
     )  # fmt: skip
-
-
-def _any(unlike: Unlike, box: Place, grid: Grid) -> bool:
-    """Whether anything is unlike on a box, or in the cells beside, which are read between cells."""
-    left, top, width, height = box
-    cells = unlike.grid
-    its = cells_under(Box(left, top, left + width, top + height), grid, cells)
-    rows, columns = np.arange(its.top - 1, its.bottom + 1), np.arange(its.left - 1, its.right + 1)
-    columns = columns % cells.width if cells.wraps else columns.clip(0, cells.width - 1)
-    there = np.ix_(rows.clip(0, cells.height - 1), columns)
-    return bool(unlike.anywhere[there].any())
 
 
 def _from_beside(sums: Values, wraps: bool) -> Values:

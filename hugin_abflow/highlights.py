@@ -25,7 +25,7 @@ from hugin_abflow.cells import Mask
 from hugin_abflow.coefficient import Masks, distance, on_cells
 from hugin_abflow.opencl import Buffer, Device
 from hugin_abflow.settings import Settings
-from hugin_abflow.working import CLIPPED, Grid, WorkingLayer
+from hugin_abflow.working import CLIPPED, Grid, WorkingLayer, any_around
 
 # Working pixels per cell.
 _CELL = 16
@@ -120,18 +120,19 @@ def restore_weights(
     extra: PerLayer,
     there: Mask,
     grid: Grid,
+    cells: Grid,
 ) -> None:
     """Restore, in some cells, the colour weights that layers would have if white had to be shown.
 
     extra       what `reduce_weights` returned.
-    there       (height, width) on any grid over the region: these cells.
+    there       (height, width) on `cells`, over the region of `grid`: these.
     """
-    part, part_cells = device.upload(there, np.float32), (*there.shape[::-1], *grid.border[2:])
+    part = device.upload(there, np.float32)
     for layer, field, one in zip(layers, fields, extra, strict=True):
-        if one.any():
+        if one.any() and any_around(there, layer.box, grid, cells):
             device.run(
                 "highlights", "highlights_restore", layer.box[2:], field, layer.box, grid.border,
-                device.upload(one), highlights_grid(grid).border, part, part_cells,
+                device.upload(one), highlights_grid(grid).border, part, cells.border,
             )  # fmt: skip
 
 

@@ -28,7 +28,7 @@ from hugin_abflow.geometry import Pair
 from hugin_abflow.layer import Box
 from hugin_abflow.opencl import Buffer, Device
 from hugin_abflow.regions import Cells, Choice, Gone, Prices, Residuals, completed, find
-from hugin_abflow.working import Grid, Place, WorkingLayer, shared_cells
+from hugin_abflow.working import Grid, WorkingLayer, shared_cells
 
 # Working pixels per cell of the seam grid.
 _CELL = 8
@@ -152,7 +152,7 @@ def cut(
     factor = np.full(whole.shape, _WHOLE_FACTOR)
     if single is not None:
         factor = np.where(single, _SINGLE_FACTOR, _WHOLE_FACTOR)
-    choice = _choice(layers, fields, residual, whole, masks, grid, cells, _CUT, factor, clipping)
+    choice = _choice(device, layers, fields, residual, whole, masks, grid, cells, _CUT, factor, clipping)
     owner, gone = choose(choice) if choose else (choice.owners()[0], Gone())
     yields = [yielded(whole, owner, k, cells.wraps) for k in range(len(layers))]
     for k, at in gone.items():  # wholly: beside a border the softmax hardly knows another layer
@@ -208,13 +208,14 @@ def cut_unaligned(
         measured = found[..., 4] > 0
         square[its] = np.maximum(square[its], np.where(measured, _SHORTER + found[..., 3], 0))
     whole = square > 0
-    choice = _choice(layers, fields, Residuals(square, square), whole, masks, grid, cells, _FINE_CUT)
+    choice = _choice(device, layers, fields, Residuals(square, square), whole, masks, grid, cells, _FINE_CUT)
     owner, _ = choice.owners()
     yields = [(whole & (owner != k)).astype(np.float32) for k in range(len(layers))]
     _yield(device, layers, fields, yields, grid, cells)
 
 
 def _choice(
+    device: Device,
     layers: Sequence[WorkingLayer],
     fields: Sequence[Buffer],
     residual: Residuals,
@@ -228,12 +229,23 @@ def _choice(
 ) -> Choice:
     """The choice of the layer that each cell of the regions `whole` is taken from."""
     cover = on_cells(masks.host, cells, np.logical_and)
-    shares = np.stack(
-        [_at_centres(f.get()[..., 3], k.box, grid, cells) for f, k in zip(fields, layers, strict=True)]
-    )
+    shares = _weights(device, layers, fields, grid, cells)
     shares /= np.maximum(shares.sum(0), 1e-12)
     residual = completed(residual, cover, cells.wraps)
     return Choice(whole, residual, shares, cover, cells.wraps, cut_price, whole_factor, clipping)
+
+
+def _weights(
+    device: Device, layers: Sequence[WorkingLayer], fields: Sequence[Buffer], grid: Grid, cells: Grid
+) -> npt.NDArray[np.float64]:
+    """The layers' colour weights at the centres of cells, (layers, height, width)."""
+    rows, columns = (device.upload(one, np.int32) for one in _centres(cells, grid.shape))
+    weights = [device.empty(cells.shape) for _ in layers]
+    for layer, field, one in zip(layers, fields, weights, strict=True):
+        device.run(
+            "seam", "seam_weights", cells.border[:2], field, layer.box, rows, columns, cells.border, one
+        )
+    return np.stack([one.get() for one in weights]).astype(np.float64)
 
 
 def _yield(
@@ -319,16 +331,3 @@ def _centres(cells: Grid, shape: Sequence[int]) -> tuple[npt.NDArray[np.intp], n
         for to, of in zip(cells.shape, shape[-2:], strict=True)
     )
     return row, column
-
-
-def _at_centres(
-    weights: npt.NDArray[np.float32], box: Place, grid: Grid, cells: Grid
-) -> npt.NDArray[np.float64]:
-    """Weights at the cells' centres; 0 outside the layer's box."""
-    left, top, width, height = box
-    rows, columns = _centres(cells, grid.shape)
-    rows, columns = rows - top, columns - left
-    row_inside, column_inside = (rows >= 0) & (rows < height), (columns >= 0) & (columns < width)
-    result = np.zeros(cells.shape)
-    result[np.ix_(row_inside, column_inside)] = weights[np.ix_(rows[row_inside], columns[column_inside])]
-    return result

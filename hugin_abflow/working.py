@@ -194,6 +194,16 @@ def cells_under(box: Box, grid: Grid, cells: Grid) -> Box:
     return Box(left, top, right, bottom)
 
 
+def any_around(mask: npt.NDArray[np.bool_], place: Place, grid: Grid, cells: Grid) -> bool:
+    """Whether a mask on `cells` has any that a place of `grid` reaches into, or beside these, from where what
+    lies between cells is read.
+    """
+    its = cells_under(Box.at(*place), grid, cells)
+    rows, columns = np.arange(its.top - 1, its.bottom + 1), np.arange(its.left - 1, its.right + 1)
+    columns = columns % cells.width if cells.wraps else columns.clip(0, cells.width - 1)
+    return bool(mask[np.ix_(rows.clip(0, cells.height - 1), columns)].any())
+
+
 def _cells(start: int, end: int, pixels: int, cells: int) -> tuple[int, int]:
     """The first cell that has one of the pixels from `start` up to `end`, and the one after the last; cell c
     begins with pixel c * pixels // cells.

@@ -58,6 +58,21 @@ __kernel void seam_yield(__global float4 *field,        /* (box.w, box.z) of the
     field[y * box.z + x].w *= GREATEST(left, trace);
 }
 
+/* A layer's colour weight at the centres of cells; 0 where the layer is not. */
+__kernel void seam_weights(__global const float4 *field, /* (box.w, box.z) */
+                           int4 box,                     /* place on the working grid */
+                           __global const int *rows,     /* (cells.y) of the working grid, in which centres lie */
+                           __global const int *columns,  /* (cells.x) */
+                           int4 cells,                   /* run size */
+                           __global float *weights)      /* (cells.y, cells.x) */
+{
+    const int x = get_global_id(0), y = get_global_id(1);
+    if (x >= cells.x || y >= cells.y)
+        return;
+    const int at = box_index((int2)(columns[x], rows[y]), box);
+    weights[y * cells.x + x] = at < 0 ? 0.0f : field[at].w;
+}
+
 /* Halvings in which it is found how far a displacement leads to what a layer shows. */
 #define SEAM_HALVINGS 5
 

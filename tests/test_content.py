@@ -15,7 +15,7 @@ from hugin_abflow import content, seam
 from hugin_abflow.content import Unlike
 from hugin_abflow.layer import Canvas, Layer
 from hugin_abflow.opencl import Device
-from hugin_abflow.working import Grid
+from hugin_abflow.working import Grid, any_around
 
 __all__ = ["one_device"]
 
@@ -99,8 +99,8 @@ def test_nothing_is_done_where_nothing_is_unlike(wraps: bool) -> None:
         one = np.zeros((10, 20), np.float32)
         one[9, column] = 0.1
         for unlike in (Unlike(grid.coarser(4), one, 0 * one), Unlike(grid.coarser(4), 0 * one, one)):
-            assert content._any(unlike, (0, 20, 13, 20), grid) == seen
-            assert not content._any(unlike, (0, 0, 13, 30), grid)
+            assert any_around(unlike.anywhere, (0, 20, 13, 20), grid, unlike.grid) == seen
+            assert not any_around(unlike.anywhere, (0, 0, 13, 30), grid, unlike.grid)
 
 
 WIDTH, HEIGHT = 160, 64

@@ -323,7 +323,7 @@ def test_what_is_cut_out_of_a_layer_that_gave_way_is_that_layers(device: Device)
     extra = highlights.reduce_weights(device, layers, fields, clipped, masks, grid)
     prices = np.zeros((3, *cells.shape))
     prices[[0, 2]] = 5
-    highlights.restore_weights(device, layers, fields, extra, whole, grid)
+    highlights.restore_weights(device, layers, fields, extra, whole, grid, seam.seam_grid(grid))
     seam.cut(device, layers, fields, residual, whole, masks, grid, clipping=prices)
     grey, white, _ = (field.get()[38:48, 34, 3] for field in fields)
     assert (white > 100 * grey).all()

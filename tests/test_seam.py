@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from grids import GRIDS, patches, plane, random_layer
 from labels import label
-from reference.seam import seam_clamp, seam_difference, seam_yield
+from reference.seam import seam_clamp, seam_difference, seam_weights, seam_yield
 from scipy import ndimage
 from tolerances import POSITION, SUM, assert_close
 
@@ -129,6 +129,18 @@ def test_what_stays_equals_its_twin(device: Device, name: str) -> None:
     changed = (np.abs(expected - field)[..., :3] > 0.1 * scale).any(-1)
     assert 0.01 < changed.mean() < 0.5
     assert np.array_equal(out.get()[..., 3], field[..., 3])
+
+
+@pytest.mark.parametrize("place", [(0, 0, 60, 40), (11, 7, 31, 23), (29, 0, 31, 40)])
+def test_weights_equal_their_twin(device: Device, place: tuple[int, int, int, int]) -> None:
+    grid = plane(60, 40)
+    cells = grid.resized(13, 7)
+    field = np.random.default_rng(4).random((place[3], place[2], 4)).astype(np.float32)
+    rows, columns = seam._centres(cells, grid.shape)
+    layers = [SimpleNamespace(box=place)]
+    found = seam._weights(device, layers, [device.upload(field)], grid, cells)
+    assert found.shape == (1, 7, 13) and 0 < (found > 0).mean() <= 1
+    assert np.array_equal(found[0], seam_weights(field, place, rows, columns))
 
 
 # Residuals

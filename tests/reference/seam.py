@@ -70,6 +70,13 @@ def seam_yield(
     return result
 
 
+def seam_weights(field: Array, box: Sequence[int], rows: Array, columns: Array) -> Array:
+    """A layer's colour weight in rows and columns of the working grid; 0 where it is not."""
+    weights = np.zeros((max(box[1] + box[3], rows.max() + 1), max(box[0] + box[2], columns.max() + 1)))
+    weights[box[1] :, box[0] :][: box[3], : box[2]] = field[..., 3]
+    return weights[np.ix_(rows, columns)]
+
+
 def seam_clamp(
     layer: Array,
     field: Array,
