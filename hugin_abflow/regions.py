@@ -28,10 +28,12 @@ from hugin_abflow.working import Grid, connected
 _STRONG, _WEAK = 0.2, 0.045
 # From the first less this to it and this more, a cell counts from not at all to wholly as strong.
 _DOUBT = 0.05
-# Where layers differ in texture as well, and not in brightness alone, as exposures do, less is enough: the
-# residual up to which a cell counts not at all, and from which wholly; and its share of that of all
-# frequencies up to which there is texture, and from which there is none.
-_FAINT, _TEXTURED = (0.08, 0.14), (0.7, 0.8)
+# Where layers differ in texture as well as in brightness, less is enough: the residual up to which a cell
+# counts not at all, and from which wholly; and its share of that of all frequencies, between the middle two of
+# which a cell counts. More is what exposures leave, less what is not quite aligned, or noise.
+_FAINT, _TEXTURED = (0.08, 0.14), (0.55, 0.6, 0.7, 0.8)
+# The share of a region that such cells have at least: somebody fills his.
+_FILLED = 0.06
 # Strong cells, of the equator's size, that a region has at least: fewer are an edge that is a pixel off.
 _LEAST = 4.5
 # No layer is taken where it is not.
@@ -151,15 +153,16 @@ def find(residual: Residuals, cells: Grid, single: Cells) -> list[Cells]:
     """Connected outskirts that hold enough strong residual, or any cell of `single`, grown by a cell."""
     smooth_rms = residual.rms if residual.smooth_rms is None else residual.smooth_rms
     weak = (residual.mean > _WEAK) | (smooth_rms > _STRONG) | single
-    strong = np.interp(residual.mean, (_STRONG - _DOUBT, _STRONG + _DOUBT), (0, 1))
+    area = np.broadcast_to(cells.row_widths[:, None], weak.shape)
+    strong = area * np.interp(residual.mean, (_STRONG - _DOUBT, _STRONG + _DOUBT), (0, 1))
     share = residual.mean / np.maximum(smooth_rms, 1e-12)
-    textured = np.interp(share, _TEXTURED, (1, 0)) * np.interp(residual.mean, _FAINT, (0, 1))
-    # one or the other: what exposures leave is not made a thing by a little texture in it
-    either = np.stack([strong, textured]) * cells.row_widths[:, None]
+    textured = area * np.interp(residual.mean, _FAINT, (0, 1)) * np.interp(share, _TEXTURED, (0, 1, 1, 0))
     return [
         region
         for region in parts(grown(weak, 1, cells.wraps), cells.wraps)
-        if either[:, region].sum(1).max() >= _LEAST or single[region].any()
+        if strong[region].sum() >= _LEAST
+        or textured[region].sum() >= max(_LEAST, _FILLED * area[region].sum())
+        or single[region].any()
     ]
 
 

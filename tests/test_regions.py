@@ -203,18 +203,28 @@ def test_texture_that_differs_joins_a_region_but_makes_none() -> None:
         assert seam.regions(Residuals(mean, rms), plane(480, 320), aligned)[8, 12] == aligned
 
 
-@pytest.mark.parametrize(("mean", "texture", "count", "counts"), [
-    (0.14, 0.65, 4, False), (0.14, 0.65, 5, True), (0.11, 0.5, 8, False), (0.11, 0.5, 10, True),
-    (0.08, 0.5, 60, False), (0.14, 0.8, 60, False), (0.14, 0.75, 8, False), (0.14, 0.75, 10, True),
+@pytest.mark.parametrize(("mean", "share", "count", "counts"), [
+    (0.14, 0.65, 4, False), (0.14, 0.65, 5, True), (0.11, 0.62, 8, False), (0.11, 0.62, 10, True),
+    (0.08, 0.65, 60, False), (0.14, 0.8, 60, False), (0.14, 0.75, 8, False), (0.14, 0.75, 10, True),
+    (0.14, 0.55, 60, False), (0.14, 0.575, 8, False), (0.14, 0.575, 10, True),
 ])  # fmt: skip
 def test_less_is_strong_where_texture_differs_too(
-    mean: float, texture: float, count: int, counts: bool
+    mean: float, share: float, count: int, counts: bool
 ) -> None:
-    """Somebody in pale clothes before a pattern. texture: the share of low frequencies in all."""
+    """Somebody in pale clothes before a pattern. share: of low frequencies in all."""
     residual = np.zeros((40, 60))
     residual[20, :count] = mean + 1e-9
-    found_there = found(Residuals(residual, residual / texture), plane(480, 320).resized(60, 40))
-    assert len(found_there) == counts
+    regions_there = found(Residuals(residual, residual / share), plane(480, 320).resized(60, 40))
+    assert len(regions_there) == counts
+
+
+@pytest.mark.parametrize(("rows", "counts"), [(4, True), (12, False)])
+def test_somebody_fills_his_region(rows: int, counts: bool) -> None:
+    """What is not quite aligned differs here and there, in a region of many cells."""
+    residual = np.full((40, 60), 0.0)
+    residual[10 : 10 + rows, 5:15] = 1.1 * regions._WEAK
+    residual[12, 7:14] = 0.14 + 1e-9
+    assert len(found(Residuals(residual, residual / 0.65), plane(480, 320).resized(60, 40))) == counts
 
 
 def test_a_region_across_the_border_is_one() -> None:
