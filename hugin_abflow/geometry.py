@@ -23,6 +23,9 @@ _PLAUSIBLE = 0.1
 _FOLLOWING_STEPS = 8
 # Pixels of a row that a work item takes: GEOMETRY_CHUNK of kernels/geometry.cl.
 _CHUNK = 4
+# By how much a weight's logarithm falls for each working pixel that a displacement is shortened by: where
+# another layer takes over both still lie on each other.
+SHORTENED = 10.0
 
 
 @dataclass(frozen=True)
@@ -38,8 +41,7 @@ class PairFlow(Pair):
     """Flow between the layers of a pair on their chart: float32 (height, width, 2), chart px.
 
     `forward` is F_ab: what a shows at q, b shows at q + F_ab(q); `backward` is F_ba. After intermediate.py
-    both
-    are of what passes through q, no longer of what starts there.
+    both are of what passes through q, no longer of what starts there.
     """
 
     chart: Chart
@@ -86,14 +88,25 @@ def fields(
     return result
 
 
-def keep_within(device: Device, layers: Sequence[WorkingLayer], fields: Sequence[Buffer], grid: Grid) -> None:
-    """Displace layers towards a border of the canvas by half of the way there at most (fields, in place):
-    what lies beyond is cut off from all of them. Who is shortened for that weighs less.
+def keep_within(
+    device: Device,
+    layers: Sequence[WorkingLayer],
+    fields: Sequence[Buffer],
+    grid: Grid,
+    fade: float = SHORTENED,
+) -> None:
+    """Limit displacements of layers towards a border of the canvas to half of the way there (fields, in
+    place): what lies beyond is cut off from all of them.
+
+    fade    how much less, of its logarithm, a layer weighs for each working px that it is shortened by.
     """
     if grid.wraps and grid.poles == 3:  # nothing lies beyond
         return
     for layer, field in zip(layers, fields, strict=True):
-        device.run("geometry", "geometry_within", layer.box[2:], field, layer.box, grid.border, grid.lonlat)
+        device.run(
+            "geometry", "geometry_within", layer.box[2:],
+            field, layer.box, grid.border, grid.lonlat, fade,
+        )  # fmt: skip
 
 
 def _displacement(

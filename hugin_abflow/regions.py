@@ -29,8 +29,8 @@ _STRONG, _WEAK = 0.2, 0.045
 # From the first less this to it and this more, a cell counts from not at all to wholly as strong.
 _DOUBT = 0.05
 # Where layers differ in texture as well as in brightness, less is enough: the residual up to which a cell
-# counts not at all, and from which wholly; and its share of that of all frequencies, between the middle two of
-# which a cell counts. More is what exposures leave, less what is not quite aligned, or noise.
+# counts not at all, and from which wholly; and its share of that of all frequencies, which is low, and high,
+# where a cell does not count: more is what exposures leave, less what is not quite aligned, or noise.
 _FAINT, _TEXTURED = (0.08, 0.14), (0.55, 0.6, 0.7, 0.8)
 # The share of a region that such cells have at least: somebody fills his.
 _FILLED = 0.06

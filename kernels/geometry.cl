@@ -79,15 +79,16 @@ __kernel void geometry_add(__global const float *blend_j,   /* (box_j.w, box_j.z
             field[at + k].xyz += share[k] * way[k];
 }
 
-/* By how much of its logarithm a weight falls for each pixel that a displacement is shortened by. */
-#define GEOMETRY_SHORTENED 0.7f
+/* A weight falls to e to the power of minus that at most: where a cut takes one layer, the others weigh less still. */
+#define GEOMETRY_FAINTEST 14.0f
 
-/* Displace a layer towards a border of the canvas by half of the way to its last pixels' centres at most, and have it
-   weigh the less the more it is shortened for that: what it would show from beyond is cut off, and another layer, which
-   shows it, would take over along a hard edge. */
+/* Limit how far a layer is displaced towards a border of the canvas to half of the way to its last pixels' centres, and
+   have it weigh the less the more it is shortened for that. What it would show from beyond is cut off, and another
+   layer, which shows it, would take over there along a hard edge; now it does where both still lie on each other. */
 __kernel void geometry_within(__global float4 *field, /* (box.w, box.z), in place */
                               int4 box, int4 border,  /* place on the working grid, run size; working grid */
-                              float4 lonlat)
+                              float4 lonlat,
+                              float fade)             /* of a weight's logarithm, for each working px */
 {
     const int x = get_global_id(0), y = get_global_id(1), at = y * box.z + x;
     if (x >= box.z || y >= box.w)
@@ -112,7 +113,7 @@ __kernel void geometry_within(__global float4 *field, /* (box.w, box.z), in plac
     const float shortened = ROOT(square2(inside - there));
     if (shortened > 0.0f)
         field[at] = (float4)(canvas_point(inside, lonlat) - canvas_point(q, lonlat),
-                             own.w * exponential(-LEAST(GEOMETRY_SHORTENED * shortened, 80.0f)));
+                             own.w * exponential(-LEAST(fade * shortened, GEOMETRY_FAINTEST)));
 }
 
 /* a_k = sharpness * w_k * (1 + magnitude * f_k / width), with f_k = |displacement| / (1 - w_k); and the maximum

@@ -20,8 +20,8 @@ from reference.common import (
 
 # Coefficients below this move nothing.
 NEGLIGIBLE = 1e-5
-# By how much of its logarithm a weight falls for each pixel that a displacement is shortened by.
-SHORTENED = 0.7
+# A weight falls to e to the power of minus that at most.
+FAINTEST = 14.0
 
 
 def flow_at(flow: Array, u: Array, v: Array, grid: Sequence[int]) -> Array:
@@ -55,7 +55,9 @@ def geometry_add(
     return result
 
 
-def geometry_within(field: Array, box: Sequence[int], border: Sequence[int], lonlat: Numbers) -> Array:
+def geometry_within(
+    field: Array, box: Sequence[int], border: Sequence[int], lonlat: Numbers, fade: float
+) -> Array:
     """The field with displacements that lead half of the way to the grid's last pixels' centres at most, and
     weights that are less where they are shortened."""
     columns, rows = pixels(box[2], box[3], box[0], box[1])
@@ -71,7 +73,8 @@ def geometry_within(field: Array, box: Sequence[int], border: Sequence[int], lon
     moved = (inside_x != there_x) | (inside_y != there_y)
     result = field.astype(np.float64)
     result[moved, :3] = (canvas_point(inside_x, inside_y, lonlat) - own)[moved]
-    result[..., 3] *= np.exp(-SHORTENED * np.hypot(inside_x - there_x, inside_y - there_y))
+    shortened = np.hypot(inside_x - there_x, inside_y - there_y)
+    result[..., 3] *= np.exp(-np.minimum(fade * shortened, FAINTEST))
     return result
 
 
