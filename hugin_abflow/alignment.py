@@ -214,8 +214,10 @@ def _cut(
     moved = [*gone.values()] + ([] if single is None else [single])
     unlike = Unlike.of(cells, regions.residual.mean, whole, np.any(moved, 0) if moved else None)
     stretched = membrane.stretch(device, layers, fields, owner, whole, unlike.anywhere, masks, grid, cells)
-    again = [[one[k] for k in stretched] for one in (layers, fields)]
-    geometry.keep_within(device, *again, grid, fade=0)  # nothing else is to be seen in a region
+    # nothing else is to be seen in a region
+    geometry.keep_within(
+        device, [layers[k] for k in stretched], [fields[k] for k in stretched], grid, fade=0.0
+    )
     for k in stretched:
         reaches[k] = geometry.reach(device, layers[k], fields[k], grid)
     seam.clamp_displacements(device, layers, fields, owner, whole, grid, cells)
