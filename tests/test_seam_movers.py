@@ -133,7 +133,7 @@ def test_what_moved_makes_a_region_whatever_the_layers_show() -> None:
     assert not seam.regions(alike(residual), grid).any()
 
 
-def owners(told: np.ndarray, residual: np.ndarray, turn: int = 0) -> np.ndarray:
+def owners(device: Device, told: np.ndarray, residual: np.ndarray, turn: int = 0) -> np.ndarray:
     """Whose each cell is: the first layer ends at column 26, the second begins at 14; somebody is on 8 to 17
     in one, on 16 to 23 in the other. All is turned by some columns.
     """
@@ -147,8 +147,8 @@ def owners(told: np.ndarray, residual: np.ndarray, turn: int = 0) -> np.ndarray:
     )
     fields = [np.stack([0 * s] * 3 + [s], -1).repeat(8, 0).repeat(8, 1) for s in (1 - share, share)]
     choice = seam._choice(
-        [SimpleNamespace(box=(0, 0, 240, 96))] * 2,
-        [SimpleNamespace(get=lambda field=field: field) for field in fields],
+        device, [SimpleNamespace(box=(0, 0, 240, 96))] * 2,
+        [device.upload(field, np.float32) for field in fields],
         Residuals(residual, residual, told), region, SimpleNamespace(host=covers), grid,
         seam.seam_grid(grid), seam._CUT, seam._SINGLE_FACTOR * region,
     )  # fmt: skip
@@ -192,7 +192,7 @@ def test_a_region_comes_from_one_layer_and_an_overlap_from_both(
     (1.6, False, False), (1.8, False, True), (1.8, True, False), (2.1, True, True),
 ])  # fmt: skip
 def test_one_layer_may_cost_more_where_something_moved(
-    monkeypatch: pytest.MonkeyPatch, cost: float, moved: bool, cut: bool
+    device: Device, monkeypatch: pytest.MonkeyPatch, cost: float, moved: bool, cut: bool
 ) -> None:
     """So many times as much as cut in two; a single cell that moved is enough."""
     grid = plane(240, 96)
@@ -205,11 +205,11 @@ def test_one_layer_may_cost_more_where_something_moved(
     once = np.zeros(region.shape, bool)
     once[5, 5] = moved
     share = np.where(np.arange(240) < 120, 0.9, 0.1) * np.ones((96, 1))
-    fields = [SimpleNamespace(get=lambda s=s: np.stack([0 * s] * 3 + [s], -1)) for s in (share, 1 - share)]
+    fields = [device.upload(np.stack([0 * s] * 3 + [s], -1), np.float32) for s in (share, 1 - share)]
     residual = np.where(region, 0.3, 0.0)
     residual[:, 14:16] = 0
     found, _ = seam.cut(
-        None, [SimpleNamespace(box=(0, 0, 240, 96))] * 2, fields, Residuals(residual, residual), region,
+        device, [SimpleNamespace(box=(0, 0, 240, 96))] * 2, fields, Residuals(residual, residual), region,
         SimpleNamespace(host=np.ones((2, 12, 30), bool)), grid, once,
     )  # fmt: skip
     assert len(seen) == 1
@@ -217,15 +217,15 @@ def test_one_layer_may_cost_more_where_something_moved(
 
 
 @pytest.mark.parametrize("turn", [0, 15])
-def test_nobody_is_cut_by_a_border_where_nothing_tells_what_is_there(turn: int) -> None:
+def test_nobody_is_cut_by_a_border_where_nothing_tells_what_is_there(device: Device, turn: int) -> None:
     """Beside the second layer's border what it shows was moved away: a cut there seems to cost nothing."""
     residual = np.zeros((12, 30))
     residual[:, 14:26] = 0.02
     residual[2:10, [15, *range(18, 24)]] = 0.3
     residual[:, 14] = 0
-    assert (owners(np.ones((12, 30), bool), residual, turn)[2:10, 14:24] == 1).all()
+    assert (owners(device, np.ones((12, 30), bool), residual, turn)[2:10, 14:24] == 1).all()
     told = residual > 0
-    assert (owners(told, residual, turn)[2:10, 8:26] == 0).all()
+    assert (owners(device, told, residual, turn)[2:10, 8:26] == 0).all()
 
 
 @pytest.mark.parametrize("wraps", WRAPS)
