@@ -150,7 +150,9 @@ class Choice:
 
 
 def find(residual: Residuals, cells: Grid, single: Cells) -> list[Cells]:
-    """Connected outskirts that hold enough strong residual, or any cell of `single`, grown by a cell."""
+    """Connected outskirts, grown by a cell, that hold enough strong residual, are filled with what differs by
+    less and in texture as well, or have any cell of `single`.
+    """
     smooth_rms = residual.rms if residual.smooth_rms is None else residual.smooth_rms
     weak = (residual.mean > _WEAK) | (smooth_rms > _STRONG) | single
     area = np.broadcast_to(cells.row_widths[:, None], weak.shape)
