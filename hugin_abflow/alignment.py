@@ -111,7 +111,7 @@ def _fields(
         transition.minimise_strain(device, layers, coefficients, flows, masks, grid, settings, unlike)
     intermediate.replace_flows(device, layers, coefficients, flows, grid, settings)
     fields = geometry.fields(device, layers, coefficients, flows, grid, settings)
-    if settings.intermediate:  # else as published
+    if settings.flow and settings.intermediate:  # else nothing is displaced, or as published
         geometry.keep_within(device, layers, fields, grid)
     del coefficients
     device.give_back()
