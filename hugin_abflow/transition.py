@@ -11,9 +11,11 @@ of all that sum to 1 and are 0 where layer k is not. The first term is the strai
 well, is the price of each place that no photo shows as it is. Together a transition costs about the parallax
 that it meets along its length, so that it runs where there is little, and is pi P / (2 strain) wide, at which
 the strain is what is wanted, where the overlap has room for it: a phase field (Modica and Mortola 1977; with
-this well Blowey and Elliott 1991). Near things that end within an overlap are left to one photo. Where
-layers cannot be brought to one brightness there is no well, and transitions of layers that reach beyond each
-other are as wide as the overlap. Layers of one and the same mask share it evenly.
+this well Blowey and Elliott 1991). Near things that end within an overlap are left to one photo. What shows
+nothing, such as a sky or a wall, counts as without parallax: flow spreads over it from what is beside it,
+but nobody sees it bend. So transitions run there, round posts and letters. Where layers cannot be brought to
+one brightness there is no well, and transitions of layers that reach beyond each other are as wide as the
+overlap. Layers of one and the same mask share it evenly.
 
 Layers end hard at their borders in overlaps that are thinner than a cell, as in holes of their masks. The sum
 is minimised by relaxation on a pyramid of cells. On the coarsest the well is deepened step by step, since
@@ -32,9 +34,10 @@ import scipy
 from hugin_abflow.cells import Mask
 from hugin_abflow.coefficient import Masks, on_cells
 from hugin_abflow.geometry import PairFlow
+from hugin_abflow.layer import Box
 from hugin_abflow.opencl import Buffer, Device
 from hugin_abflow.settings import Settings
-from hugin_abflow.working import Grid, WorkingLayer
+from hugin_abflow.working import Grid, WorkingLayer, cells_under
 
 # Working pixels per cell of the grids on which transitions are found, from the coarsest to the finest.
 _CELLS = (32, 16, 8, 4)
@@ -98,7 +101,7 @@ def minimise_strain(
     """
     grids = [grid.coarser(pixels) for pixels in _CELLS]
     covers = _covers(masks, grids)
-    price = _price(device, flows, masks, grid, grids[-1], covers[-1])
+    price = _price(device, layers, flows, masks, grid, grids[-1], covers[-1])
     shares: Shares | None = None
     for cells, cover in zip(grids, covers, strict=True):
         finer = Shares.equal(device, cells, cover)
@@ -131,16 +134,26 @@ def _covers(masks: Masks, grids: Sequence[Grid]) -> list[Mask]:
 
 
 def _price(
-    device: Device, flows: Sequence[PairFlow], masks: Masks, grid: Grid, cells: Grid, cover: Mask
+    device: Device,
+    layers: Sequence[WorkingLayer],
+    flows: Sequence[PairFlow],
+    masks: Masks,
+    grid: Grid,
+    cells: Grid,
+    cover: Mask,
 ) -> npt.NDArray[np.float64]:
-    """P^2 + P0^2 in cells, (height, width), in squared working px."""
+    """P^2 + P0^2 in cells, (height, width), in squared working px; P is 0 where no layer shows anything that
+    may be seen there.
+    """
     squared = device.zeros(cells.shape)
+    textures = [_texture(device, layer, grid, cells) for layer in layers]
     for flow in flows:
         chart = flow.chart
         device.run(
             "transition", "transition_parallax", cells.border[:2], flow.forward, flow.backward,
             chart.border, chart.transform, masks.buffers[flow.a],
-            masks.buffers[flow.b], masks.grid.border, grid.border, grid.lonlat, cells.border, squared,
+            masks.buffers[flow.b], masks.grid.border, *textures[flow.a], *textures[flow.b],
+            grid.border, grid.lonlat, cells.border, squared,
         )  # fmt: skip
     several = (cover.sum(0) > 1).astype(np.float64)
     modes = ("nearest", "wrap" if cells.wraps else "nearest")
@@ -150,6 +163,21 @@ def _price(
     )
     price: npt.NDArray[np.float64] = np.square(sums / np.maximum(counts, 1e-6)) + _LEAST_PARALLAX**2
     return price
+
+
+def _texture(
+    device: Device, layer: WorkingLayer, grid: Grid, cells: Grid
+) -> tuple[Buffer, tuple[int, int, int, int]]:
+    """The steepest slope of r, g or b in each cell that a layer is in, full scales per working px: float32
+    (height, width); and which cells these are.
+    """
+    its = cells_under(Box.at(*layer.box), grid, cells)
+    texture = device.empty((its.height, its.width))
+    device.run(
+        "transition", "transition_texture", (its.width, its.height), layer.pixels, layer.box, grid.border,
+        cells.border, its.place, texture,
+    )  # fmt: skip
+    return texture, its.place
 
 
 def _means(values: npt.NDArray[np.float64], cells: Grid) -> npt.NDArray[np.float64]:

@@ -250,6 +250,14 @@ static inline float3 canvas_point(float2 p, float4 lonlat) {
     return (float3)(q.x, q.y, q.z);
 }
 
+/* The point of a chart's position. */
+static inline float3 chart_point(float2 u, const float16 *chart) {
+    if (chart->sd == 0.0f)
+        return (float3)((u.x - chart->sb) / chart->s9, (u.y - chart->sc) / chart->sa, 0.0f);
+    const points q = chart_sphere(u.x, u.y, chart);
+    return (float3)(q.x, q.y, q.z);
+}
+
 static inline float2 canvas_position(float3 q, float4 lonlat) {
     if (lonlat.y == 0.0f)
         return q.xy;

@@ -90,14 +90,6 @@ static inline float relay_follow(__global const float4 *found, __global const fl
     return trust * cells[y / cell * ((grid.x + cell - 1) / cell) + x / cell].w;
 }
 
-/* The point of a chart's position. */
-static inline float3 relay_point(float2 u, const float16 *chart) {
-    if (chart->sd == 0.0f)
-        return (float3)((u.x - chart->sb) / chart->s9, (u.y - chart->sc) / chart->sa, 0.0f);
-    const points q = chart_sphere(u.x, u.y, chart);
-    return (float3)(q.x, q.y, q.z);
-}
-
 /* Add the flow from a to c composed by way of b, F_ab(q) and then F_bc where that leads, at every step-th pixel of
    their chart, times the weights of both. */
 __kernel void relay_add(__global const float4 *first,        /* (first_grid.y, first_grid.x) found, from a to b */
@@ -118,15 +110,15 @@ __kernel void relay_add(__global const float4 *first,        /* (first_grid.y, f
         return;
     const int2 p = (int2)(LEAST(x * step + step / 2, grid.x - 1), LEAST(y * step + step / 2, grid.y - 1));
     const float2 from = convert_float2(p) + 0.5f;
-    float2 u = chart_position(relay_point(from, &chart), &first_chart);
+    float2 u = chart_position(chart_point(from, &chart), &first_chart);
     float weight = share * relay_follow(first, first_back, first_cells, first_grid, cell, &u);
     if (weight <= 0.0f)
         return;
-    u = chart_position(relay_point(u, &first_chart), &second_chart);
+    u = chart_position(chart_point(u, &first_chart), &second_chart);
     weight *= relay_follow(second, second_back, second_cells, second_grid, cell, &u);
     if (weight <= 0.0f)
         return;
-    float2 way = chart_position(relay_point(u, &second_chart), &chart) - from;
+    float2 way = chart_position(chart_point(u, &second_chart), &chart) - from;
     const float period = chart.sd != 0.0f ? 2.0f * M_PI_F * chart.s9 : chart.se * chart.s9;
     if (period > 0.0f) /* the shorter way around */
         way.x -= period * floor_int(way.x / period + 0.5f);

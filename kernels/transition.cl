@@ -10,13 +10,73 @@
 /* The well of a cell weakens its links to no less than this part of them: else its parabola would have no minimum. */
 #define TRANSITION_WEAKEST 0.25f
 
-/* Squared parallax of a pair in cells, in working px: the longest flow, either way, at places where both layers are. */
+/* Slopes, of full scale per working px, up to which nobody sees what is bent, and from which on everybody does. */
+#define TRANSITION_PLAIN 0.012f
+#define TRANSITION_TEXTURED 0.035f
+
+/* Cells of a displacement that are looked at, about. */
+#define TRANSITION_FAR 64.0f
+
+/* A layer's texture in each cell: the steepest slope of r, g or b, of full scale per working px, by Sobel's operator. */
+__kernel void transition_texture(__global const float4 *layer, /* (box.w, box.z) r, g, b, valid */
+                                 int4 box, int4 border,        /* place on the working grid; the grid */
+                                 int4 cells, int4 place,       /* their grid; those that the layer is in, run size */
+                                 __global float *texture)      /* (place.w, place.z) */
+{
+    const int column = get_global_id(0), row = get_global_id(1);
+    if (column >= place.z || row >= place.w)
+        return;
+    const int4 its = cell_pixels(column + place.x, row + place.y, border, cells);
+    const int left = max(its.x - box.x, 1), right = min(its.z - box.x, box.z - 1);
+    const int top = max(its.y - box.y, 1), bottom = min(its.w - box.y, box.w - 1);
+    float steepest = 0.0f;
+    for (int y = top; y < bottom; ++y)
+        for (int x = left; x < right; ++x) {
+            __global const float4 *p = layer + y * box.z + x;
+            const float4 a = p[-box.z - 1], b = p[-box.z], c = p[-box.z + 1], d = p[-1], f = p[1], g = p[box.z - 1],
+                         h = p[box.z], i = p[box.z + 1];
+            if (a.w * b.w * c.w * d.w * f.w * g.w * h.w * i.w == 0.0f)
+                continue;
+            const float3 across = 0.125f * (c + 2.0f * f + i - a - 2.0f * d - g).xyz;
+            const float3 down = 0.125f * (g + 2.0f * h + i - a - 2.0f * b - c).xyz;
+            const float3 squared = across * across + down * down;
+            steepest = GREATEST(steepest, GREATEST(GREATEST(squared.x, squared.y), squared.z));
+        }
+    texture[row * place.z + column] = ROOT(steepest);
+}
+
+/* The largest texture that a layer may show at position p of the working grid, which displacements up to `end` - p lead
+   to: of the cells along the way and beside it. */
+static inline float transition_met(__global const float *texture, int4 place, float2 p, float2 end, int4 border,
+                                   float4 lonlat, int4 cells) {
+    const float period = lonlat.y != 0.0f ? 2.0f * M_PI_F / lonlat.y : border.z ? border.x : 0.0f;
+    float2 way = end - p;
+    if (period > 0.0f) /* the shorter way around */
+        way.x -= period * floor_int(way.x / period + 0.5f);
+    const float2 ratio = (float2)((float)cells.x / border.x, (float)cells.y / border.y);
+    const int steps = 1 + (int)LEAST(GREATEST(MAGNITUDE(way.x * ratio.x), MAGNITUDE(way.y * ratio.y)), TRANSITION_FAR);
+    float met = 0.0f;
+    for (int step = 0; step <= steps; ++step) {
+        const int2 at = floor_int2((p + way * ((float)step / steps)) * ratio);
+        for (int beside = 0; beside < 9; ++beside) {
+            int2 cell = at + (int2)(beside % 3 - 1, beside / 3 - 1);
+            const int index = grid_border(&cell, cells) ? box_index(cell, place) : -1;
+            met = GREATEST(met, index < 0 ? 0.0f : texture[index]);
+        }
+    }
+    return met;
+}
+
+/* Squared parallax of a pair in cells, in working px: the longest flow, either way, at places where both layers are, as
+   far as it is seen: what shows nothing may be bent. */
 __kernel void transition_parallax(__global const float2 *flow,   /* chart grid, px: F_ab */
                                   __global const float2 *back,   /* chart grid, px: F_ba */
                                   int4 grid, float16 chart,      /* chart */
                                   __global const uchar *mask_a,  /* (masks.y, masks.x) */
                                   __global const uchar *mask_b,  /* (masks.y, masks.x) */
                                   int4 masks,                    /* mask grid */
+                                  __global const float *texture_a, int4 place_a, /* (place.w, place.z) */
+                                  __global const float *texture_b, int4 place_b, /* of transition_texture */
                                   int4 border, float4 lonlat,    /* working grid */
                                   int4 cells,                    /* run size */
                                   __global float *parallax)      /* (cells.y, cells.x) that of no pair before is less */
@@ -26,7 +86,7 @@ __kernel void transition_parallax(__global const float2 *flow,   /* chart grid, 
         return;
     const float2 size = (float2)(border.x, border.y), unit = (float2)(lonlat.y == 0.0f ? 1.0f : 1.0f / lonlat.y);
     const float2 per_pixel = unit / (float2)(chart.s9, chart.sa);
-    float longest = parallax[y * cells.x + x];
+    float longest = 0.0f;
     for (int part = 0; part < 4; ++part) {
         const float2 share = ((float2)(x, y) + 0.25f + 0.5f * (float2)(part & 1, part >> 1)) /
                              (float2)(cells.x, cells.y);
@@ -37,7 +97,17 @@ __kernel void transition_parallax(__global const float2 *flow,   /* chart grid, 
         longest = GREATEST(longest, square2(bilinear_flow(flow, u, grid) * per_pixel));
         longest = GREATEST(longest, square2(bilinear_flow(back, u, grid) * per_pixel));
     }
-    parallax[y * cells.x + x] = longest;
+    if (longest > parallax[y * cells.x + x]) {
+        const float2 p = ((float2)(x, y) + 0.5f) * (float2)((float)border.x / cells.x, (float)border.y / cells.y);
+        const float2 u = chart_position(canvas_point(p, lonlat), &chart);
+        const float2 to_a = canvas_position(chart_point(u + bilinear_flow(back, u, grid), &chart), lonlat);
+        const float2 to_b = canvas_position(chart_point(u + bilinear_flow(flow, u, grid), &chart), lonlat);
+        const float met = GREATEST(transition_met(texture_a, place_a, p, to_a, border, lonlat, cells),
+                                   transition_met(texture_b, place_b, p, to_b, border, lonlat, cells));
+        const float seen = (met - TRANSITION_PLAIN) / (TRANSITION_TEXTURED - TRANSITION_PLAIN);
+        const float share = LIMITED(seen, 0.0f, 1.0f);
+        parallax[y * cells.x + x] = GREATEST(parallax[y * cells.x + x], longest * share * share);
+    }
 }
 
 /* The share of a layer in a cell; 0 where it has none. */

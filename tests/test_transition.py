@@ -69,17 +69,35 @@ def test_parallax_equals_its_twin(device: Device, name: str) -> None:
         for _ in range(2)
     ]
     before = (4 * random.random(cells.shape)).astype(np.float32)
+    places = (0, 0, *cells.border[:2]), (3, 2, 12, 7)
+    textures = [(0.05 * patches(5 + k, *its[2:], 0.35, 3)).astype(np.float32) for k, its in enumerate(places)]
+    placed = list(zip(textures, places, strict=True))
     found, chart_grid = device.upload(before), (chart.width, chart.height, int(chart.wraps), 0)
     device.run(
         "transition", "transition_parallax", cells.border[:2], *(device.upload(one) for one in flows),
         chart_grid, chart.transform, *(device.upload(one) for one in masks), mask_grid.border,
+        device.upload(textures[0]), places[0], device.upload(textures[1]), places[1],
         grid.border, grid.lonlat, cells.border, found,
     )  # fmt: skip
     expected = twin.transition_parallax(
-        flows, chart_grid, chart.transform, masks, grid.border, grid.lonlat, cells.border, before
+        flows, chart_grid, chart.transform, masks, placed, grid.border, grid.lonlat, cells.border, before
     )
-    assert 0.3 < (expected > before).mean() < 1
+    assert 0.2 < (expected > before).mean() < 1
     assert_close(found.get(), expected, 100 * POSITION)
+
+
+@pytest.mark.parametrize("name", list(GRIDS))
+def test_texture_equals_its_twin(device: Device, name: str) -> None:
+    grid = GRIDS[name]
+    cells, place, layer = cells_of(grid, 19, 11), (2, 1, 15, 9), random_layer(4, *BOX[2:], 0.8)
+    found = device.empty((place[3], place[2]))
+    device.run(
+        "transition", "transition_texture", place[2:], device.upload(layer), BOX, grid.border, cells.border,
+        place, found,
+    )  # fmt: skip
+    expected = twin.transition_texture(layer, BOX, grid.border, cells.border, place)
+    assert 0.2 < (expected > 0).mean() < 1
+    assert_close(found.get(), expected, 10 * SUM)
 
 
 @pytest.mark.parametrize("name", list(GRIDS))
@@ -306,6 +324,18 @@ def test_a_near_thing_within_the_overlap_is_one_photo_s(device: Device) -> None:
     assert (np.ptp(made[1][0].get()[25:, 120:200], axis=1) > 0.25).all()
     first = minimised(device, WIDE, made)[0][25:, 124:196]
     assert min(first.max(), (1 - first).max()) < 0.03
+
+
+def test_a_transition_runs_where_nothing_is_to_be_seen(device: Device) -> None:
+    """Of an overlap that shifts by 20 px all over, the left half shows something: it is one photo's."""
+    made = scene(device, WIDE, left_and_right(WIDE, 20), np.full(WIDE.shape, 20.0))
+    for layer in made[0]:
+        pixels = layer.pixels.get()
+        pixels[:, 200 - layer.box[0] :, :3] = 0.5
+        layer.pixels.set(pixels)
+    first = minimised(device, WIDE, made)[0]
+    assert (first[:, 20:170] > 0.97).all()
+    assert np.allclose(first[:, 190:].min(1), 0, atol=0.02)
 
 
 def test_what_crosses_the_overlap_bends_little_more_than_wanted(device: Device) -> None:

@@ -6,9 +6,79 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from reference.common import Array, Numbers, bilinear, canvas_point, chart_position, pixels
+from reference.common import (
+    Array,
+    Numbers,
+    bilinear,
+    canvas_point,
+    canvas_position,
+    chart_point,
+    chart_position,
+    grid_border,
+    pixels,
+    take,
+)
 
 TRACE, WEAKEST = 1e-6, 0.25
+PLAIN, TEXTURED, FAR = 0.012, 0.035, 64.0
+
+
+def transition_texture(
+    layer: Array, box: Sequence[int], border: Sequence[int], cells: Sequence[int], place: Sequence[int]
+) -> Array:
+    """The steepest slope, by Sobel's operator, of r, g or b in each cell of place (left, top, width, height),
+    where all pixels around are valid.
+    """
+    padded = np.pad(np.asarray(layer, np.float64), ((1, 1), (1, 1), (0, 0)))
+    height, width = layer.shape[:2]
+    around = {
+        (right, down): padded[1 + down : 1 + down + height, 1 + right : 1 + right + width]
+        for down in (-1, 0, 1)
+        for right in (-1, 0, 1)
+    }
+    slopes = np.zeros((2, height, width, 3))
+    for (right, down), one in around.items():
+        slopes[0] += right * (2 - abs(down)) / 8 * one[..., :3]
+        slopes[1] += down * (2 - abs(right)) / 8 * one[..., :3]
+    valid = np.all([one[..., 3] != 0 for at, one in around.items() if at != (0, 0)], 0)
+    steepest = np.where(valid, np.hypot(*slopes).max(-1), 0)
+    found = np.zeros((place[3], place[2]))
+    for row, column in np.ndindex(*found.shape):
+        first, last = (
+            [
+                max((n + more) * of // to - start, 0)
+                for n, of, to, start in zip(
+                    (row + place[1], column + place[0]), border[1::-1], cells[1::-1], box[1::-1], strict=True
+                )
+            ]
+            for more in (0, 1)
+        )
+        found[row, column] = steepest[first[0] : last[0], first[1] : last[1]].max(initial=0)
+    return found
+
+
+def transition_met(
+    texture: Array, place: Sequence[int], start: Array, end: Array, border: Sequence[int], lonlat: Array,
+    cells: Sequence[int],
+) -> Array:  # fmt: skip
+    """The largest texture in the cells along straight ways, and beside them.
+
+    start, end: (height, width, 2), working px.
+    """
+    period = 2 * np.pi / lonlat[1] if lonlat[1] else border[0] * bool(border[2])
+    way = end - start
+    if period:
+        way[..., 0] -= period * np.floor(way[..., 0] / period + 0.5)
+    ratio = np.array([cells[0] / border[0], cells[1] / border[1]])
+    steps = 1 + np.minimum(np.abs(way * ratio).max(-1), FAR).astype(int)
+    met = np.zeros(start.shape[:2])
+    for step in range(steps.max() + 1):
+        at = np.floor((start + way * np.minimum(step / steps, 1)[..., None]) * ratio).astype(int)
+        for down in (-1, 0, 1):
+            for right in (-1, 0, 1):
+                x, y, inside = grid_border(at[..., 0] + right, at[..., 1] + down, cells)
+                met = np.maximum(met, take(texture, place, x, y, inside))
+    return met
 
 
 def transition_parallax(
@@ -16,17 +86,19 @@ def transition_parallax(
     chart_grid: Sequence[int],
     chart: Numbers,
     masks: Sequence[Array],
+    textures: Sequence[tuple[Array, Sequence[int]]],
     border: Sequence[int],
     lonlat: Numbers,
     cells: Sequence[int],
     parallax: Array,
 ) -> Array:
-    """The squares of the longest flow of both ways in each cell, or of `parallax`, where that is more.
+    """The squares of the longest flow of both ways in each cell, as far as it is seen, or `parallax`, where
+    that is more.
 
-    masks: of both layers, any (height, width) over the same region.
+    masks: of both layers, any (height, width) over the same region. textures: with their places.
     """
     lonlat, chart = np.asarray(lonlat, np.float64), np.asarray(chart, np.float64)
-    longest = np.asarray(parallax, np.float64)
+    longest = np.zeros(parallax.shape)
     columns, rows = pixels(cells[0], cells[1])
     for down in (0.25, 0.75):
         for right in (0.25, 0.75):
@@ -40,7 +112,15 @@ def transition_parallax(
                 total, share = bilinear(flow, chart_grid, *at)
                 found = total / np.maximum(share, 1e-6)[..., None] / chart[9:11] / (lonlat[1] or 1)
                 longest = np.where(both, np.maximum(longest, (found**2).sum(-1)), longest)
-    return longest
+    x, y = (columns + 0.5) * border[0] / cells[0], (rows + 0.5) * border[1] / cells[1]
+    at, met = chart_position(canvas_point(x, y, lonlat), chart), 0.0
+    for (texture, place), flow in zip(textures, flows[::-1], strict=True):
+        total, share = bilinear(flow, chart_grid, *at)
+        u, v = (at[k] + total[..., k] / np.maximum(share, 1e-6) for k in (0, 1))
+        end = np.stack(canvas_position(chart_point(u, v, chart), lonlat), -1)
+        seen = transition_met(texture, place, np.stack([x, y], -1), end, border, lonlat, cells)
+        met = np.maximum(met, seen)
+    return np.maximum(parallax, longest * np.clip((met - PLAIN) / (TEXTURED - PLAIN), 0, 1) ** 2)
 
 
 def transition_refine(coarse: Array, cells: Sequence[int], owns: Array) -> Array:
