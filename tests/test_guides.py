@@ -200,8 +200,8 @@ def test_near_thing_is_whole_and_in_its_place_only_with_guides(device, mode):
 
 @pytest.mark.parametrize("mode", ["joint", "sequential"])
 def test_transition_goes_round_a_near_thing_that_guides_tell(device, mode):
-    """It is seen as one of the photos shows it; without guides it is there twice, side by side, unless it is
-    cut out.
+    """It is seen as one of the photos shows it; without guides a part of it is there twice, side by side,
+    unless it is cut out.
     """
     settings, shows = Settings(merge=mode, exposure=False, seam=False), [look(0), look(MOVE)]
     x = np.arange(CANVAS.width)
@@ -211,8 +211,8 @@ def test_transition_goes_round_a_near_thing_that_guides_tell(device, mode):
         result = merge_layers(near_scene(), CANVAS, settings, guides=guides).astype(int)
         return min(np.abs(result - photo)[20:140, near].mean() for photo in shows)
 
-    assert unlike(GUIDES) < 2
-    assert unlike(()) > 10
+    assert unlike(GUIDES) < 0.5
+    assert unlike(()) > 5  # a transition passes beside its stripes, but not beside all of them
 
 
 def test_guides_may_be_left_aside(device):
