@@ -37,7 +37,7 @@ from hugin_abflow.geometry import PairFlow
 from hugin_abflow.layer import Box
 from hugin_abflow.opencl import Buffer, Device
 from hugin_abflow.settings import Settings
-from hugin_abflow.working import Grid, WorkingLayer, cells_under
+from hugin_abflow.working import Grid, Place, WorkingLayer, cells_under
 
 # Working pixels per cell of the grids on which transitions are found, from the coarsest to the finest.
 _CELLS = (32, 16, 8, 4)
@@ -165,9 +165,7 @@ def _price(
     return price
 
 
-def _texture(
-    device: Device, layer: WorkingLayer, grid: Grid, cells: Grid
-) -> tuple[Buffer, tuple[int, int, int, int]]:
+def _texture(device: Device, layer: WorkingLayer, grid: Grid, cells: Grid) -> tuple[Buffer, Place]:
     """The steepest slope of r, g or b in each cell that a layer is in, full scales per working px: float32
     (height, width); and which cells these are.
     """

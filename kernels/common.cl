@@ -310,6 +310,12 @@ static inline float4 bilinear_taps(float2 q, int4 grid, int4 *at) {
     return weights * (sum > 1e-6f ? 1.0f / sum : 0.0f);
 }
 
+/* The whole turns in a way along what repeats after `period`: without them it is the shorter way around. 0: it does not
+   repeat. */
+static inline float whole_turns(float way, float period) {
+    return period > 0.0f ? period * floor_int(way / period + 0.5f) : 0.0f;
+}
+
 /* Where a pixel lies on another grid over the same region. */
 static inline float2 grid_place(int x, int y, int4 from, int4 to) {
     return (float2)((x + 0.5f) * to.x / from.x, (y + 0.5f) * to.y / from.y);

@@ -119,9 +119,7 @@ __kernel void relay_add(__global const float4 *first,        /* (first_grid.y, f
     if (weight <= 0.0f)
         return;
     float2 way = chart_position(chart_point(u, &second_chart), &chart) - from;
-    const float period = chart.sd != 0.0f ? 2.0f * M_PI_F * chart.s9 : chart.se * chart.s9;
-    if (period > 0.0f) /* the shorter way around */
-        way.x -= period * floor_int(way.x / period + 0.5f);
+    way.x -= whole_turns(way.x, (chart.sd != 0.0f ? 2.0f * M_PI_F : chart.se) * chart.s9);
     sum[y * size.x + x] += (float4)(weight * way, weight, 0.0f);
 }
 

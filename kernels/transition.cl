@@ -49,10 +49,8 @@ __kernel void transition_texture(__global const float4 *layer, /* (box.w, box.z)
    to: of the cells along the way and beside it. */
 static inline float transition_met(__global const float *texture, int4 place, float2 p, float2 end, int4 border,
                                    float4 lonlat, int4 cells) {
-    const float period = lonlat.y != 0.0f ? 2.0f * M_PI_F / lonlat.y : border.z ? border.x : 0.0f;
     float2 way = end - p;
-    if (period > 0.0f) /* the shorter way around */
-        way.x -= period * floor_int(way.x / period + 0.5f);
+    way.x -= whole_turns(way.x, lonlat.y != 0.0f ? 2.0f * M_PI_F / lonlat.y : border.z ? border.x : 0.0f);
     const float2 ratio = (float2)((float)cells.x / border.x, (float)cells.y / border.y);
     const int steps = 1 + (int)LEAST(GREATEST(MAGNITUDE(way.x * ratio.x), MAGNITUDE(way.y * ratio.y)), TRANSITION_FAR);
     float met = 0.0f;
@@ -98,7 +96,7 @@ __kernel void transition_parallax(__global const float2 *flow,   /* chart grid, 
         longest = GREATEST(longest, square2(bilinear_flow(back, u, grid) * per_pixel));
     }
     if (longest > parallax[y * cells.x + x]) {
-        const float2 p = ((float2)(x, y) + 0.5f) * (float2)((float)border.x / cells.x, (float)border.y / cells.y);
+        const float2 p = grid_place(x, y, cells, border);
         const float2 u = chart_position(canvas_point(p, lonlat), &chart);
         const float2 to_a = canvas_position(chart_point(u + bilinear_flow(back, u, grid), &chart), lonlat);
         const float2 to_b = canvas_position(chart_point(u + bilinear_flow(flow, u, grid), &chart), lonlat);
