@@ -322,23 +322,15 @@ static inline float2 grid_place(int x, int y, int4 from, int4 to) {
 }
 
 /* Bilinear reading of a grid at position q, over the taps that lie on it; 0 where none does. */
-static inline float bilinear_scalar(__global const float *values, float2 q, int4 grid) {
-    int4 at;
-    const float4 w = bilinear_taps(q, grid, &at);
-    return w.x * values[at.x] + w.y * values[at.y] + w.z * values[at.z] + w.w * values[at.w];
-}
-
-static inline float4 bilinear_colour(__global const float4 *values, float2 q, int4 grid) {
-    int4 at;
-    const float4 w = bilinear_taps(q, grid, &at);
-    return w.x * values[at.x] + w.y * values[at.y] + w.z * values[at.z] + w.w * values[at.w];
-}
-
-static inline float2 bilinear_flow(__global const float2 *values, float2 q, int4 grid) {
-    int4 at;
-    const float4 w = bilinear_taps(q, grid, &at);
-    return w.x * values[at.x] + w.y * values[at.y] + w.z * values[at.z] + w.w * values[at.w];
-}
+#define BILINEAR(name, type)                                                                                       \
+    static inline type bilinear_##name(__global const type *values, float2 q, int4 grid) {                         \
+        int4 at;                                                                                                   \
+        const float4 w = bilinear_taps(q, grid, &at);                                                              \
+        return w.x * values[at.x] + w.y * values[at.y] + w.z * values[at.z] + w.w * values[at.w];                  \
+    }
+BILINEAR(scalar, float)
+BILINEAR(flow, float2)
+BILINEAR(colour, float4)
 
 #define EXCLUDED 1e3f /* brightness, in what consistency.cl makes, of pixels that do not count */
 
