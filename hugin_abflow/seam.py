@@ -157,7 +157,8 @@ def cut(
     yields = [yielded(whole, owner, k, cells.wraps) for k in range(len(layers))]
     for k, at in gone.items():  # wholly: beside a border the softmax hardly knows another layer
         yields[k] = np.maximum(yields[k], grown(at, 1, cells.wraps) & (owner != k))
-    _yield(device, layers, fields, yields, grid, cells)
+    same = averaged(grown(whole, 1, cells.wraps).astype(np.float32), cells.wraps)
+    _yield(device, layers, fields, yields, same, grid, cells)
     return owner, gone
 
 
@@ -211,7 +212,7 @@ def cut_unaligned(
     choice = _choice(device, layers, fields, Residuals(square, square), whole, masks, grid, cells, _FINE_CUT)
     owner, _ = choice.owners()
     yields = [(whole & (owner != k)).astype(np.float32) for k in range(len(layers))]
-    _yield(device, layers, fields, yields, grid, cells)
+    _yield(device, layers, fields, yields, whole.astype(np.float32), grid, cells)
 
 
 def _choice(
@@ -253,17 +254,21 @@ def _yield(
     layers: Sequence[WorkingLayer],
     fields: Sequence[Buffer],
     yields: Sequence[npt.NDArray[np.float32]],
+    same: npt.NDArray[np.floating],
     grid: Grid,
     cells: Grid,
 ) -> None:
-    """Take the layers' colour weight away where they yield."""
+    """Take the layers' colour weight away where they yield; where they are the `same`, 0..1, none weighs more
+    than another one before.
+    """
+    if not same.any():
+        return
+    everywhere = device.upload(same, np.float32)
     for layer, field, one in zip(layers, fields, yields, strict=True):
-        if one.any():
-            there = device.upload(one)
-            device.run(
-                "seam", "seam_yield", layer.box[2:],
-                field, layer.box, grid.border, there, cells.border, _TRACE,
-            )  # fmt: skip
+        device.run(
+            "seam", "seam_yield", layer.box[2:],
+            field, layer.box, grid.border, device.upload(one), everywhere, cells.border, _TRACE,
+        )  # fmt: skip
 
 
 def _differences(

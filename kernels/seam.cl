@@ -41,21 +41,30 @@ __kernel void seam_difference(__global const float4 *layer_a, __global const flo
     square[at] = n > 0.0f ? GREATEST(squares.x, GREATEST(squares.y, squares.z)) / n : 0.0f;
 }
 
-/* Take a layer's colour weight away where it yields: bilinear from the seam grid, but for a trace. */
-__kernel void seam_yield(__global float4 *field,        /* (box.w, box.z) of the working grid; w is scaled */
+/* The least weight that is told from none, about exp(-87). */
+#define SEAM_LEAST 1.7e-38f
+
+/* Take a layer's colour weight away where it yields, but for a trace, and let layers weigh the same before where they
+   are cut: a cut is where it was chosen, however much more one of them weighed. Both bilinear from the seam grid. */
+__kernel void seam_yield(__global float4 *field,        /* (box.w, box.z) of the working grid; w changes */
                          int4 box, int4 border,         /* place on the working grid, run size; working grid */
                          __global const float *yields,  /* (cells.y, cells.x), 0..1 */
+                         __global const float *same,    /* (cells.y, cells.x), 0..1: weights to the power 1 - same */
                          int4 cells,                    /* seam grid, over the same region */
                          float trace)                   /* the least that is left, of the weight */
 {
-    const int x = get_global_id(0), y = get_global_id(1);
-    if (x >= box.z || y >= box.w)
+    const int x = get_global_id(0), y = get_global_id(1), at = y * box.z + x;
+    if (x >= box.z || y >= box.w || !(field[at].w > 0.0f))
         return;
     const float2 ratio = (float2)((float)cells.x / border.x, (float)cells.y / border.y);
-    const float keep = 1.0f - bilinear_scalar(yields, (float2)(x + box.x + 0.5f, y + box.y + 0.5f) * ratio, cells);
+    const float2 place = (float2)(x + box.x + 0.5f, y + box.y + 0.5f) * ratio;
+    const float keep = 1.0f - bilinear_scalar(yields, place, cells), power = 1.0f - bilinear_scalar(same, place, cells);
     /* to the fourth power: the softmax's own weights span many powers of ten */
     const float left = keep * keep * keep * keep;
-    field[y * box.z + x].w *= GREATEST(left, trace);
+    if (power < 1.0f)
+        field[at].w = exponential(power * logarithm(GREATEST(field[at].w, SEAM_LEAST)));
+    if (left < 1.0f)
+        field[at].w *= GREATEST(left, trace);
 }
 
 /* A layer's colour weight at the centres of cells; 0 where the layer is not. */

@@ -25,21 +25,30 @@ WRAPS = [False, True]
 
 
 def test_twin_of_yield_reads_scipys_zoom() -> None:
-    """A layer's weight times (1 - y) ** 4, with y between the cells' centres; never quite nothing."""
-    yields = patches(0, 13, 9, 0.5, 3).astype(np.float64)
+    """A layer's weight to the power 1 - s, times (1 - y) ** 4, with y and s between the cells' centres; never
+    quite nothing.
+    """
+    yields, same = (patches(k, 13, 9, 0.5, 3).astype(np.float64) for k in (0, 1))
     field = np.random.default_rng(1).random((40, 60, 4))
     for wraps in WRAPS:
         result = seam_yield(
-            field, (11, 7, 60, 40), (77, 53, int(wraps), 0), yields, (13, 9, int(wraps), 0), seam._TRACE
-        )
-        around = np.pad(
-            np.pad(yields, ((1, 1), (0, 0)), "edge"), ((0, 0), (1, 1)), "wrap" if wraps else "edge"
-        )
+            field, (11, 7, 60, 40), (77, 53, int(wraps), 0), yields, same, (13, 9, int(wraps), 0), seam._TRACE
+        )  # fmt: skip
         y, x = np.mgrid[7:47, 11:71] + 0.5
-        read = ndimage.map_coordinates(around, [y * 9 / 53 + 0.5, x * 13 / 77 + 0.5], order=1)
-        assert (read == 0).any()
+        read, alike = (
+            ndimage.map_coordinates(
+                np.pad(np.pad(one, ((1, 1), (0, 0)), "edge"), ((0, 0), (1, 1)), "wrap" if wraps else "edge"),
+                [y * 9 / 53 + 0.5, x * 13 / 77 + 0.5],
+                order=1,
+            )
+            for one in (yields, same)
+        )
+        assert (read == 0).any() and (alike == 0).any() and (alike == 1).any()
         assert np.allclose(
-            result[..., 3], field[..., 3] * np.maximum((1 - read) ** 4, 1e-12), rtol=1e-9, atol=0
+            result[..., 3],
+            field[..., 3] ** (1 - alike) * np.maximum((1 - read) ** 4, 1e-12),
+            rtol=1e-9,
+            atol=0,
         )
         assert np.array_equal(result[..., :3], field[..., :3])
         assert result[..., 3].min() > 0
@@ -84,12 +93,19 @@ def test_yield_equals_its_twin(device: Device, name: str) -> None:
     yields = (patches(2, 10, 7, 0.5, 2) * np.random.default_rng(3).random((7, 10)).clip(0.3)).astype(
         np.float32
     )
+    same = patches(5, 10, 7, 0.5, 2).astype(np.float32)
     field = np.random.default_rng(4).normal(size=(box[3], box[2], 4)).astype(np.float32)
+    # as the softmax's; nothing where the layer is not
+    field[..., 3] = np.where(field[..., 3] > -1, np.exp(20 * np.minimum(field[..., 3], 0)), 0)
     out = device.upload(field)
-    device.run("seam", "seam_yield", box[2:], out, box, grid.border, device.upload(yields), cells, 1e-3)
-    expected = seam_yield(field, box, grid.border, yields, cells, 1e-3)
+    device.run(
+        "seam", "seam_yield", box[2:], out, box, grid.border, device.upload(yields), device.upload(same),
+        cells, 1e-3,
+    )  # fmt: skip
+    expected = seam_yield(field, box, grid.border, yields, same, cells, 1e-3)
     assert_close(out.get(), expected, 10 * SUM)
     assert np.array_equal(out.get()[..., :3], field[..., :3])
+    assert ((out.get()[..., 3] == 0) == (field[..., 3] == 0)).all()
     assert (expected[..., 3] == field[..., 3]).any()
     assert (expected[..., 3] != field[..., 3]).any()
 
@@ -243,6 +259,32 @@ def test_a_layer_yields_all_of_a_region_that_is_not_its_own(columns: int) -> Non
     assert np.allclose(second[6, 8:18], [0, third, 2 * third, 1, 1, 1, 1, 2 * third, third, 0])
     assert np.allclose(first[:7, 7], [0, 0, third, 2 * third, 1, 1, 1])
     assert not first[:, 13:].any() and not second[:, :7].any()
+
+
+@pytest.mark.parametrize("weight", [1.0, 1e-4, 1e-30])
+def test_a_cut_is_where_it_was_chosen(device: Device, weight: float) -> None:
+    """However little the softmax knows the layer that is taken: what the other one shows beside it is gone. A
+    layer that covers less stays nothing where it is not.
+    """
+    grid = plane(184, 104)
+    shape = seam.seam_grid(grid).shape
+    whole = np.zeros(shape, bool)
+    whole[2:-2, 2:17] = True
+    owner = np.zeros(shape, int)
+    owner[:, :10] = 1
+    fields = [np.full((104, 184, 4), one, np.float32) for one in (1.0, weight)]
+    fields[1][60:, :60, 3] = 0
+    fields = [device.upload(field) for field in fields]
+    layers = [SimpleNamespace(box=(0, 0, 184, 104))] * 2
+    masks = SimpleNamespace(host=np.ones((2, 104, 184), bool))
+    nothing = Residuals(np.zeros(shape), np.zeros(shape))
+    seam.cut(device, layers, fields, nothing, whole, masks, grid, choose=lambda _: (owner, {}))
+    first, second = (field.get()[..., 3].astype(np.float64) for field in fields)
+    share = first / (first + second)
+    assert (share[20:56, 20:75] < 0.05).all() and (share[20:84, 85:132] > 0.95).all()
+    assert np.allclose(share[20:84, 79:81].mean(1), 0.5, atol=1e-3)
+    assert np.allclose(share[:, 160:], 1 / (1 + weight), rtol=1e-5)
+    assert (first[60:, :60] > 0).all() and (second[60:, :60] == 0).all()
 
 
 def test_cells_that_a_layer_covers_whole() -> None:

@@ -57,15 +57,18 @@ def seam_yield(
     box: Sequence[int],
     border: Sequence[int],
     yields: Array,
+    same: Array,
     cells: Sequence[int],
     trace: float,
 ) -> Array:
-    """The field (height, width, 4) with the weight of a layer that yields, all but a trace; `yields` is on
-    the cells."""
+    """The field (height, width, 4) with the weight of a layer that yields, all but a trace, and before that
+    weighs like all others where they are the `same`; both are on the cells."""
     columns, rows = pixels(box[2], box[3], box[0], box[1])
     x, y = (columns + 0.5) * cells[0] / border[0], (rows + 0.5) * cells[1] / border[1]
-    given, share = bilinear(yields, cells, x, y)
+    (given, share), (alike, _) = (bilinear(one, cells, x, y) for one in (yields, same))
     result = field.astype(np.float64)
+    weighs = result[..., 3] > 0
+    result[weighs, 3] **= (1 - alike / share)[weighs]
     result[..., 3] *= np.maximum((1 - given / share) ** 4, trace)
     return result
 
