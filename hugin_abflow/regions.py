@@ -58,12 +58,15 @@ class Residuals:
     measured    where any pair has pixels to compare: none are where layers are clipped, or sampled beyond
                 their borders. None: everywhere.
     smooth_rms  of all frequencies, averaged as r is, for the outskirts of regions. None: t.
+    unrelated   where any two show things that have nothing in common, though they may be as bright: trousers
+                and paving. None: nowhere.
     """
 
     mean: npt.NDArray[np.float64]
     rms: npt.NDArray[np.float64]
     measured: Cells | None = None
     smooth_rms: npt.NDArray[np.float64] | None = None
+    unrelated: Cells | None = None
 
 
 @dataclass(frozen=True)
@@ -151,10 +154,12 @@ class Choice:
 
 def find(residual: Residuals, cells: Grid, single: Cells) -> list[Cells]:
     """Connected outskirts, grown by a cell, that hold enough strong residual, are filled with what differs by
-    less and in texture as well, or have any cell of `single`.
+    less and in texture as well, or have any cell of `single`. What is unrelated belongs to outskirts.
     """
     smooth_rms = residual.rms if residual.smooth_rms is None else residual.smooth_rms
     weak = (residual.mean > _WEAK) | (smooth_rms > _STRONG) | single
+    if residual.unrelated is not None:
+        weak |= residual.unrelated
     area = np.broadcast_to(cells.row_widths[:, None], weak.shape)
     strong = area * np.interp(residual.mean, (_STRONG - _DOUBT, _STRONG + _DOUBT), (0, 1))
     share = residual.mean / np.maximum(smooth_rms, 1e-12)

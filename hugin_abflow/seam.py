@@ -40,6 +40,10 @@ _SIGMA, _REACH = 1.0, 3
 _CUT = 10.0
 # The same without flow, where the softmax has little to say: overlaps are some hundred cells wide.
 _FINE_CUT = 120.0
+# Layers show unrelated things: what they differ by in all frequencies, at least, its square's share of the
+# sum of their variances (1 of what has nothing in common), and how many times one's is the other's (1 of one
+# texture that is not aligned).
+_UNRELATED, _OF_VARIANCES, _UNLIKE = 0.06, 0.7, 1.5
 # Residual of layers that agree, without flow: of two cuts that nobody sees the shorter one is taken.
 _SHORTER = 0.005
 # Price of a cell that is clipped, and is not in another layer, as of a residual that nothing favours; and by
@@ -68,17 +72,18 @@ def residuals(
     """What flow and exposure do not explain."""
     cells = seam_grid(grid)
     mean, square, smooth_square = (np.zeros(cells.shape) for _ in range(3))
-    measured = np.zeros(cells.shape, bool)
+    measured, unrelated = (np.zeros(cells.shape, bool) for _ in range(2))
     clipped = [clipping(layer) for layer in layers]
     for its, found in _differences(device, layers, fields, pairs, correction, grid, cells, clipped):
-        share = found[..., 4:]
-        smooth = _smooth(np.concatenate([found[..., :4] * share, share], -1), cells)
-        smooth = (share > 0) * smooth[..., :4] / np.where(share > 0, smooth[..., 4:], 1)
+        share = found[..., 4:5]
+        smooth = _smooth(np.concatenate([found[..., :4] * share, found[..., 5:] * share, share], -1), cells)
+        smooth = (share > 0) * smooth[..., :6] / np.where(share > 0, smooth[..., 6:], 1)
         mean[its] = np.maximum(mean[its], np.abs(smooth[..., :3]).max(-1))
         square[its] = np.maximum(square[its], found[..., 3])
         smooth_square[its] = np.maximum(smooth_square[its], smooth[..., 3])
         measured[its] |= share[..., 0] > 0
-    return Residuals(mean, np.sqrt(square), measured, np.sqrt(smooth_square))
+        unrelated[its] |= _unrelated(smooth[..., 3], smooth[..., 4:])
+    return Residuals(mean, np.sqrt(square), measured, np.sqrt(smooth_square), unrelated)
 
 
 def clipping_prices(
@@ -282,31 +287,32 @@ def _differences(
     clipped: Sequence[tuple[float, ...]],
 ) -> Iterator[tuple[tuple[slice, slice], npt.NDArray[np.float64]]]:
     """Of each two corrected layers, rows and columns of the cells that both may be in, and of these
-    (height, width, 5): the mean of the layers' difference in r, g, b and the largest mean square of these,
-    where neither is brighter than `clipped`, and the share of such pixels.
+    (height, width, 7): the mean of the layers' difference in r, g, b and the largest mean square of these,
+    where neither is brighter than `clipped`, the share of such pixels, and each layer's variance there.
     """
     no_gain = device.zeros((*correction.grid.shape, 4))
 
-    def start(pair: Pair) -> tuple[Box, Buffer, Buffer]:
+    def start(pair: Pair) -> tuple[Box, Buffer, Buffer, Buffer]:
         part = shared_cells(layers[pair.a], layers[pair.b], grid, cells)
         difference = device.empty((part.height, part.width, 4))
         square = device.empty((part.height, part.width))
+        variance = device.empty((part.height, part.width, 2))
         sides: list[Any] = []
         for k in (pair.a, pair.b):
             sides += [layers[k].pixels, fields[k], layers[k].box, correction.gains[k] or no_gain]
         device.run(
             "seam", "seam_difference", (part.width, part.height), *sides, grid.border, grid.lonlat,
             correction.grid.border, cells.border, part.place, correction.shoulder, clipped[pair.a],
-            clipped[pair.b], difference, square,
+            clipped[pair.b], difference, square, variance,
         )  # fmt: skip
-        return part, difference, square
+        return part, difference, square, variance
 
     def fetch(
-        part: Box, difference: Buffer, square: Buffer
+        part: Box, difference: Buffer, square: Buffer, variance: Buffer
     ) -> tuple[tuple[slice, slice], npt.NDArray[np.float64]]:
         mean = difference.get()
-        found = np.dstack([mean[..., :3], square.get(), mean[..., 3]]).astype(np.float64)
-        return part.slices, found
+        found = np.dstack([mean[..., :3], square.get(), mean[..., 3], variance.get()])
+        return part.slices, found.astype(np.float64)
 
     if not pairs:
         return
@@ -317,6 +323,15 @@ def _differences(
         device.flush()
         yield found
     yield fetch(*started)
+
+
+def _unrelated(square: npt.NDArray[np.float64], variances: npt.NDArray[np.float64]) -> Cells:
+    """Where layers show things that have nothing in common, though they may be as bright, by the mean square
+    of their difference and the variance of each (..., 2).
+    """
+    apart = (square > _UNRELATED**2) & (square > _OF_VARIANCES * variances.sum(-1))
+    found: Cells = apart & (variances.max(-1) > _UNLIKE * variances.min(-1))
+    return found
 
 
 def _smooth(values: npt.NDArray[np.float64], cells: Grid) -> npt.NDArray[np.float64]:

@@ -1,7 +1,8 @@
 /* Where one layer is taken whole. */
 
 /* Mean difference a - b of two aligned, corrected layers over the pixels of a cell (every second one in x and y)
-   that both show unclipped, the share of these, and the mean square of the channel that differs most. */
+   that both show unclipped, the share of these, the mean square of the channel that differs most, and the variance of
+   what each shows, a mean of its channels. */
 __kernel void seam_difference(__global const float4 *layer_a, __global const float4 *field_a, int4 box_a,
                               __global const float4 *gain_a, /* (colours.y, colours.x) */
                               __global const float4 *layer_b, __global const float4 *field_b, int4 box_b,
@@ -12,7 +13,8 @@ __kernel void seam_difference(__global const float4 *layer_a, __global const flo
                               float shoulder,              /* of the exposure scale */
                               float4 clipped_a, float4 clipped_b, /* brighter samples are not used */
                               __global float4 *difference, /* (part.w, part.z): r, g, b, share */
-                              __global float *square)      /* (part.w, part.z) */
+                              __global float *square,      /* (part.w, part.z) */
+                              __global float2 *variance)   /* the same: of a, of b */
 {
     const int column = get_global_id(0), row = get_global_id(1);
     if (column >= part.z || row >= part.w)
@@ -20,7 +22,7 @@ __kernel void seam_difference(__global const float4 *layer_a, __global const flo
     const int cx = part.x + column, cy = part.y + row;
     const int4 its = cell_pixels(cx, cy, border, cells);
     const int g = gain_index(cx, cy, cells, colours);
-    float3 sum = (float3)(0.0f), squares = sum;
+    float3 sum = (float3)(0.0f), squares = sum, sum_a = sum, sum_b = sum, squares_a = sum, squares_b = sum;
     float n = 0.0f, tried = 0.0f;
     for (int y = its.y; y < its.w; y += 2)
         for (int x = its.x; x < its.z; x += 2) {
@@ -30,15 +32,22 @@ __kernel void seam_difference(__global const float4 *layer_a, __global const flo
             if (!layer_pair(layer_a, field_a, box_a, layer_b, field_b, box_b, p, border, lonlat, &a, &b) ||
                 any(a.xyz > clipped_a.xyz) || any(b.xyz > clipped_b.xyz))
                 continue;
-            const float3 d =
-                exposure_look(a.xyz, gain_a[g].xyz, shoulder) - exposure_look(b.xyz, gain_b[g].xyz, shoulder);
+            const float3 look_a = exposure_look(a.xyz, gain_a[g].xyz, shoulder);
+            const float3 look_b = exposure_look(b.xyz, gain_b[g].xyz, shoulder), d = look_a - look_b;
             sum += d;
             squares += d * d;
+            sum_a += look_a;
+            sum_b += look_b;
+            squares_a += look_a * look_a;
+            squares_b += look_b * look_b;
             n += 1.0f;
         }
     const int at = row * part.z + column;
     difference[at] = n > 0.0f ? (float4)(sum / n, n / tried) : (float4)(0.0f);
     square[at] = n > 0.0f ? GREATEST(squares.x, GREATEST(squares.y, squares.z)) / n : 0.0f;
+    const float least = GREATEST(n, 1.0f);
+    const float3 spread_a = squares_a - sum_a * sum_a / least, spread_b = squares_b - sum_b * sum_b / least;
+    variance[at] = (float2)(spread_a.x + spread_a.y + spread_a.z, spread_b.x + spread_b.y + spread_b.z) / (3.0f * least);
 }
 
 /* The least weight that is told from none, about exp(-87). */

@@ -70,18 +70,21 @@ def test_difference_equals_its_twin(device: Device, name: str, shoulder: float, 
         gain = np.random.default_rng(9 + k).normal(size=(3, 5, 4)).astype(np.float32)
         sides += [pixels, field, box, gain]
     part, of_part = (2, 1, 7, 5), np.s_[1:6, 2:9]
-    out, square = device.empty((5, 7, 4)), device.empty((5, 7))
+    out, square, variance = device.empty((5, 7, 4)), device.empty((5, 7)), device.empty((5, 7, 2))
     uploaded = [device.upload(one) if isinstance(one, np.ndarray) else one for one in sides]
     device.run(
         "seam", "seam_difference", part[2:], *uploaded, grid.border, grid.lonlat, colours, cells, part,
-        shoulder, *clipped, out, square,
+        shoulder, *clipped, out, square, variance,
     )  # fmt: skip
-    expected, squares = seam_difference(*sides, grid.border, grid.lonlat, colours, cells, shoulder, *clipped)
+    expected, squares, variances = seam_difference(
+        *sides, grid.border, grid.lonlat, colours, cells, shoulder, *clipped
+    )
     assert (expected[..., 3] > 0).mean() > 0.4
     assert (squares > 1.5 * np.square(expected[..., :3]).max(-1)).any()
     # a pixel more or less at a mask's rim is one of some ten of a cell
     assert_close(out.get(), expected[of_part], 10 * POSITION, decisions=0.05)
     assert_close(square.get(), squares[of_part], 10 * POSITION, decisions=0.05)
+    assert_close(variance.get(), variances[of_part], 10 * POSITION, decisions=0.05)
 
 
 @pytest.mark.parametrize("name", list(GRIDS))
@@ -166,9 +169,9 @@ LAYERS = [SimpleNamespace(layer=SimpleNamespace(dtype=np.dtype(np.uint8)), white
 
 def test_a_cell_of_which_little_is_seen_tells_as_much_less(monkeypatch: pytest.MonkeyPatch) -> None:
     """Of those around; a cut through it crosses what is seen."""
-    found = np.zeros((9, 12, 5))
+    found = np.zeros((9, 12, 7))
     found[..., 4] = 1
-    found[4, 6] = 0.5, -0.6, 0.1, 0.4, 0.1
+    found[4, 6] = 0.5, -0.6, 0.1, 0.4, 0.1, 0, 0
     found[4, 7] = 0
     monkeypatch.setattr(seam, "_differences", lambda *_: [(np.s_[0:9, 0:12], found)])
     residual = seam.residuals(None, LAYERS, [], [seam.Pair(0, 1)], None, plane(96, 72))
@@ -186,7 +189,7 @@ def test_a_cut_goes_through_a_gap_of_one_cell(monkeypatch: pytest.MonkeyPatch) -
     """Between somebody's head, which one layer shows whole, and his body, which it cuts off: also where the
     head is as bright as what is behind.
     """
-    found = np.zeros((14, 12, 5))
+    found = np.zeros((14, 12, 7))
     found[..., 4] = 1
     found[:7, 2:10, :3], found[:7, 2:10, 3] = 0.1, 0.02
     found[7, 2:10, :3], found[7, 2:10, 3] = 0.01, 0.001
@@ -203,7 +206,7 @@ def test_a_cut_goes_through_a_gap_of_one_cell(monkeypatch: pytest.MonkeyPatch) -
 
 def test_residuals_are_smoothed_across_the_border(monkeypatch: pytest.MonkeyPatch) -> None:
     """Of a canvas that wraps, by what is compared all along it; the same at each column."""
-    found = np.random.default_rng(4).random((9, 12, 5))
+    found = np.random.default_rng(4).random((9, 12, 7))
     means = []
     for wraps in (True, False):
         for shift in (0, 5):
@@ -217,7 +220,7 @@ def test_residuals_are_smoothed_across_the_border(monkeypatch: pytest.MonkeyPatc
 
 def test_a_cell_is_told_of_by_any_pair(monkeypatch: pytest.MonkeyPatch) -> None:
     """What is as bright as clipped pixels are is not compared, but without flow."""
-    found = np.zeros((2, 9, 12, 5))
+    found = np.zeros((2, 9, 12, 7))
     found[0, :, :5, 4], found[1, 3, 3:, 4] = 0.2, 1
     found[0, 3, 3, 3], found[1, 3, 3, 3], found[1, 3, 8, 3] = 0.09, 0.01, 0.04
     asked = []
@@ -229,6 +232,37 @@ def test_a_cell_is_told_of_by_any_pair(monkeypatch: pytest.MonkeyPatch) -> None:
     ]
     assert np.isclose(residual.rms[3, [3, 8]], [0.3, 0.2]).all()
     assert residual.smooth_rms is not None and (residual.smooth_rms[3, [3, 8]] > 0.05).all()
+
+
+@pytest.mark.parametrize(
+    ("square", "variances", "unrelated"),
+    [
+        (0.01, (0.0095, 0.002), True),  # trousers before paving: neither tells anything of the other
+        (0.01, (0.002, 0.0095), True),
+        (0.01, (0.0055, 0.0055), False),  # paving that is not aligned
+        (0.01, (0.016, 0.004), False),  # partly alike
+        (0.003, (0.003, 0.0005), False),  # noise, hardly to be seen
+    ],
+)
+def test_things_that_have_nothing_in_common_are_told(
+    monkeypatch: pytest.MonkeyPatch, square: float, variances: tuple[float, float], unrelated: bool
+) -> None:
+    """As bright as each other, by any pair; they join a region that differs, and make none."""
+    found = np.zeros((2, 19, 22, 7))
+    found[..., 4] = 1
+    found[0, 7:, 8:14, 3] = square
+    found[0, 7:, 8:14, 5:] = variances
+    found[1, 2:6, 8:14, :3] = 0.5
+    everywhere = [(np.s_[0:19, 0:22], one) for one in found]
+    monkeypatch.setattr(seam, "_differences", lambda *_: iter(everywhere))
+    grid = plane(176, 152)
+    residual = seam.residuals(None, LAYERS, [], [seam.Pair(0, 1)] * 2, None, grid)
+    assert residual.unrelated is not None and residual.unrelated[9:, 9:13].all() == unrelated
+    assert residual.unrelated.any() == unrelated and not residual.unrelated[:5].any()
+    whole = seam.regions(residual, grid)
+    assert whole[3:5, 9:13].all() and whole[10:, 9:13].all() == whole[12:].any() == unrelated
+    monkeypatch.setattr(seam, "_differences", lambda *_: iter(everywhere[:1]))
+    assert not seam.regions(seam.residuals(None, LAYERS, [], [seam.Pair(0, 1)], None, grid), grid).any()
 
 
 # Yields

@@ -33,9 +33,10 @@ def seam_difference(
     shoulder: float,
     clipped_a: Numbers,
     clipped_b: Numbers,
-) -> tuple[Array, Array]:
+) -> tuple[Array, Array, Array]:
     """Mean corrected difference a - b of every cell's pixels, every other one in x and y, with their share,
-    and the largest channel's mean square; samples brighter than `clipped` of their layer are left out."""
+    the largest channel's mean square, and the variance of a and of b, a mean of the channels'; samples
+    brighter than `clipped` of their layer are left out."""
     looks = []
     usable = np.ones((border[1], border[0]), bool)
     sides = (layer_a, field_a, box_a, gain_a, clipped_a), (layer_b, field_b, box_b, gain_b, clipped_b)
@@ -43,13 +44,14 @@ def seam_difference(
         seen, look = layer_look(*side, border, lonlat, colours, cells, shoulder)
         usable &= (seen[..., 3] > 0) & (seen[..., :3] <= np.float32(clipped)[:3]).all(-1)
         looks.append(look)
-    result, square = np.zeros((cells[1], cells[0], 4)), np.zeros((cells[1], cells[0]))
+    result, square, variance = (np.zeros((cells[1], cells[0], *n)) for n in ((4,), (), (2,)))
     for place, part in cell_parts(border, cells, 2):
         values = (looks[0] - looks[1])[part][usable[part]]
         if len(values):
             result[place] = [*values.mean(0), len(values) / usable[part].size]
             square[place] = (values**2).mean(0).max()
-    return result, square
+            variance[place] = [look[part][usable[part]].var(0).mean() for look in looks]
+    return result, square, variance
 
 
 def seam_yield(
