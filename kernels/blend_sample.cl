@@ -3,9 +3,11 @@
 /* Of the cubic that layers are sampled with: Catmull-Rom's -1/2 loses a twentieth of fine texture's gradients over
    all fractions, this next to nothing; a ramp stays one to 0.03 px. */
 #define BLEND_SLOPE (-2.0f / 3.0f)
-/* Beside a step it swings back by a share of that. Beside a lamp this is more light than there is, so that floats, which
-   no range limits, go no farther below the least tap than by half of it; ordinary texture does not anyway. */
-#define BLEND_LIT(v, least) (INTEGER ? (v) : GREATEST(v, (least) - 0.5f * MAGNITUDE(least)))
+/* Beside a step it swings back by a share of that. Beside a lamp this is more light than there is: a black rim. So
+   floats, which no range limits, go no farther below the least tap than by half of it, integers, which are coded, by a
+   quarter, which is as much light; ordinary texture does not anyway. */
+#define BLEND_LIT(v, least)                                                                                        \
+    (INTEGER ? GREATEST(v, 0.75f * (least)) : GREATEST(v, (least) - 0.5f * MAGNITUDE(least)))
 
 /* What is kept for PIXELS sets of four taps, or of their weights, is blend_samples too. */
 #define FIRSTS REDS

@@ -48,22 +48,30 @@ def test_a_crop_elsewhere_takes_other_pixels_together(
 
 
 @pytest.mark.parametrize("channels", [1, 3])
-@pytest.mark.parametrize(("dtype", "lamp"), [(np.float32, 50), (np.float16, 65504)])
+@pytest.mark.parametrize(
+    ("dtype", "lamp", "wall", "least"),
+    [
+        (np.float32, 50, 0.05, 0.0249),
+        (np.float16, 65504, 0.05, 0.0249),
+        (np.uint8, 255, 12, 8.9),
+        (np.uint16, 65535, 3000, 2249),
+    ],
+)
 @pytest.mark.parametrize("name", ["plane", "cylinder", "sphere"])
 def test_no_light_is_taken_away_beside_a_lamp(
-    device: Device, name: str, dtype: type, lamp: float, channels: int
+    device: Device, name: str, dtype: type, lamp: float, wall: float, least: float, channels: int
 ) -> None:
     """A lamp may be a thousand times as bright as the wall behind it, also at a border, and as bright as half
-    floats can be.
+    floats can be; and white before a wall at night, which has no black rim.
     """
     full = GRIDS[name]
     grid = full.resized(24, 15)
-    pixels = np.ones((full.height, full.width, channels + 1), np.float32)
-    pixels[..., :-1] = 0.05
+    pixels = np.full((full.height, full.width, channels + 1), full_scale(dtype), np.float32)
+    pixels[..., :-1] = wall
     pixels[9:12, 30:33, :-1] = pixels[25:35, :2, :-1] = pixels[:1, 50:, :-1] = lamp
     layer = blend_layer(
         device, pixels.astype(dtype), 0, 0, full, grid, field=field_of(3, grid, (0, 0, 24, 15), 0.7)
     )
     result = merged(device, [layer, layer], full, grid)
-    assert 0.0249 < result[..., :-1].min() < 0.049
+    assert least < result[..., :-1].min() < 0.98 * wall
     assert 0.98 * lamp < result[..., :-1].max() < np.inf

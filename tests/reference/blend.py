@@ -23,8 +23,8 @@ from reference.common import (
 
 # Of the cubic that layers are sampled with.
 SLOPE = -2 / 3
-# Of the least tap, what floats keep of it.
-LIT = 0.5
+# Of the least tap, by how much floats and integers may be below it.
+FLOAT_LIT, INTEGER_LIT = 0.5, 0.25
 
 
 def opaque(rows: Array, white: float) -> Array:
@@ -58,8 +58,7 @@ def sample(
             cubic = cubic + (across[i] * down[j])[..., None] * tap
             least = np.minimum(least, tap)
             valid = valid & (tap[..., 3] != 0)
-    if white == 1:
-        cubic = np.maximum(cubic, least - LIT * np.abs(least))
+    cubic = np.maximum(cubic, least - (FLOAT_LIT if white == 1 else INTEGER_LIT) * np.abs(least))
     linear = 0.0
     for column, row, weight in four_taps(x, y):
         column, row, inside = grid_border(column, row, border)
