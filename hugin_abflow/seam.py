@@ -28,7 +28,7 @@ from hugin_abflow.geometry import Pair
 from hugin_abflow.layer import Box
 from hugin_abflow.opencl import Buffer, Device
 from hugin_abflow.regions import Cells, Choice, Gone, Prices, Residuals, completed, find
-from hugin_abflow.working import Grid, WorkingLayer, shared_cells
+from hugin_abflow.working import Grid, WorkingLayer, any_around, shared_cells
 
 # Working pixels per cell of the seam grid.
 _CELL = 8
@@ -75,9 +75,9 @@ def residuals(
     measured, unrelated = (np.zeros(cells.shape, bool) for _ in range(2))
     clipped = [clipping(layer) for layer in layers]
     for its, found in _differences(device, layers, fields, pairs, correction, grid, cells, clipped):
-        share = found[..., 4:5]
-        smooth = _smooth(np.concatenate([found[..., :4] * share, found[..., 5:] * share, share], -1), cells)
-        smooth = (share > 0) * smooth[..., :6] / np.where(share > 0, smooth[..., 6:], 1)
+        values, share = found[..., :-1], found[..., -1:]
+        smooth = _smooth(np.concatenate([values * share, share], -1), cells)
+        smooth = (share > 0) * smooth[..., :-1] / np.where(share > 0, smooth[..., -1:], 1)
         mean[its] = np.maximum(mean[its], np.abs(smooth[..., :3]).max(-1))
         square[its] = np.maximum(square[its], found[..., 3])
         smooth_square[its] = np.maximum(smooth_square[its], smooth[..., 3])
@@ -111,7 +111,7 @@ def clipping_prices(
     unclipped = [(math.inf,) * 4] * len(layers)  # all pixels count
     differences = _differences(device, layers, fields, pairs, correction, grid, cells, unclipped)
     for pair, (its, found) in zip(pairs, differences, strict=True):
-        brighter, both = found[..., :3].mean(-1), found[..., 4] > 0
+        brighter, both = found[..., :3].mean(-1), found[..., -1] > 0
         as_bright[pair.a][its] |= both & (brighter < _DARKER)
         as_bright[pair.b][its] |= both & (-brighter < _DARKER)
     prices: Prices = _CLIPPED * as_bright * clips
@@ -211,7 +211,7 @@ def cut_unaligned(
     square = np.zeros(cells.shape)
     unclipped = [(math.inf,) * 4] * len(layers)  # all pixels count
     for its, found in _differences(device, layers, fields, pairs, correction, grid, cells, unclipped):
-        measured = found[..., 4] > 0
+        measured = found[..., -1] > 0
         square[its] = np.maximum(square[its], np.where(measured, _SHORTER + found[..., 3], 0))
     whole = square > 0
     choice = _choice(device, layers, fields, Residuals(square, square), whole, masks, grid, cells, _FINE_CUT)
@@ -266,14 +266,13 @@ def _yield(
     """Take the layers' colour weight away where they yield; where they are the `same`, 0..1, none weighs more
     than another one before.
     """
-    if not same.any():
-        return
-    everywhere = device.upload(same, np.float32)
+    anywhere, everywhere = same > 0, device.upload(same, np.float32)
     for layer, field, one in zip(layers, fields, yields, strict=True):
-        device.run(
-            "seam", "seam_yield", layer.box[2:],
-            field, layer.box, grid.border, device.upload(one), everywhere, cells.border, _TRACE,
-        )  # fmt: skip
+        if any_around(anywhere, layer.box, grid, cells):  # of many layers few
+            device.run(
+                "seam", "seam_yield", layer.box[2:],
+                field, layer.box, grid.border, device.upload(one), everywhere, cells.border, _TRACE,
+            )  # fmt: skip
 
 
 def _differences(
@@ -287,8 +286,8 @@ def _differences(
     clipped: Sequence[tuple[float, ...]],
 ) -> Iterator[tuple[tuple[slice, slice], npt.NDArray[np.float64]]]:
     """Of each two corrected layers, rows and columns of the cells that both may be in, and of these
-    (height, width, 7): the mean of the layers' difference in r, g, b and the largest mean square of these,
-    where neither is brighter than `clipped`, the share of such pixels, and each layer's variance there.
+    (height, width, 7): the mean of the layers' difference in r, g, b, the largest mean square of these, and
+    each layer's variance, where neither is brighter than `clipped`, and the share of such pixels.
     """
     no_gain = device.zeros((*correction.grid.shape, 4))
 
@@ -311,7 +310,7 @@ def _differences(
         part: Box, difference: Buffer, square: Buffer, variance: Buffer
     ) -> tuple[tuple[slice, slice], npt.NDArray[np.float64]]:
         mean = difference.get()
-        found = np.dstack([mean[..., :3], square.get(), mean[..., 3], variance.get()])
+        found = np.dstack([mean[..., :3], square.get(), variance.get(), mean[..., 3]])
         return part.slices, found.astype(np.float64)
 
     if not pairs:

@@ -45,9 +45,9 @@ __kernel void seam_difference(__global const float4 *layer_a, __global const flo
     const int at = row * part.z + column;
     difference[at] = n > 0.0f ? (float4)(sum / n, n / tried) : (float4)(0.0f);
     square[at] = n > 0.0f ? GREATEST(squares.x, GREATEST(squares.y, squares.z)) / n : 0.0f;
-    const float least = GREATEST(n, 1.0f);
-    const float3 spread_a = squares_a - sum_a * sum_a / least, spread_b = squares_b - sum_b * sum_b / least;
-    variance[at] = (float2)(spread_a.x + spread_a.y + spread_a.z, spread_b.x + spread_b.y + spread_b.z) / (3.0f * least);
+    const float count = GREATEST(n, 1.0f);
+    const float3 spread_a = squares_a - sum_a * sum_a / count, spread_b = squares_b - sum_b * sum_b / count;
+    variance[at] = (float2)(spread_a.x + spread_a.y + spread_a.z, spread_b.x + spread_b.y + spread_b.z) / (3.0f * count);
 }
 
 /* The least weight that is told from none, about exp(-87). */

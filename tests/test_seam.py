@@ -170,13 +170,13 @@ LAYERS = [SimpleNamespace(layer=SimpleNamespace(dtype=np.dtype(np.uint8)), white
 def test_a_cell_of_which_little_is_seen_tells_as_much_less(monkeypatch: pytest.MonkeyPatch) -> None:
     """Of those around; a cut through it crosses what is seen."""
     found = np.zeros((9, 12, 7))
-    found[..., 4] = 1
-    found[4, 6] = 0.5, -0.6, 0.1, 0.4, 0.1, 0, 0
+    found[..., -1] = 1
+    found[4, 6] = 0.5, -0.6, 0.1, 0.4, 0, 0, 0.1
     found[4, 7] = 0
     monkeypatch.setattr(seam, "_differences", lambda *_: [(np.s_[0:9, 0:12], found)])
     residual = seam.residuals(None, LAYERS, [], [seam.Pair(0, 1)], None, plane(96, 72))
     y, x = np.mgrid[0:9, 0:12]
-    weight = np.exp(-0.5 * ((y - 4) ** 2 + (x - 6) ** 2)) * found[..., 4]
+    weight = np.exp(-0.5 * ((y - 4) ** 2 + (x - 6) ** 2)) * found[..., -1]
     assert np.isclose(residual.mean[4, 6], 0.6 * 0.1 / weight.sum(), rtol=0.01)
     assert residual.smooth_rms is not None
     assert np.isclose(residual.smooth_rms[4, 6], np.sqrt(0.4 * 0.1 / weight.sum()), rtol=0.01)
@@ -190,7 +190,7 @@ def test_a_cut_goes_through_a_gap_of_one_cell(monkeypatch: pytest.MonkeyPatch) -
     head is as bright as what is behind.
     """
     found = np.zeros((14, 12, 7))
-    found[..., 4] = 1
+    found[..., -1] = 1
     found[:7, 2:10, :3], found[:7, 2:10, 3] = 0.1, 0.02
     found[7, 2:10, :3], found[7, 2:10, 3] = 0.01, 0.001
     found[8:, 2:10, :3], found[8:, 2:10, 3] = 0.5, 0.3
@@ -221,13 +221,13 @@ def test_residuals_are_smoothed_across_the_border(monkeypatch: pytest.MonkeyPatc
 def test_a_cell_is_told_of_by_any_pair(monkeypatch: pytest.MonkeyPatch) -> None:
     """What is as bright as clipped pixels are is not compared, but without flow."""
     found = np.zeros((2, 9, 12, 7))
-    found[0, :, :5, 4], found[1, 3, 3:, 4] = 0.2, 1
+    found[0, :, :5, -1], found[1, 3, 3:, -1] = 0.2, 1
     found[0, 3, 3, 3], found[1, 3, 3, 3], found[1, 3, 8, 3] = 0.09, 0.01, 0.04
     asked = []
     everywhere = [(np.s_[0:9, 0:12], one) for one in found]
     monkeypatch.setattr(seam, "_differences", lambda *given: asked.append(given[-1]) or iter(everywhere))
     residual = seam.residuals(None, LAYERS, [], [seam.Pair(0, 1)] * 2, None, plane(96, 72))
-    assert np.array_equal(residual.measured, (found[..., 4] > 0).any(0)) and asked == [
+    assert np.array_equal(residual.measured, (found[..., -1] > 0).any(0)) and asked == [
         [(0.98, 0.98, 0.98, 1.0)] * 2
     ]
     assert np.isclose(residual.rms[3, [3, 8]], [0.3, 0.2]).all()
@@ -249,9 +249,9 @@ def test_things_that_have_nothing_in_common_are_told(
 ) -> None:
     """As bright as each other, by any pair; they join a region that differs, and make none."""
     found = np.zeros((2, 19, 22, 7))
-    found[..., 4] = 1
+    found[..., -1] = 1
     found[0, 7:, 8:14, 3] = square
-    found[0, 7:, 8:14, 5:] = variances
+    found[0, 7:, 8:14, 4:6] = variances
     found[1, 2:6, 8:14, :3] = 0.5
     everywhere = [(np.s_[0:19, 0:22], one) for one in found]
     monkeypatch.setattr(seam, "_differences", lambda *_: iter(everywhere))
