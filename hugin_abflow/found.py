@@ -174,19 +174,6 @@ def named_files(layers: Sequence[str | Path]) -> list[Path]:
     return [Path(path) for path in layers]
 
 
-def find_layers(plan: Plan, remap: Remap) -> str | None:
-    """The prefix of layers that `open_layers` takes without making any; None if there are none.
-
-    Raises `LayersMissingError` as it does.
-    """
-    found = None if remap == "always" else find(plan)
-    if found is None and remap == "never":
-        raise none_there(plan)
-    if found is None or (remap != "never" and (found.broken or found.missing(plan) or found.stale(plan))):
-        return None
-    return Path(found.prefix).name
-
-
 def none_there(plan: Plan) -> LayersMissingError:
     """What to raise where layers are neither there nor to be made."""
     return LayersMissingError(

@@ -239,11 +239,18 @@ def _report(canvas: Canvas, projection: str, layers: Sequence[Layer], writer: Im
 def _target(plan: Plan, layers: Sequence[Layer], output: Path | str | None) -> Path:
     """The panorama's file, which must be none of the inputs."""
     inputs = [layer.file for layer in layers if layer.file is not None]
-    if output is None:  # layers that are there stay, also where they were made again
-        there = [file for found in candidates(plan) for file in found.in_order()]
-        return plan.default_output([*inputs, *there])
+    if output is None:
+        return default_target(plan, inputs)
     refuse_input(Path(output), inputs)
     return Path(output)
+
+
+def default_target(plan: Plan, layers: Iterable[Path]) -> Path:
+    """The file of the panorama that nobody names: none of its layers, nor of those that are there and are
+    made again.
+    """
+    there = [file for found in candidates(plan) for file in found.in_order()]
+    return plan.default_output([*layers, *there])
 
 
 def _check_early(plan: Plan, settings: Settings, output: Path | str | None, compression: str | None) -> None:

@@ -116,26 +116,31 @@ def _check_request(remap: str, named: bool) -> None:
         )
 
 
-def _find_or_make(plan: Plan, folder: Path, remap: Remap, keep: bool, progress: Progress) -> Found:
-    """Layers that nobody named: what is there, what nona makes, or both."""
+def planned_layers(plan: Plan, remap: Remap) -> tuple[Found | None, Sequence[PlannedImage]]:
+    """What `open_layers` takes where nobody names layers, and the images of which nona makes layers first;
+    None and all images where it makes all anew. Says why.
+
+    Raises `LayersMissingError` where nothing is there and nothing may be made.
+    """
     found = None if remap == "always" else find(plan)
     if remap == "never":
         if found is None:
             raise none_there(plan)
         _report_used(plan, found)
-        return found
-    broken, stale = (found.broken, found.stale(plan)) if found else (None, [])
-    if found is None or ((broken or stale) and _can_make(plan)):
+        return found, []
+    if found is None:
+        return None, plan.images
+    broken, stale = found.broken, found.stale(plan)
+    if (broken or stale) and _can_make(plan):
         if broken:
             log.warning("%s cannot be read: all layers are made again", broken)
-        elif stale:
+        else:
             log.info("%s is older than the project or its photo: layers are made again", stale[0])
-        return _make_all(plan, folder, keep, progress)
+        return None, plan.images
     if stale and not broken:
         reason = "nona is not installed" if shutil.which("nona") is None else "photos are missing"
         log.warning("%s is older than the project or its photo; used as it is, since %s", stale[0], reason)
-    made = _make_missing(plan, folder, found, keep, progress)
-    return Found(found.prefix, found.files | made, found.pages)
+    return found, found.missing(plan)
 
 
 def _report_used(plan: Plan, found: Found) -> None:
@@ -184,13 +189,23 @@ def _make_all(plan: Plan, folder: Path, keep: bool, progress: Progress) -> Found
     return Found(prefix, _keep(plan, prefix, made) if keep else made)
 
 
-def _make_missing(plan: Plan, folder: Path, found: Found, keep: bool, progress: Progress) -> dict[int, Path]:
-    """Have nona make the layers that are not there; images that miss the crop have none."""
-    missing = found.missing(plan)
+def _find_or_make(plan: Plan, folder: Path, remap: Remap, keep: bool, progress: Progress) -> Found:
+    """Layers that nobody named: what is there, what nona makes, or both."""
+    found, missing = planned_layers(plan, remap)
+    if found is None:
+        return _make_all(plan, folder, keep, progress)
     if not missing:
-        return {}
+        return found
+    made = _make_missing(plan, missing, folder, found.prefix, keep, progress)
+    return Found(found.prefix, found.files | made, found.pages)
+
+
+def _make_missing(
+    plan: Plan, missing: Sequence[PlannedImage], folder: Path, prefix: str, keep: bool, progress: Progress
+) -> dict[int, Path]:
+    """Have nona make the layers that are not there; images that miss the crop have none."""
     if keep:
-        _refuse_to_keep(found.prefix)
+        _refuse_to_keep(prefix)
     with progress("remap", len(_STEPS) * len(missing)) as advance:
         for image in missing:
             code, lines = _run(plan, [image], folder, ["-i", str(image.index)], advance)
@@ -202,7 +217,7 @@ def _make_missing(plan: Plan, folder: Path, found: Found, keep: bool, progress: 
                 raise _failure(plan, [image], folder, code, lines)
     made = _made(plan, folder)
     _check_made(plan, made)
-    return _keep(plan, found.prefix, made) if keep else made
+    return _keep(plan, prefix, made) if keep else made
 
 
 def _check_made(plan: Plan, made: dict[int, Path]) -> None:

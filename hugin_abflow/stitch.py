@@ -12,12 +12,19 @@ from pathlib import Path
 
 from hugin_abflow.errors import LayersMismatchError, ProgramMissingError
 from hugin_abflow.exif import embed
-from hugin_abflow.found import Remap, find_layers, layers_there
+from hugin_abflow.found import Remap, layers_there
 from hugin_abflow.images import COMPRESSIONS, ENDINGS, read_layer
 from hugin_abflow.layer import Layer, check_layers
-from hugin_abflow.merge import OpenDevice, guides_of, merge_project, refuse_input, write_panorama
+from hugin_abflow.merge import (
+    OpenDevice,
+    default_target,
+    guides_of,
+    merge_project,
+    refuse_input,
+    write_panorama,
+)
 from hugin_abflow.metadata import describe
-from hugin_abflow.nona import open_layers, remapping
+from hugin_abflow.nona import open_layers, planned_layers, remapping
 from hugin_abflow.outputs import (
     BLEND,
     WORDS,
@@ -73,7 +80,8 @@ def stitch_project(
                 made += _files(opened)
         if Kind.PANORAMA in branch.kinds:
             # layers that were kept just now are not made again
-            made.append(one(remap="auto" if made else remap, keep_layers=keep_layers))
+            again: Remap = "auto" if made and remap == "always" else remap
+            made.append(one(remap=again, keep_layers=keep_layers))
         if branch.plan.hdr or branch.plan.ignore_exposure:
             stored = _stored(branch.plan, compression, jpeg_quality)
             maker = _Maker(
@@ -114,19 +122,20 @@ def show_project(
     ]
     stored = _storing(compression, jpeg_quality)
     if output or prefix or layers:
-        target = str(Path(output).absolute()) if output else plan.default_output().name
+        there = layers_there(plan, prefix, layers, remap)
+        target = str(Path(output).absolute()) if output else default_target(plan, there).name
         named = ["--layers", *(str(Path(layer).absolute()) for layer in layers)] if layers else []
         named = ["--prefix", _from_anywhere(plan, prefix)] if prefix else named
-        remapped = [] if named else _remapping(plan, remap)
-        named = named or ["--prefix", _layers_prefix(plan, remap)]
+        remapped, found = ([], "") if named else _remapping(plan, remap)
+        named = named or ["--prefix", found]
         return [*head, *remapped, shlex.join([BLEND, *options, *stored, "-o", target, name, *named])]
     lines: list[str] = []
     for branch in _branches(plan):
         lines += [f"# {WORDS[kind]}" for kind in Kind if kind in branch.kinds]
-        lines += _remapping(branch.plan, _remap(branch.plan, remap))
+        remapped, found = _remapping(branch.plan, _remap(branch.plan, remap))
+        lines += remapped
         if Kind.PANORAMA in branch.kinds:
-            found = _layers_prefix(branch.plan, remap)
-            target = plan.default_output().name
+            target = default_target(plan, layers_there(plan, None, None, remap)).name
             lines.append(shlex.join([BLEND, *options, *stored, "-o", target, name, "--prefix", found]))
         own, asked = branch.plan.output, _stored(branch.plan, compression, jpeg_quality)
         differs = _storing(
@@ -166,16 +175,15 @@ def _remap(plan: Plan, remap: Remap) -> Remap:
     return "always" if plan.hdr and remap == "auto" else remap
 
 
-def _layers_prefix(plan: Plan, remap: Remap) -> str:
-    """What comes before the numbers of layers that are there or that nona makes."""
-    return find_layers(plan, remap) or plan.layer_prefix(plan.stem)
-
-
-def _remapping(plan: Plan, remap: Remap) -> list[str]:
-    """nona's command, if layers have to be made."""
-    if find_layers(plan, remap) is not None:
-        return []
-    return [shlex.join(remapping(plan, [], plan.layer_prefix(plan.stem), plan.file.name))]
+def _remapping(plan: Plan, remap: Remap) -> tuple[list[str], str]:
+    """nona's commands, if layers have to be made, and what comes before the numbers of all layers."""
+    found, missing = planned_layers(plan, remap)
+    if found is None:
+        prefix = plan.layer_prefix(plan.stem)
+        return [shlex.join(remapping(plan, [], prefix, plan.file.name))], prefix
+    prefix = Path(found.prefix).name
+    each = [remapping(plan, ["-i", str(image.index)], prefix, plan.file.name) for image in missing]
+    return [shlex.join(command) for command in each], prefix
 
 
 def _stored(plan: Plan, compression: str | None, jpeg_quality: int | None) -> Plan:

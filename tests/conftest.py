@@ -17,6 +17,7 @@ from hypothesis import settings
 
 from hugin_abflow.batch import pool, run, task
 from hugin_abflow.layer import Layer, full_scale
+from hugin_abflow.nona import planned_layers
 from hugin_abflow.opencl import Device
 from hugin_abflow.project import Plan
 
@@ -233,3 +234,9 @@ def names_of(layers: list[Layer]) -> list[str]:
 
 def refuse(*arguments):
     raise AssertionError("nona is not needed here")
+
+
+def to_make(plan: Plan) -> tuple[str | None, list[int]]:
+    """The name of the layers that are taken as they are, and the images that layers are made of."""
+    found, missing = planned_layers(plan, "auto")
+    return found and Path(found.prefix).name, [image.index for image in missing]

@@ -9,11 +9,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from conftest import age, names_of, pixels_of, refuse, remap, same, whole
+from conftest import age, names_of, pixels_of, refuse, remap, same, to_make, whole
 
 from hugin_abflow import nona as program
 from hugin_abflow.errors import ImageReadError, LayersMissingError, OutputError, SettingsError
-from hugin_abflow.found import find_layers
 from hugin_abflow.images import write_image
 from hugin_abflow.merge import merge_project
 from hugin_abflow.nona import open_layers
@@ -179,14 +178,14 @@ def test_layers_of_a_run_that_was_broken_off_are_made_again(
     whole = cut.read_bytes()
     assert len(whole) > 2000
     cut.write_bytes(whole[:left])
-    assert find_layers(plan, "auto") is None
+    assert to_make(plan) == (None, [0, 1, 2])
     with open_layers(plan) as layers:
         assert all(temporary in layer.file.parents for layer in layers)
     assert "cannot be read: all layers are made again" in caplog.text and f"{prefix}0001.tif" in caplog.text
     assert cut.read_bytes() == whole[:left]
     with open_layers(plan, keep_layers=True):
         pass
-    assert find_layers(plan, "auto") == "pano"
+    assert to_make(plan) == ("pano", [])
 
 
 @pytest.mark.parametrize("fault", ["broken", "stale"])
@@ -199,7 +198,7 @@ def test_whole_and_fresh_layers_go_before_others(make_project, nona, monkeypatch
     else:
         age(plan.folder / "pano0001.tif", 60)
     monkeypatch.setattr(program, "_run", refuse)
-    assert find_layers(plan, "auto") == "photo 0 - photo 2"
+    assert to_make(plan) == ("photo 0 - photo 2", [])
     with open_layers(plan) as layers:
         assert names_of(layers)[1] == "photo 0 - photo 20001.tif"
 
@@ -211,7 +210,7 @@ def test_whole_layers_go_before_complete_ones(make_project, nona):
     remap(plan, "photo 0 - photo 2")
     (plan.folder / "pano0001.tif").write_bytes(b"")
     (plan.folder / "photo 0 - photo 20002.tif").unlink()
-    assert find_layers(plan, "auto") is None
+    assert to_make(plan) == ("photo 0 - photo 2", [2])
     with open_layers(plan) as layers:
         assert [layer.file.parent == plan.folder for layer in layers] == [True, True, False]
 

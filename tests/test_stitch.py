@@ -19,7 +19,7 @@ from test_exif import shown
 from test_hugin import CANVAS, NAME, stacked
 from test_metadata import shot
 
-from hugin_abflow import cli
+from hugin_abflow import cli, nona
 from hugin_abflow.errors import (
     ExitCode,
     LayersMismatchError,
@@ -364,3 +364,43 @@ def test_dry_run_takes_layers_that_are_there(make_project: ProjectMaker) -> None
     merge_project(project, keep_layers=True)
     assert [line.split()[0] for line in show_project(project)[3:]] == ["hugin-abflow"]
     assert [line.split()[0] for line in show_project(project, remap="always")[3:]] == ["nona", "hugin-abflow"]
+
+
+def test_dry_run_has_nona_make_what_is_missing_and_no_more(make_project: ProjectMaker) -> None:
+    project = make_project(panorama=CANVAS)
+    merge_project(project, keep_layers=True)
+    project.with_name("pano0001.tif").unlink()
+    before = project.with_name("pano0000.tif").stat()
+    remapping, ours = (shlex.split(line) for line in show_project(project)[3:])
+    assert remapping[remapping.index("-i") :] == ["-i", "1", "-o", "pano", "pano.pto"]
+    subprocess.run(remapping, cwd=project.parent, check=True, capture_output=True)
+    assert project.with_name("pano0001.tif").is_file()
+    assert project.with_name("pano0000.tif").stat() == before
+    assert [shlex.split(line) for line in show_project(project)[3:]] == [ours]
+
+
+def test_dry_run_names_the_panorama_as_the_run_does(make_project: ProjectMaker) -> None:
+    """A file of many pages has the name that the panorama would have."""
+    project = make_project(panorama=CANVAS)
+    with tifffile.TiffWriter(project.with_name("pano.tif")) as file:
+        for page in range(2):
+            file.write(
+                np.full((50, 50, 4), 255, np.uint8), photometric="rgb", extrasamples=["unassalpha"],
+                subfiletype=2, resolution=(150, 150), resolutionunit="inch", metadata=None,
+                extratags=[(X_POSITION, RATIONAL, 1, (40 * page, 150), True)],
+            )  # fmt: skip
+    for options in ({}, {"prefix": "pano"}):
+        line = shlex.split(show_project(project, remap="never", **options)[-1])
+        assert line[line.index("-o") + 1] == "pano_abflow.tif"
+    assert [file.name for file in stitch_project(project, remap="never")] == ["pano_abflow.tif"]
+
+
+def test_never_leaves_layers_as_they_are_for_the_panorama_as_well(
+    make_project: ProjectMaker, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    project = make_project(panorama=CANVAS, extra=asked(Kind.LAYERS, Kind.PANORAMA))
+    merge_project(project, keep_layers=True)
+    for file in project.parent.glob("pano000?.tif"):
+        os.utime(file, (1e9, 1e9))
+    monkeypatch.setattr(nona, "_make_all", lambda *_: pytest.fail("layers are made"))
+    assert [file.name for file in stitch_project(project, remap="never")][-1] == "pano.tif"
