@@ -178,9 +178,9 @@ def _texture(device: Device, layer: WorkingLayer, grid: Grid, cells: Grid) -> tu
     return texture, its.place
 
 
-def _means(values: npt.NDArray[np.float64], cells: Grid) -> npt.NDArray[np.float64]:
-    """Means of a finer grid's values in cells."""
-    sums, counts = on_cells(np.stack([values, np.ones_like(values)]), cells, np.add)
+def _means(values: npt.NDArray[np.floating], cells: Grid) -> npt.NDArray[np.float64]:
+    """Means, in cells, of values on another grid over the same region; of a coarser one the cell's own."""
+    sums, counts = on_cells(np.stack([values, np.ones_like(values)]).astype(np.float64), cells, np.add)
     means: npt.NDArray[np.float64] = sums / counts
     return means
 
@@ -215,10 +215,8 @@ def wells(cells: Grid, grid: Grid, strain: float, unlike: Values) -> Values:
     """(2 strain)^2 times the area of each cell, in squared working px, (height, width); 0 where layers are
     unlike.
     """
-    rows, columns = np.arange(cells.height), np.arange(cells.width)
     area = grid.width / cells.width * grid.height / cells.height * _narrowing(cells)
-    height, width = unlike.shape
-    alike = 1 - unlike[rows * height // cells.height][:, columns * width // cells.width]
+    alike = 1 - _means(unlike, cells)
     prices: Values = ((2 * strain) ** 2 * area[:, None] * alike).astype(np.float32)
     return prices
 

@@ -212,6 +212,8 @@ def test_wells_are_as_large_as_their_cells() -> None:
     flat = transition.wells(plane(8, 4), plane(80, 40), 0.5, unlike)
     assert flat[:2] == pytest.approx(100) and flat[2:, :4] == pytest.approx(100)
     assert not flat[2:, 4:6].any() and flat[2:, 6:] == pytest.approx(100)
+    coarse = transition.wells(plane(2, 1), plane(80, 40), 0.5, unlike)  # of all cells below, in equal parts
+    assert coarse[0] == pytest.approx([1600, 1600 * 3 / 4])
     curved = transition.wells(sphere(40, 20), sphere(400, 200), 0.5, np.zeros((1, 1), np.float32))
     latitudes = math.pi / 2 - (np.arange(20) + 0.5) * math.pi / 20
     assert curved == pytest.approx(np.repeat(100 * np.cos(latitudes)[:, None], 40, 1), rel=1e-5)
