@@ -17,6 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from hugin_abflow import hidden, memory
+from hugin_abflow.content import Unlike
 from hugin_abflow.layer import Box, Layer
 from hugin_abflow.opencl import Buffer, Device, DeviceMemoryError
 from hugin_abflow.progress import Advance
@@ -75,6 +76,25 @@ class BlendLayer:
 
 
 @dataclass(frozen=True)
+class Prepared:
+    """All that the full-resolution pass needs, on the device.
+
+    full        the canvas's grid at full resolution; grid, gain_grid, offset_grid: those of the layers'
+                fields, gains and offsets.
+    shoulder    of the exposure scale (colour.py).
+    unlike      where layers show different things, by which offsets were made; None: nowhere.
+    """
+
+    layers: tuple[BlendLayer, ...]
+    full: Grid
+    grid: Grid
+    gain_grid: Grid
+    offset_grid: Grid
+    shoulder: float
+    unlike: Unlike | None = None
+
+
+@dataclass(frozen=True)
 class _Band:
     """part: the band, in pixels of the region. rows: for each layer, the half-open range of its rows that
     this band may sample; both ends equal where it samples none.
@@ -85,29 +105,17 @@ class _Band:
 
 
 def bands(
-    device: Device,
-    layers: Sequence[BlendLayer],
-    full: Grid,
-    grid: Grid,
-    gain_grid: Grid,
-    offset_grid: Grid,
-    shoulder: float,
-    crop: Box,
-    settings: Settings,
-    advance: Advance,
+    device: Device, prepared: Prepared, crop: Box, settings: Settings, advance: Advance
 ) -> Iterator[npt.NDArray[Any]]:
     """Rows of the panorama, from the crop's top to its bottom: (rows, crop width, channels + 1) in the
-    layers' dtype, alpha last. `crop` is in canvas pixels; `advance` counts rows. `shoulder` is that of the
-    exposure scale (colour.py).
+    layers' dtype, alpha last. `crop` is in canvas pixels; `advance` counts rows.
     """
-    height = settings.band_rows or _band_height(device, layers, full, grid, crop, settings)
+    height = settings.band_rows or _band_height(device, prepared, crop, settings)
     top = crop.top
     while top < crop.bottom:
         rest = Box(crop.left, top, crop.right, crop.bottom)
         try:
-            for out in _bands(
-                device, layers, full, grid, gain_grid, offset_grid, shoulder, rest, height, settings
-            ):
+            for out in _bands(device, prepared, rest, height, settings):
                 yield out
                 advance(len(out))
                 top += len(out)
@@ -117,9 +125,7 @@ def bands(
             height = max(_LEAST_ROWS, height // 2)  # the device is smaller than it says
 
 
-def _band_height(
-    device: Device, layers: Sequence[BlendLayer], full: Grid, grid: Grid, crop: Box, settings: Settings
-) -> int:
+def _band_height(device: Device, prepared: Prepared, crop: Box, settings: Settings) -> int:
     """Rows of a band: as many as are quick and memory holds."""
     pixels = _BAND_PIXELS_ON_CARD if device.kind == "GPU" else _BAND_PIXELS
     height = max(_LEAST_ROWS, pixels // crop.width)
@@ -127,8 +133,8 @@ def _band_height(
     limit = memory.limit(settings.max_memory)
     used = memory.resident() + device.own_memory + _SLACK
     while True:
-        plan = _plan(layers, full, grid, crop, height)
-        needed = used + _pass_memory(layers, plan, grid.row_height)
+        plan = _plan(prepared, crop, height)
+        needed = used + _pass_memory(prepared.layers, plan, prepared.grid.row_height)
         if needed <= limit or height <= _LEAST_ROWS:
             break
         height = max(_LEAST_ROWS, height // 2)
@@ -178,31 +184,22 @@ def _pixels_together(device: Device) -> int:
 
 
 def _bands(
-    device: Device,
-    layers: Sequence[BlendLayer],
-    full: Grid,
-    grid: Grid,
-    gain_grid: Grid,
-    offset_grid: Grid,
-    shoulder: float,
-    crop: Box,
-    height: int,
-    settings: Settings,
+    device: Device, prepared: Prepared, crop: Box, height: int, settings: Settings
 ) -> Iterator[npt.NDArray[Any]]:
     """Bands of `height` rows."""
+    layers, full, grid = prepared.layers, prepared.full, prepared.grid
     region, first = full.region, layers[0].layer
     together, options = _pixels_together(device), build_options(device, first)
     share = _QUARTER_LEVEL.get(first.dtype, _QUARTER_FINE_LEVEL)
-    whole = (0, 0, gain_grid.width, gain_grid.height)
+    whole = (0, 0, prepared.gain_grid.width, prepared.gain_grid.height)
     longitudes = _sines_cosines(device, full.lonlat[0], full.lonlat[1], crop.left - region.left, crop.width)
-    plan = _plan(layers, full, grid, crop, height)
+    plan = _plan(prepared, crop, height)
     fields = _Slices(device, [(layer.box, layer.field) for layer in layers], grid, plan)
     corrections = [None if layer.gain is None else (whole, layer.gain) for layer in layers]
-    gains = _Slices(device, corrections, gain_grid, plan)
-    offsets = _Slices(device, [layer.offset for layer in layers], offset_grid, plan)
-    with _Store(
-        device, [layer.layer for layer in layers], [band.rows for band in plan], settings.cores
-    ) as store:
+    gains = _Slices(device, corrections, prepared.gain_grid, plan)
+    offsets = _Slices(device, [layer.offset for layer in layers], prepared.offset_grid, plan)
+    spans = [band.rows for band in plan]
+    with _Store(device, [layer.layer for layer in layers], spans, settings.cores) as store:
         for band in plan:
             part = band.part
             size = part.width, part.height
@@ -228,9 +225,9 @@ def _bands(
             device.run(
                 "blend", "blend_band", groups, store.rows, touched, len(used), fields.values, gains.values,
                 offsets.values, longitudes, latitudes, full.border, full.lonlat, grid.border,
-                gain_grid.border, offset_grid.border, (part.left, part.top, *size), (region.left, region.top),
-                shoulder, int(settings.interpolation == "nearest"), share, marks, marks.shape[-1], out,
-                options=options,
+                prepared.gain_grid.border, prepared.offset_grid.border, (part.left, part.top, *size),
+                (region.left, region.top), prepared.shoulder, int(settings.interpolation == "nearest"),
+                share, marks, marks.shape[-1], out, options=options,
             )  # fmt: skip
             yield _stored(out.get(), first.dtype)
 
@@ -329,14 +326,15 @@ def _rows_needed(layer: BlendLayer, full: Grid, part: Box, scale: float) -> Span
     return start, min(box.height, end + (-end % strip if strip * row <= _WHOLE_STRIP else 0))
 
 
-def _plan(layers: Sequence[BlendLayer], full: Grid, grid: Grid, crop: Box, height: int) -> list[_Band]:
+def _plan(prepared: Prepared, crop: Box, height: int) -> list[_Band]:
     """The bands from top to bottom. No band needs a row that the one before it has let go of."""
+    layers, full, scale = prepared.layers, prepared.full, prepared.grid.row_height
     left, top = full.region.left, full.region.top
     parts = [
         Box(crop.left - left, start - top, crop.right - left, min(start + height, crop.bottom) - top)
         for start in range(crop.top, crop.bottom, height)
     ]
-    spans = [[_rows_needed(layer, full, part, grid.row_height) for layer in layers] for part in parts]
+    spans = [[_rows_needed(layer, full, part, scale) for layer in layers] for part in parts]
     for k in range(len(layers)):
         touched = [i for i, rows in enumerate(spans) if rows[k][0] < rows[k][1]]
         for before, after in pairwise(touched):

@@ -49,6 +49,7 @@ class GuidanceParameters:
     trust: float = 20.0  # weight of a guide's own place beside a link of neighbours
     contrast: float = 0.05  # step of h across which a link falls to 1/e
     sweeps: int = 200  # of the vote
+    relaxation: float = 1.9  # of its sweeps, 1 to 2
     # The images confirm a guide if, in a window around it, the new flow costs less than `gain` of the old one
     # and `misfit` of the contrast there, or less than `fit` of the contrast, or if that is less than `blank`
     window: float = 6.0  # px: sigma
@@ -376,7 +377,7 @@ def _refusals(
 
 
 def _cost(a: npt.NDArray[np.float32], b: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
-    """How badly features fit, as `guidance_cost` of the kernel."""
+    """How badly features fit: `guidance_cost` of the kernel, which never stores what it finds."""
     off = np.abs(a - b)
     cost: npt.NDArray[np.float32] = np.minimum(off[..., 0] + 2 * (off[..., 1] + off[..., 2]), 0.5)
     return cost
@@ -390,6 +391,6 @@ def _choose(device: Device, rivals: _Rivals, near: Buffer, parameters: GuidanceP
         "guidance", "guidance_vote", size, rivals.feature, *rivals.brought, near, grid, board.pitch,
         parameters.evidence, parameters.trust, parameters.contrast, board.planes,
     )  # fmt: skip
-    board.relax(device, parameters.sweeps, 1.9)
+    board.relax(device, parameters.sweeps, parameters.relaxation)
     vote = board.solution(device, device.empty(rivals.old.shape))
     device.run("guidance", "guidance_choose", size, vote, rivals.new, grid, rivals.old)

@@ -31,11 +31,10 @@ from hugin_abflow import (
     single,
     working,
 )
-from hugin_abflow.blend import BlendLayer
+from hugin_abflow.blend import BlendLayer, Prepared
 from hugin_abflow.cells import SingleSource
 from hugin_abflow.chart import Chart
 from hugin_abflow.coefficient import Masks
-from hugin_abflow.content import Unlike
 from hugin_abflow.errors import SettingsError
 from hugin_abflow.geometry import Pair, PairFlow
 from hugin_abflow.guides import Guide, by_pair
@@ -65,19 +64,6 @@ _NEVER = -1e30
 _LEAST_WORKING_PIXELS = 20_000
 
 
-@dataclass(frozen=True)
-class Prepared:
-    """All that the full-resolution pass needs, on the device; `unlike` tells how its offsets were made."""
-
-    layers: tuple[BlendLayer, ...]
-    full: Grid
-    grid: Grid
-    gain_grid: Grid
-    offset_grid: Grid
-    shoulder: float
-    unlike: Unlike | None
-
-
 def merge(
     device: Device,
     layers: Sequence[Layer],
@@ -99,10 +85,7 @@ def bands(
 ) -> Iterator[npt.NDArray[Any]]:
     """The full-resolution pass."""
     with progress("blend", canvas.crop.height) as advance:
-        yield from blend.bands(
-            device, prepared.layers, prepared.full, prepared.grid, prepared.gain_grid,
-            prepared.offset_grid, prepared.shoulder, canvas.crop, settings, advance,
-        )  # fmt: skip
+        yield from blend.bands(device, prepared, canvas.crop, settings, advance)
 
 
 def prepare_in_memory(
@@ -111,7 +94,7 @@ def prepare_in_memory(
     canvas: Canvas,
     settings: Settings,
     progress: Progress,
-    guides: Sequence[Guide] = (),
+    guides: Sequence[Guide],
 ) -> Prepared:
     """`prepare`, one pair of layers at a time where the device's memory does not hold more, and on a smaller
     working canvas where it does not hold that.

@@ -14,8 +14,8 @@ import numpy as np
 import numpy.typing as npt
 
 from hugin_abflow import coefficient, geometry, joint, working
+from hugin_abflow.blend import Prepared
 from hugin_abflow.guides import Guide
-from hugin_abflow.joint import Prepared
 from hugin_abflow.layer import Canvas, Layer
 from hugin_abflow.opencl import Device
 from hugin_abflow.progress import Progress, silent

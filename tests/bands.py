@@ -9,7 +9,7 @@ from grids import patches
 from scipy import ndimage
 
 from hugin_abflow import blend, geometry, working
-from hugin_abflow.blend import BlendLayer
+from hugin_abflow.blend import BlendLayer, Prepared
 from hugin_abflow.layer import Box, Layer, full_scale
 from hugin_abflow.opencl import Device
 from hugin_abflow.settings import Settings
@@ -69,7 +69,7 @@ def merged(
 ) -> np.ndarray:
     shoulder = float(layers[0].layer.dtype.kind == "u")
     parts = blend.bands(
-        device, layers, full, grid, grid.resized(7, 5), grid.resized(24, 13), shoulder,
+        device, Prepared(tuple(layers), full, grid, grid.resized(7, 5), grid.resized(24, 13), shoulder),
         crop or full.region, Settings(band_rows=rows), lambda units: None,
     )  # fmt: skip
     return np.concatenate(list(parts))

@@ -11,6 +11,7 @@ from bands import blend_layer, merged, stored_pixels
 from grids import plane
 
 from hugin_abflow import blend
+from hugin_abflow.blend import Prepared
 from hugin_abflow.layer import Layer
 from hugin_abflow.opencl import Device
 from hugin_abflow.settings import Settings
@@ -22,18 +23,15 @@ def test_bands_are_as_high_as_memory_allows(device: Device, monkeypatch: pytest.
     grid = full.resized(50, 40)
     pixels = stored_pixels(30, 500, 400, np.uint8, 3, 0.9)
     layers = [blend_layer(device, pixels, 0, 0, full, grid)] * 2
+    cells = grid.resized(7, 5)
     heights, results, warnings = [], [], []
     monkeypatch.setattr(blend, "_SLACK", 0)
     monkeypatch.setattr(blend.memory, "resident", lambda: 0)
     monkeypatch.setattr(blend._log, "warning", lambda *said: warnings.append(said))
     for limit in (0, 6 << 20, 3 << 20, 1 << 18):
         settings = Settings(max_memory=limit)
-        cells = grid.resized(7, 5)
-        parts = list(
-            blend.bands(
-                device, layers, full, grid, cells, cells, 1.0, full.region, settings, lambda units: None
-            )
-        )
+        prepared = Prepared(tuple(layers), full, grid, cells, cells, 1.0)
+        parts = list(blend.bands(device, prepared, full.region, settings, lambda units: None))
         heights.append(len(parts[0]))
         results.append(np.concatenate(parts))
     assert heights[0] == 400 > heights[1] > heights[2] > heights[3] == blend._LEAST_ROWS
@@ -55,11 +53,8 @@ def test_bands_are_higher_on_graphics_cards(
 
     def parts(settings: Settings) -> list[np.ndarray]:
         cells = grid.resized(7, 5)
-        return list(
-            blend.bands(
-                device, layers, full, grid, cells, cells, 1.0, full.region, settings, lambda units: None
-            )
-        )
+        prepared = Prepared(tuple(layers), full, grid, cells, cells, 1.0)
+        return list(blend.bands(device, prepared, full.region, settings, lambda units: None))
 
     result = parts(Settings())
     assert len(result[0]) == rows

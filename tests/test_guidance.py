@@ -125,6 +125,13 @@ def test_vote_equals_its_twin(device: Device, name: str) -> None:
     assert_close(on_board(board, SOLVED), wanted, TRIGONOMETRY, scale=10)
 
 
+def test_costs_on_the_host_are_those_of_the_vote() -> None:
+    features, brought = (0.2 * make_feature(72 + i, GRIDS["plane"])[0] for i in range(2))
+    expected = twin.cost(features, brought)
+    assert 0.1 < (expected < twin.MOST_COST).mean() < 0.9
+    assert_close(guidance._cost(features, brought), expected, SUM)
+
+
 def test_twin_of_vote_is_a_weighted_mean() -> None:
     """Right over left is each pixel's own opinion: -1 far off, 1 at a guide, evidence in between."""
     grid = (5, 1, 0, 0)

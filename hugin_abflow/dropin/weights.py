@@ -12,12 +12,11 @@ import numpy as np
 import numpy.typing as npt
 
 from hugin_abflow import joint, multiband, working
-from hugin_abflow.blend import BlendLayer
+from hugin_abflow.blend import BlendLayer, Prepared
 from hugin_abflow.colour import Correction
 from hugin_abflow.errors import CommandLineError, LayersMismatchError, LayersMissingError
 from hugin_abflow.guides import Guide
 from hugin_abflow.images import ImageWriter, check_target, read_layer
-from hugin_abflow.joint import Prepared
 from hugin_abflow.layer import Box, Canvas, Layer, full_scale
 from hugin_abflow.merge import refuse_input
 from hugin_abflow.opencl import Device
