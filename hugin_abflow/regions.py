@@ -36,6 +36,9 @@ _FAINT, _TEXTURED = (0.08, 0.14), (0.55, 0.6, 0.7, 0.8)
 _FILLED = 0.06
 # Strong cells, of the equator's size, that a region has at least: fewer are an edge that is a pixel off.
 _LEAST = 4.5
+# Cells from a region up to which what is unrelated belongs to it: farther away it is no part of somebody, but
+# what one photo shows less sharp.
+_FAR = 32
 # No layer is taken where it is not.
 _FORBIDDEN = 1e4
 # The share of a region's cells that a layer has for it to be taken from there, whole.
@@ -59,7 +62,7 @@ class Residuals:
                 their borders. None: everywhere.
     smooth_rms  of all frequencies, averaged as r is, for the outskirts of regions. None: t.
     unrelated   where any two show things that have nothing in common, though they may be as bright: trousers
-                and paving. None: nowhere.
+                and paving; but also what one shows less sharp. None: nowhere.
     """
 
     mean: npt.NDArray[np.float64]
@@ -154,23 +157,38 @@ class Choice:
 
 def find(residual: Residuals, cells: Grid, single: Cells) -> list[Cells]:
     """Connected outskirts, grown by a cell, that hold enough strong residual, are filled with what differs by
-    less and in texture as well, or have any cell of `single`. What is unrelated belongs to outskirts.
+    less and in texture as well, or have any cell of `single`. What is unrelated beside them belongs to them,
+    and they to each other.
     """
     smooth_rms = residual.rms if residual.smooth_rms is None else residual.smooth_rms
     weak = (residual.mean > _WEAK) | (smooth_rms > _STRONG) | single
-    if residual.unrelated is not None:
-        weak |= residual.unrelated
     area = np.broadcast_to(cells.row_widths[:, None], weak.shape)
     strong = area * np.interp(residual.mean, (_STRONG - _DOUBT, _STRONG + _DOUBT), (0, 1))
     share = residual.mean / np.maximum(smooth_rms, 1e-12)
     textured = area * np.interp(residual.mean, _FAINT, (0, 1)) * np.interp(share, _TEXTURED, (0, 1, 1, 0))
-    return [
-        region
-        for region in parts(grown(weak, 1, cells.wraps), cells.wraps)
-        if strong[region].sum() >= _LEAST
-        or textured[region].sum() >= max(_LEAST, _FILLED * area[region].sum())
-        or single[region].any()
-    ]
+    outskirts = grown(weak, 1, cells.wraps)
+    found = np.zeros_like(weak)
+    for part in parts(outskirts, cells.wraps):
+        if (
+            strong[part].sum() >= _LEAST
+            or textured[part].sum() >= max(_LEAST, _FILLED * area[part].sum())
+            or single[part].any()
+        ):
+            found |= part
+    if residual.unrelated is not None and residual.unrelated.any():
+        for part in parts(_extended(outskirts, residual.unrelated, cells.wraps), cells.wraps):
+            if strong[part].sum() >= _LEAST:
+                found |= part
+        found = _extended(found, residual.unrelated, cells.wraps)
+    return parts(found, cells.wraps)
+
+
+def _extended(regions: Cells, unrelated: Cells, wraps: bool) -> Cells:
+    """Regions with what is unrelated, grown by a cell, that leads away from them, but not far."""
+    unrelated = grown(unrelated, 1, wraps)
+    for _ in range(_FAR):
+        regions = regions | (grown(regions, 1, wraps) & unrelated)
+    return regions
 
 
 def parts(mask: Cells, wraps: bool) -> list[Cells]:

@@ -28,7 +28,7 @@ from hugin_abflow.geometry import Pair
 from hugin_abflow.layer import Box
 from hugin_abflow.opencl import Buffer, Device
 from hugin_abflow.regions import Cells, Choice, Gone, Prices, Residuals, completed, find
-from hugin_abflow.working import Grid, WorkingLayer, any_around, shared_cells
+from hugin_abflow.working import Grid, WorkingLayer, any_around, connected, shared_cells
 
 # Working pixels per cell of the seam grid.
 _CELL = 8
@@ -42,8 +42,10 @@ _CUT = 10.0
 _FINE_CUT = 120.0
 # Layers show unrelated things: what they differ by in all frequencies, at least, its square's share of the
 # sum of their variances (1 of what has nothing in common), and how many times one's is the other's (1 of one
-# texture that is not aligned).
-_UNRELATED, _OF_VARIANCES, _UNLIKE = 0.06, 0.7, 1.5
+# texture that is not aligned); and how much of the smoother one, in all such cells that touch, may be in the
+# other as well (1 of what is the same and less sharp: photos of which one was out of focus, or shaken), of
+# which less than so many do not tell by themselves, but all such together.
+_UNRELATED, _OF_VARIANCES, _VARIANCE_RATIO, _RELATED, _ENOUGH = 0.06, 0.7, 1.5, 0.7, 32
 # Residual of layers that agree, without flow: of two cuts that nobody sees the shorter one is taken.
 _SHORTER = 0.005
 # Price of a cell that is clipped, and is not in another layer, as of a residual that nothing favours; and by
@@ -54,6 +56,11 @@ _TRACE = 1e-12
 # How many times as much as a cut it may cost to take a region from one layer that has most of it, which shows
 # things once and whole: of what single.py found, and of any other.
 _SINGLE_FACTOR, _WHOLE_FACTOR = 2.0, 1.65
+# Of what `_differences` finds of a cell: the mean of the layers' difference in r, g, b, the largest mean
+# square of these, each layer's variance, their covariance, and the share of the cell that tells.
+_MEAN, _SQUARE, _VARIANCES, _COVARIANCE, _SHARE = (
+    np.s_[..., :3], np.s_[..., 3], np.s_[..., 4:6], np.s_[..., 6], np.s_[..., 7],
+)  # fmt: skip
 
 
 def seam_grid(grid: Grid) -> Grid:
@@ -75,14 +82,14 @@ def residuals(
     measured, unrelated = (np.zeros(cells.shape, bool) for _ in range(2))
     clipped = [clipping(layer) for layer in layers]
     for its, found in _differences(device, layers, fields, pairs, correction, grid, cells, clipped):
-        values, share = found[..., :-1], found[..., -1:]
-        smooth = _smooth(np.concatenate([values * share, share], -1), cells)
-        smooth = (share > 0) * smooth[..., :-1] / np.where(share > 0, smooth[..., -1:], 1)
-        mean[its] = np.maximum(mean[its], np.abs(smooth[..., :3]).max(-1))
-        square[its] = np.maximum(square[its], found[..., 3])
-        smooth_square[its] = np.maximum(smooth_square[its], smooth[..., 3])
-        measured[its] |= share[..., 0] > 0
-        unrelated[its] |= _unrelated(smooth[..., 3], smooth[..., 4:])
+        share = found[_SHARE]
+        smooth = _smooth(np.dstack([found[..., :-1] * share[..., None], share]), cells)
+        smooth /= np.where(share > 0, smooth[_SHARE], np.inf)[..., None]
+        mean[its] = np.maximum(mean[its], np.abs(smooth[_MEAN]).max(-1))
+        square[its] = np.maximum(square[its], found[_SQUARE])
+        smooth_square[its] = np.maximum(smooth_square[its], smooth[_SQUARE])
+        measured[its] |= share > 0
+        unrelated[its] |= _unrelated(smooth, cells)
     return Residuals(mean, np.sqrt(square), measured, np.sqrt(smooth_square), unrelated)
 
 
@@ -111,7 +118,7 @@ def clipping_prices(
     unclipped = [(math.inf,) * 4] * len(layers)  # all pixels count
     differences = _differences(device, layers, fields, pairs, correction, grid, cells, unclipped)
     for pair, (its, found) in zip(pairs, differences, strict=True):
-        brighter, both = found[..., :3].mean(-1), found[..., -1] > 0
+        brighter, both = found[_MEAN].mean(-1), found[_SHARE] > 0
         as_bright[pair.a][its] |= both & (brighter < _DARKER)
         as_bright[pair.b][its] |= both & (-brighter < _DARKER)
     prices: Prices = _CLIPPED * as_bright * clips
@@ -211,8 +218,8 @@ def cut_unaligned(
     square = np.zeros(cells.shape)
     unclipped = [(math.inf,) * 4] * len(layers)  # all pixels count
     for its, found in _differences(device, layers, fields, pairs, correction, grid, cells, unclipped):
-        measured = found[..., -1] > 0
-        square[its] = np.maximum(square[its], np.where(measured, _SHORTER + found[..., 3], 0))
+        measured = found[_SHARE] > 0
+        square[its] = np.maximum(square[its], np.where(measured, _SHORTER + found[_SQUARE], 0))
     whole = square > 0
     choice = _choice(device, layers, fields, Residuals(square, square), whole, masks, grid, cells, _FINE_CUT)
     owner, _ = choice.owners()
@@ -285,9 +292,8 @@ def _differences(
     cells: Grid,
     clipped: Sequence[tuple[float, ...]],
 ) -> Iterator[tuple[tuple[slice, slice], npt.NDArray[np.float64]]]:
-    """Of each two corrected layers, rows and columns of the cells that both may be in, and of these
-    (height, width, 7): the mean of the layers' difference in r, g, b, the largest mean square of these, and
-    each layer's variance, where neither is brighter than `clipped`, and the share of such pixels.
+    """Of each two corrected layers, rows and columns of the cells that both may be in, and of these `_MEAN`
+    to `_SHARE`, (height, width, 8), of the pixels where neither is brighter than `clipped`.
     """
     no_gain = device.zeros((*correction.grid.shape, 4))
 
@@ -295,7 +301,7 @@ def _differences(
         part = shared_cells(layers[pair.a], layers[pair.b], grid, cells)
         difference = device.empty((part.height, part.width, 4))
         square = device.empty((part.height, part.width))
-        variance = device.empty((part.height, part.width, 2))
+        variance = device.empty((part.height, part.width, 4))
         sides: list[Any] = []
         for k in (pair.a, pair.b):
             sides += [layers[k].pixels, fields[k], layers[k].box, correction.gains[k] or no_gain]
@@ -310,7 +316,7 @@ def _differences(
         part: Box, difference: Buffer, square: Buffer, variance: Buffer
     ) -> tuple[tuple[slice, slice], npt.NDArray[np.float64]]:
         mean = difference.get()
-        found = np.dstack([mean[..., :3], square.get(), variance.get(), mean[..., 3]])
+        found = np.dstack([mean[..., :3], square.get(), variance.get()[..., :3], mean[..., 3]])
         return part.slices, found.astype(np.float64)
 
     if not pairs:
@@ -324,13 +330,20 @@ def _differences(
     yield fetch(*started)
 
 
-def _unrelated(square: npt.NDArray[np.float64], variances: npt.NDArray[np.float64]) -> Cells:
-    """Where layers show things that have nothing in common, though they may be as bright, by the mean square
-    of their difference and the variance of each (..., 2).
+def _unrelated(found: npt.NDArray[np.float64], cells: Grid) -> Cells:
+    """Where layers show things that have nothing in common, though they may be as bright. found: of
+    `_differences`, averaged over the cells around, on some of the grid's columns.
     """
+    square, variances = found[_SQUARE], found[_VARIANCES]
     apart = (square > _UNRELATED**2) & (square > _OF_VARIANCES * variances.sum(-1))
-    found: Cells = apart & (variances.max(-1) > _UNLIKE * variances.min(-1))
-    return found
+    apart &= variances.max(-1) > _VARIANCE_RATIO * variances.min(-1)
+    number = connected(apart, cells.wraps and apart.shape[1] == cells.width)
+    number[apart & (np.bincount(number.flat) < _ENOUGH)[number]] = 0  # all of them together
+    common, smoother = (
+        np.bincount(number.flat, (apart * one).flat) for one in (found[_COVARIANCE], variances.min(-1))
+    )
+    unrelated: Cells = apart & (common <= _RELATED * smoother)[number]
+    return unrelated
 
 
 def _smooth(values: npt.NDArray[np.float64], cells: Grid) -> npt.NDArray[np.float64]:

@@ -150,6 +150,8 @@ class Grid:
 
 def connected(mask: npt.NDArray[np.bool_], wraps: bool) -> npt.NDArray[np.int32]:
     """The connected parts of a mask over a grid, numbered from 1 on, not all numbers in use; 0 elsewhere."""
+    if not mask.any():  # OpenCV takes no mask without pixels
+        return np.zeros(mask.shape, np.int32)
     labels = np.asarray(cv2.connectedComponents(mask.astype(np.uint8), connectivity=8)[1], np.int32)
     if wraps:  # parts that meet across the border, at a corner too, are one
         height = labels.shape[0]

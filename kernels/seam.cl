@@ -2,7 +2,7 @@
 
 /* Mean difference a - b of two aligned, corrected layers over the pixels of a cell (every second one in x and y)
    that both show unclipped, the share of these, the mean square of the channel that differs most, and the variance of
-   what each shows, a mean of its channels. */
+   what each shows and their covariance, means of the channels. */
 __kernel void seam_difference(__global const float4 *layer_a, __global const float4 *field_a, int4 box_a,
                               __global const float4 *gain_a, /* (colours.y, colours.x) */
                               __global const float4 *layer_b, __global const float4 *field_b, int4 box_b,
@@ -14,7 +14,7 @@ __kernel void seam_difference(__global const float4 *layer_a, __global const flo
                               float4 clipped_a, float4 clipped_b, /* brighter samples are not used */
                               __global float4 *difference, /* (part.w, part.z): r, g, b, share */
                               __global float *square,      /* (part.w, part.z) */
-                              __global float2 *variance)   /* the same: of a, of b */
+                              __global float4 *variance)   /* the same: of a, of b, their covariance, 0 */
 {
     const int column = get_global_id(0), row = get_global_id(1);
     if (column >= part.z || row >= part.w)
@@ -23,6 +23,7 @@ __kernel void seam_difference(__global const float4 *layer_a, __global const flo
     const int4 its = cell_pixels(cx, cy, border, cells);
     const int g = gain_index(cx, cy, cells, colours);
     float3 sum = (float3)(0.0f), squares = sum, sum_a = sum, sum_b = sum, squares_a = sum, squares_b = sum;
+    float3 products = sum;
     float n = 0.0f, tried = 0.0f;
     for (int y = its.y; y < its.w; y += 2)
         for (int x = its.x; x < its.z; x += 2) {
@@ -40,6 +41,7 @@ __kernel void seam_difference(__global const float4 *layer_a, __global const flo
             sum_b += look_b;
             squares_a += look_a * look_a;
             squares_b += look_b * look_b;
+            products += look_a * look_b;
             n += 1.0f;
         }
     const int at = row * part.z + column;
@@ -47,7 +49,8 @@ __kernel void seam_difference(__global const float4 *layer_a, __global const flo
     square[at] = n > 0.0f ? GREATEST(squares.x, GREATEST(squares.y, squares.z)) / n : 0.0f;
     const float count = GREATEST(n, 1.0f);
     const float3 spread_a = squares_a - sum_a * sum_a / count, spread_b = squares_b - sum_b * sum_b / count;
-    variance[at] = (float2)(spread_a.x + spread_a.y + spread_a.z, spread_b.x + spread_b.y + spread_b.z) / (3.0f * count);
+    const float3 common = products - sum_a * sum_b / count, each = 1.0f / (3.0f * count);
+    variance[at] = (float4)(dot(spread_a, each), dot(spread_b, each), dot(common, each), 0.0f);
 }
 
 /* The least weight that is told from none, about exp(-87). */

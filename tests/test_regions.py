@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from itertools import product
 
 import numpy as np
@@ -201,6 +202,31 @@ def test_texture_that_differs_joins_a_region_but_makes_none() -> None:
     assert len(found(Residuals(mean, rms, smooth_rms=mean), cells)) == 2
     for aligned in (True, False):  # between the arms, where texture tells
         assert seam.regions(Residuals(mean, rms), plane(480, 320), aligned)[8, 12] == aligned
+
+
+def test_what_is_unrelated_belongs_to_what_is_beside_it_but_not_far() -> None:
+    """It makes no region, takes none away that would be filled without it, and counts up to `_FAR` cells."""
+    cells = plane(480, 800).resized(60, 100)
+    mean, unrelated = np.zeros((100, 60)), np.zeros((100, 60), bool)
+    unrelated[10:, 10:50] = True
+    assert found(Residuals(mean, mean, unrelated=unrelated), cells) == []
+    mean[5:9, 20:24] = 0.14 + 1e-9
+    residual = Residuals(mean, mean / 0.65, unrelated=unrelated)
+    (alone,), (region,) = found(replace(residual, unrelated=None), cells), found(residual, cells)
+    assert np.argwhere(alone).min(0).tolist() == [4, 19] and np.argwhere(alone).max(0).tolist() == [9, 24]
+    assert (region >= alone).all() and region[10:40, 12:48].all() and not region[:, :9].any()
+    assert region[9 + regions._FAR].any() and not region[10 + regions._FAR :].any()
+
+
+def test_what_is_unrelated_links_what_is_strong() -> None:
+    """A head and a shoe, and between them trousers as bright as the paving."""
+    cells = plane(480, 320).resized(60, 40)
+    mean, unrelated = np.zeros((40, 60)), np.zeros((40, 60), bool)
+    mean[5, 5:8] = mean[20, 5:8] = 2.0
+    unrelated[7:19, 6] = True
+    assert found(Residuals(mean, mean), cells) == []
+    (region,) = found(Residuals(mean, mean, unrelated=unrelated), cells)
+    assert region[4:22, 5:8].all() and region.sum() == 18 * 3 + 2 * 6
 
 
 @pytest.mark.parametrize(("mean", "share", "count", "counts"), [

@@ -70,7 +70,7 @@ def test_difference_equals_its_twin(device: Device, name: str, shoulder: float, 
         gain = np.random.default_rng(9 + k).normal(size=(3, 5, 4)).astype(np.float32)
         sides += [pixels, field, box, gain]
     part, of_part = (2, 1, 7, 5), np.s_[1:6, 2:9]
-    out, square, variance = device.empty((5, 7, 4)), device.empty((5, 7)), device.empty((5, 7, 2))
+    out, square, variance = device.empty((5, 7, 4)), device.empty((5, 7)), device.empty((5, 7, 4))
     uploaded = [device.upload(one) if isinstance(one, np.ndarray) else one for one in sides]
     device.run(
         "seam", "seam_difference", part[2:], *uploaded, grid.border, grid.lonlat, colours, cells, part,
@@ -169,9 +169,9 @@ LAYERS = [SimpleNamespace(layer=SimpleNamespace(dtype=np.dtype(np.uint8)), white
 
 def test_a_cell_of_which_little_is_seen_tells_as_much_less(monkeypatch: pytest.MonkeyPatch) -> None:
     """Of those around; a cut through it crosses what is seen."""
-    found = np.zeros((9, 12, 7))
+    found = np.zeros((9, 12, 8))
     found[..., -1] = 1
-    found[4, 6] = 0.5, -0.6, 0.1, 0.4, 0, 0, 0.1
+    found[4, 6] = 0.5, -0.6, 0.1, 0.4, 0, 0, 0, 0.1
     found[4, 7] = 0
     monkeypatch.setattr(seam, "_differences", lambda *_: [(np.s_[0:9, 0:12], found)])
     residual = seam.residuals(None, LAYERS, [], [seam.Pair(0, 1)], None, plane(96, 72))
@@ -189,7 +189,7 @@ def test_a_cut_goes_through_a_gap_of_one_cell(monkeypatch: pytest.MonkeyPatch) -
     """Between somebody's head, which one layer shows whole, and his body, which it cuts off: also where the
     head is as bright as what is behind.
     """
-    found = np.zeros((14, 12, 7))
+    found = np.zeros((14, 12, 8))
     found[..., -1] = 1
     found[:7, 2:10, :3], found[:7, 2:10, 3] = 0.1, 0.02
     found[7, 2:10, :3], found[7, 2:10, 3] = 0.01, 0.001
@@ -206,7 +206,7 @@ def test_a_cut_goes_through_a_gap_of_one_cell(monkeypatch: pytest.MonkeyPatch) -
 
 def test_residuals_are_smoothed_across_the_border(monkeypatch: pytest.MonkeyPatch) -> None:
     """Of a canvas that wraps, by what is compared all along it; the same at each column."""
-    found = np.random.default_rng(4).random((9, 12, 7))
+    found = np.random.default_rng(4).random((9, 12, 8))
     means = []
     for wraps in (True, False):
         for shift in (0, 5):
@@ -220,7 +220,7 @@ def test_residuals_are_smoothed_across_the_border(monkeypatch: pytest.MonkeyPatc
 
 def test_a_cell_is_told_of_by_any_pair(monkeypatch: pytest.MonkeyPatch) -> None:
     """What is as bright as clipped pixels are is not compared, but without flow."""
-    found = np.zeros((2, 9, 12, 7))
+    found = np.zeros((2, 9, 12, 8))
     found[0, :, :5, -1], found[1, 3, 3:, -1] = 0.2, 1
     found[0, 3, 3, 3], found[1, 3, 3, 3], found[1, 3, 8, 3] = 0.09, 0.01, 0.04
     asked = []
@@ -235,23 +235,28 @@ def test_a_cell_is_told_of_by_any_pair(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.parametrize(
-    ("square", "variances", "unrelated"),
+    ("square", "variances", "covariance", "unrelated"),
     [
-        (0.01, (0.0095, 0.002), True),  # trousers before paving: neither tells anything of the other
-        (0.01, (0.002, 0.0095), True),
-        (0.01, (0.0055, 0.0055), False),  # paving that is not aligned
-        (0.01, (0.016, 0.004), False),  # partly alike
-        (0.003, (0.003, 0.0005), False),  # noise, hardly to be seen
+        (0.01, (0.0095, 0.002), 0.0005, True),  # trousers before paving: neither tells anything of the other
+        (0.01, (0.002, 0.0095), 0.0005, True),
+        (0.01, (0.0055, 0.0055), 0.0005, False),  # paving that is not aligned
+        (0.01, (0.016, 0.004), 0.005, False),  # partly alike
+        (0.01, (0.0117, 0.0017), 0.0017, False),  # the same paving, less sharp
+        (0.003, (0.003, 0.0005), 0.0, False),  # noise, hardly to be seen
     ],
 )
 def test_things_that_have_nothing_in_common_are_told(
-    monkeypatch: pytest.MonkeyPatch, square: float, variances: tuple[float, float], unrelated: bool
+    monkeypatch: pytest.MonkeyPatch,
+    square: float,
+    variances: tuple[float, float],
+    covariance: float,
+    unrelated: bool,
 ) -> None:
     """As bright as each other, by any pair; they join a region that differs, and make none."""
-    found = np.zeros((2, 19, 22, 7))
+    found = np.zeros((2, 19, 22, 8))
     found[..., -1] = 1
     found[0, 7:, 8:14, 3] = square
-    found[0, 7:, 8:14, 4:6] = variances
+    found[0, 7:, 8:14, 4:7] = *variances, covariance
     found[1, 2:6, 8:14, :3] = 0.5
     everywhere = [(np.s_[0:19, 0:22], one) for one in found]
     monkeypatch.setattr(seam, "_differences", lambda *_: iter(everywhere))
@@ -263,6 +268,29 @@ def test_things_that_have_nothing_in_common_are_told(
     assert whole[3:5, 9:13].all() and whole[10:, 9:13].all() == whole[12:].any() == unrelated
     monkeypatch.setattr(seam, "_differences", lambda *_: iter(everywhere[:1]))
     assert not seam.regions(seam.residuals(None, LAYERS, [], [seam.Pair(0, 1)], None, grid), grid).any()
+
+
+def test_few_cells_tell_of_sharpness_together_alone() -> None:
+    """Whether a photo is out of focus, or shaken, is told by cells that touch if they are many, else by all
+    such of both layers.
+    """
+    cells = plane(480, 320).resized(60, 40)
+
+    def unrelated(*slopes: tuple[int, float]) -> list[bool]:
+        """Of squares of so many cells whose smoother layer has so much in common with the other."""
+        found = np.zeros((40, 60, 8))
+        for k, (side, slope) in enumerate(slopes):
+            variances = 0.0095, 0.0015
+            square = sum(variances) - 2 * slope * variances[1]
+            found[2 : 2 + side, 10 * k : 10 * k + side] = 0, 0, 0, square, *variances, slope * variances[1], 1
+        told = seam._unrelated(found, cells)
+        squares = [told[2 : 2 + side, 10 * k : 10 * k + side] for k, (side, _) in enumerate(slopes)]
+        assert all(one.all() == one.any() for one in squares)
+        return [bool(one.any()) for one in squares]
+
+    assert unrelated((6, 0.1), (6, 0.9)) == [True, False]
+    assert unrelated((4, 0.1), (4, 0.9), (5, 0.2)) == [True] * 3
+    assert unrelated((3, 0.1), (4, 0.9), (5, 0.95), (6, 0.1)) == [False] * 3 + [True]
 
 
 # Yields

@@ -342,3 +342,14 @@ def test_half_is_read_as_float(device: Device) -> None:
     assert working.pixel_options(layer) == ("-DPIXEL=float -DSAMPLES=4", 1.0)
     assert working.device_rows(layer, 3, 9).dtype == np.float32
     assert np.array_equal(working.device_rows(layer, 3, 9), pixels[3:9].astype(np.float32))
+
+
+def test_parts_of_a_mask_meet_across_the_border_and_at_corners() -> None:
+    mask = np.zeros((5, 7), bool)
+    mask[0, 0] = mask[1, 6] = mask[3, 2] = mask[4, 3] = True
+    for wraps in (False, True):
+        number = working.connected(mask, wraps)
+        assert ((number > 0) == mask).all() and number[3, 2] == number[4, 3]
+        assert (number[0, 0] == number[1, 6]) == wraps and number[3, 2] != number[0, 0]
+    for shape in ((0, 7), (5, 0), (5, 7)):
+        assert not working.connected(np.zeros(shape, bool), True).any()

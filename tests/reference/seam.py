@@ -35,8 +35,8 @@ def seam_difference(
     clipped_b: Numbers,
 ) -> tuple[Array, Array, Array]:
     """Mean corrected difference a - b of every cell's pixels, every other one in x and y, with their share,
-    the largest channel's mean square, and the variance of a and of b, a mean of the channels'; samples
-    brighter than `clipped` of their layer are left out."""
+    the largest channel's mean square, and the variance of a, of b, their covariance, means of the channels',
+    and 0; samples brighter than `clipped` of their layer are left out."""
     looks = []
     usable = np.ones((border[1], border[0]), bool)
     sides = (layer_a, field_a, box_a, gain_a, clipped_a), (layer_b, field_b, box_b, gain_b, clipped_b)
@@ -44,13 +44,14 @@ def seam_difference(
         seen, look = layer_look(*side, border, lonlat, colours, cells, shoulder)
         usable &= (seen[..., 3] > 0) & (seen[..., :3] <= np.float32(clipped)[:3]).all(-1)
         looks.append(look)
-    result, square, variance = (np.zeros((cells[1], cells[0], *n)) for n in ((4,), (), (2,)))
+    result, square, variance = (np.zeros((cells[1], cells[0], *n)) for n in ((4,), (), (4,)))
     for place, part in cell_parts(border, cells, 2):
         values = (looks[0] - looks[1])[part][usable[part]]
         if len(values):
             result[place] = [*values.mean(0), len(values) / usable[part].size]
             square[place] = (values**2).mean(0).max()
-            variance[place] = [look[part][usable[part]].var(0).mean() for look in looks]
+            off = [look[part][usable[part]] - look[part][usable[part]].mean(0) for look in looks]
+            variance[place] = [*(one.var() for one in off), (off[0] * off[1]).mean(), 0]
     return result, square, variance
 
 
