@@ -32,6 +32,7 @@ from hugin_abflow.geometry import Pair, PairFlow
 from hugin_abflow.highlights import Clipped, PerLayer
 from hugin_abflow.opencl import Buffer, Device
 from hugin_abflow.regions import Cells, Residuals
+from hugin_abflow.scene import Scene
 from hugin_abflow.settings import Settings
 from hugin_abflow.working import Grid, WorkingLayer
 
@@ -75,22 +76,22 @@ def align(
     extra = highlights.reduce_weights(device, layers, fields, clipped, masks, grid)
     measured = colour.measure(device, layers, fields, pairs, grid, masks.host)
     device.give_back()  # two solutions at a time take the most memory
-    scene = _Scene(device, layers, pairs, fields, masks, grid, settings)
+    scene = Scene(device, layers, pairs, fields, masks, grid)
     with ThreadPoolExecutor(2, "gains") as threads:  # each on one core: the device goes on meanwhile
         gains = _Gains(threads, device, measured, settings)
         strict = gains.strict(None) if settings.seam else None
         # before it is known whether there are regions, which is rare
         early = gains.final(None) if settings.flow and single is None and settings.cores > 1 else None
         reaches = [geometry.reach(device, *one, grid) for one in zip(layers, fields, strict=True)]
-        regions = _find_regions(scene, gains, strict, single) if strict else None
+        regions = _find_regions(scene, gains, strict, single, settings) if strict else None
         if regions and not settings.flow:
-            seam.cut_unaligned(device, layers, fields, pairs, regions.correction, masks, grid)
+            seam.cut_unaligned(scene, regions.correction)
             # what is not aligned tells little of exposures; bands of frequencies change over as they are
             return Aligned(fields, reaches, gains.none().result(), None, None)
         if regions is None or regions.whole is None:
             return Aligned(fields, reaches, (early or gains.final(None)).result(), None, None)
         final = gains.final(regions.whole)
-        unlike = _cut(scene, regions, regions.whole, single, clipped, extra, reaches)
+        unlike = _cut(scene, regions, regions.whole, single, clipped, extra, reaches, settings)
         return Aligned(fields, reaches, final.result(), regions.whole, unlike)
 
 
@@ -116,19 +117,6 @@ def _fields(
     del coefficients
     device.give_back()
     return fields
-
-
-@dataclass(frozen=True)
-class _Scene:
-    """Layers, pairs of them that overlap, and their fields: what is corrected and cut."""
-
-    device: Device
-    layers: Sequence[WorkingLayer]
-    pairs: Sequence[Pair]
-    fields: list[Buffer]
-    masks: Masks
-    grid: Grid
-    settings: Settings
 
 
 @dataclass(frozen=True)
@@ -169,18 +157,19 @@ class _Regions:
     correction: Correction
 
 
-def _find_regions(scene: _Scene, gains: _Gains, first: Future[Correction], single: Cells | None) -> _Regions:
+def _find_regions(
+    scene: Scene, gains: _Gains, first: Future[Correction], single: Cells | None, settings: Settings
+) -> _Regions:
     """Regions, found in rounds, each after a correction that ignores those found before.
 
     first       the correction that ignores none.
     """
-    device, grid = scene.device, scene.grid
     whole: Cells | None = None
     for _ in range(_SEAM_ROUNDS):
         correction = (first if whole is None else gains.strict(whole)).result()
-        device.give_back()
-        residual = seam.residuals(device, scene.layers, scene.fields, scene.pairs, correction, grid)
-        found = seam.regions(residual, grid, aligned=scene.settings.flow, single=single)
+        scene.device.give_back()
+        residual = seam.residuals(scene, correction)
+        found = seam.regions(residual, scene.grid, aligned=settings.flow, single=single)
         grown = found if whole is None else found | whole
         if not grown.any() or (whole is not None and np.array_equal(grown, whole)):
             break
@@ -189,13 +178,14 @@ def _find_regions(scene: _Scene, gains: _Gains, first: Future[Correction], singl
 
 
 def _cut(
-    scene: _Scene,
+    scene: Scene,
     regions: _Regions,
     whole: Cells,
     single: Cells | None,
     clipped: Clipped,
     extra: PerLayer,
     reaches: list[list[float]],
+    settings: Settings,
 ) -> Unlike:
     """Take the regions `whole` from one layer each, smoothly displaced: fields change, and with them
     `reaches`.
@@ -203,13 +193,12 @@ def _cut(
     extra       of `highlights.reduce_weights`: there is none where one layer is taken.
     """
     device, layers, fields, masks, grid = scene.device, scene.layers, scene.fields, scene.masks, scene.grid
-    compared = (device, layers, fields, scene.pairs, regions.correction)
     cells = seam.seam_grid(grid)
-    clipping = seam.clipping_prices(*compared, clipped.excess, whole, grid)
+    price = seam.clipping_prices(scene, regions.correction, clipped.excess, whole)
     highlights.restore_weights(device, layers, fields, extra, whole, grid, cells)
     owner, gone = seam.cut(
-        device, layers, fields, regions.residual, whole, masks, grid, single, clipping,
-        choose=partial(clones.owners, *compared, grid, cells) if scene.settings.clones else None,
+        scene, regions.residual, whole, single, price,
+        choose=partial(clones.owners, scene, regions.correction, cells) if settings.clones else None,
     )  # fmt: skip
     moved = [*gone.values()] + ([] if single is None else [single])
     unlike = Unlike.of(cells, regions.residual.mean, whole, np.any(moved, 0) if moved else None)
@@ -220,5 +209,5 @@ def _cut(
     )
     for k in stretched:
         reaches[k] = geometry.reach(device, layers[k], fields[k], grid)
-    seam.clamp_displacements(device, layers, fields, owner, whole, grid, cells)
+    seam.clamp_displacements(scene, owner, whole)
     return unlike

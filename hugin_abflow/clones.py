@@ -19,7 +19,7 @@ that shows him once is better: what else the region has is taken from whichever 
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import lru_cache, partial
 
@@ -32,9 +32,9 @@ from hugin_abflow.chart import widest_gap
 from hugin_abflow.colour import Correction
 from hugin_abflow.geometry import Pair
 from hugin_abflow.layer import Box
-from hugin_abflow.opencl import Buffer, Device
 from hugin_abflow.regions import Cells, Choice, Gone, Prices, parts
-from hugin_abflow.working import Grid, WorkingLayer, cells_under, connected
+from hugin_abflow.scene import Scene
+from hugin_abflow.working import Grid, cells_under, connected
 
 # l: how unlike his two images may be, against how unlike he is to what is behind him.
 _UNLIKE = 3.0
@@ -94,26 +94,18 @@ class Clone:
 
 
 def owners(
-    device: Device,
-    layers: Sequence[WorkingLayer],
-    fields: Sequence[Buffer],
-    pairs: Sequence[Pair],
-    correction: Correction,
-    grid: Grid,
-    cells: Grid,
-    choice: Choice,
+    scene: Scene, correction: Correction, cells: Grid, choice: Choice
 ) -> tuple[npt.NDArray[np.intp], Gone]:
     """The layer of each cell, as `choice.owners`, but that nobody is there twice if it can be helped; and by
     layers the cells in which each showed somebody who is there no longer.
 
-    fields      of geometry.py.
-    cells       the seam grid, over the region of `grid`.
+    cells       the seam grid, over the region of the scene's.
     """
     owner, energy = choice.owners()
     differs, gone = choice.residual.mean, Gone()
-    look = lru_cache(_KEPT)(partial(_look, device, layers, fields, correction, grid, cells))
+    look = lru_cache(_KEPT)(partial(_look, scene, correction, cells))
     clones = list[Clone]()
-    for pair in pairs:
+    for pair in scene.pairs:
         both = choice.whole & choice.cover[pair.a] & choice.cover[pair.b]
         if np.count_nonzero(both & np.isin(owner, (pair.a, pair.b))) >= 2 * _LEAST:
             clones += find(pair, look(pair.a), look(pair.b), both, cells)
@@ -134,7 +126,7 @@ def owners(
             owner, energy, gone, choice = best
             _log.info(
                 "%s and %s show the same at two places; it is shown once",
-                layers[clone.a].layer.name, layers[clone.b].layer.name,
+                scene.layers[clone.a].layer.name, scene.layers[clone.b].layer.name,
             )  # fmt: skip
     return owner, gone
 
@@ -293,24 +285,16 @@ class _Search:
         return total / max(count, 1)
 
 
-def _look(
-    device: Device,
-    layers: Sequence[WorkingLayer],
-    fields: Sequence[Buffer],
-    correction: Correction,
-    grid: Grid,
-    cells: Grid,
-    k: int,
-) -> Look:
+def _look(scene: Scene, correction: Correction, cells: Grid, k: int) -> Look:
     """What layer k, aligned and corrected, shows in cells; nothing where its box does not reach."""
-    layer, colours = layers[k], correction.grid
+    device, grid, layer, colours = scene.device, scene.grid, scene.layers[k], correction.grid
     part = cells_under(Box.at(*layer.box), grid, cells)
     gain = correction.gains[k] or device.zeros((*colours.shape, 4))
     shown = device.empty((part.height, part.width, 4))
     device.run(
         "clones", "clones_look", (part.width, part.height),
-        layer.pixels, fields[k], layer.box, gain, grid.border, grid.lonlat, colours.border, cells.border,
-        part.place, correction.shoulder, shown,
+        layer.pixels, scene.fields[k], layer.box, gain, grid.border, grid.lonlat, colours.border,
+        cells.border, part.place, correction.shoulder, shown,
     )  # fmt: skip
     look = np.zeros((*cells.shape, 4), np.float32)
     look[part.slices] = shown.get()

@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -22,13 +23,14 @@ import numpy.typing as npt
 import scipy
 
 from hugin_abflow.cells import averaged, grown
-from hugin_abflow.coefficient import Masks, on_cells
+from hugin_abflow.coefficient import on_cells
 from hugin_abflow.colour import Correction, clipping
 from hugin_abflow.geometry import Pair
 from hugin_abflow.layer import Box
-from hugin_abflow.opencl import Buffer, Device
+from hugin_abflow.opencl import Buffer
 from hugin_abflow.regions import Cells, Choice, Gone, Prices, Residuals, completed, find
-from hugin_abflow.working import Grid, WorkingLayer, any_around, connected, shared_cells
+from hugin_abflow.scene import Scene
+from hugin_abflow.working import Grid, any_around, connected, shared_cells
 
 # Working pixels per cell of the seam grid.
 _CELL = 8
@@ -68,20 +70,13 @@ def seam_grid(grid: Grid) -> Grid:
     return grid.coarser(_CELL)
 
 
-def residuals(
-    device: Device,
-    layers: Sequence[WorkingLayer],
-    fields: Sequence[Buffer],
-    pairs: Sequence[Pair],
-    correction: Correction,
-    grid: Grid,
-) -> Residuals:
+def residuals(scene: Scene, correction: Correction) -> Residuals:
     """What flow and exposure do not explain."""
-    cells = seam_grid(grid)
+    cells = seam_grid(scene.grid)
     mean, square, smooth_square = (np.zeros(cells.shape) for _ in range(3))
     measured, unrelated = (np.zeros(cells.shape, bool) for _ in range(2))
-    clipped = [clipping(layer) for layer in layers]
-    for its, found in _differences(device, layers, fields, pairs, correction, grid, cells, clipped):
+    limits = [clipping(layer) for layer in scene.layers]
+    for its, found in _differences(scene, correction, cells, limits):
         share = found[_SHARE]
         smooth = _smooth(np.dstack([found[..., :-1] * share[..., None], share]), cells)
         smooth /= np.where(share > 0, smooth[_SHARE], np.inf)[..., None]
@@ -94,29 +89,22 @@ def residuals(
 
 
 def clipping_prices(
-    device: Device,
-    layers: Sequence[WorkingLayer],
-    fields: Sequence[Buffer],
-    pairs: Sequence[Pair],
-    correction: Correction,
-    clipped: npt.NDArray[np.float32],
-    whole: Cells,
-    grid: Grid,
+    scene: Scene, correction: Correction, excess: npt.NDArray[np.float32], whole: Cells
 ) -> Prices | None:
     """What it costs to take a cell of the regions `whole` from a layer that clips it where another one is as
     bright and not clipped; None: nothing anywhere.
 
-    clipped     how much each layer clips of what another one shows (`highlights.Clipped`).
+    excess      how much each layer clips of what another one shows, 0..1: (layers, height, width) on the
+                highlights grid (`highlights.Clipped`).
     """
-    cells = seam_grid(grid)
-    row, column = _centres(cells, clipped.shape)
-    clips = clipped[:, row[:, None], column] * whole
-    pairs = [pair for pair in pairs if clips[[pair.a, pair.b]].any()]
+    cells = seam_grid(scene.grid)
+    row, column = _centres(cells, excess.shape)
+    clips = excess[:, row[:, None], column] * whole
+    pairs = [pair for pair in scene.pairs if clips[[pair.a, pair.b]].any()]
     if not pairs:
         return None
-    as_bright = np.zeros((len(layers), *cells.shape), bool)
-    unclipped = [(math.inf,) * 4] * len(layers)  # all pixels count
-    differences = _differences(device, layers, fields, pairs, correction, grid, cells, unclipped)
+    as_bright = np.zeros((len(scene.layers), *cells.shape), bool)
+    differences = _differences(replace(scene, pairs=pairs), correction, cells)
     for pair, (its, found) in zip(pairs, differences, strict=True):
         brighter, both = found[_MEAN].mean(-1), found[_SHARE] > 0
         as_bright[pair.a][its] |= both & (brighter < _DARKER)
@@ -138,15 +126,11 @@ def regions(residual: Residuals, grid: Grid, aligned: bool = True, single: Cells
 
 
 def cut(
-    device: Device,
-    layers: Sequence[WorkingLayer],
-    fields: Sequence[Buffer],
+    scene: Scene,
     residual: Residuals,
     whole: Cells,
-    masks: Masks,
-    grid: Grid,
     single: Cells | None = None,
-    clipping: Prices | None = None,
+    clipping_price: Prices | None = None,
     choose: Callable[[Choice], tuple[npt.NDArray[np.intp], Gone]] | None = None,
 ) -> tuple[npt.NDArray[np.intp], Gone]:
     """Give each cell of the regions `whole` to one layer: the others lose their colour weight there
@@ -154,23 +138,23 @@ def cut(
 
     single      what single.py found: a region that has cells of it is cut in two only if that is much better,
                 others if it is clearly better.
-    clipping    what each layer costs in a cell besides (`clipping_prices`).
+    clipping_price    what each layer costs in a cell besides (`clipping_prices`).
     choose      the layers of a choice, and who is gone then; default: the least energy, and nobody.
 
     Returns the layer of each cell, (height, width) on the seam grid, elsewhere that which weighs most, -1
     where none covers it; and who is gone.
     """
-    cells = seam_grid(grid)
+    cells = seam_grid(scene.grid)
     factor = np.full(whole.shape, _WHOLE_FACTOR)
     if single is not None:
         factor = np.where(single, _SINGLE_FACTOR, _WHOLE_FACTOR)
-    choice = _choice(device, layers, fields, residual, whole, masks, grid, cells, _CUT, factor, clipping)
+    choice = _choice(scene, residual, whole, cells, _CUT, factor, clipping_price)
     owner, gone = choose(choice) if choose else (choice.owners()[0], Gone())
-    yields = [yielded(whole, owner, k, cells.wraps) for k in range(len(layers))]
+    yields = [yielded(whole, owner, k, cells.wraps) for k in range(len(scene.layers))]
     for k, at in gone.items():  # wholly: beside a border the softmax hardly knows another layer
         yields[k] = np.maximum(yields[k], grown(at, 1, cells.wraps) & (owner != k))
     same = averaged(grown(whole, 1, cells.wraps).astype(np.float32), cells.wraps)
-    _yield(device, layers, fields, yields, same, grid, cells)
+    _yield(scene, yields, same, cells)
     return owner, gone
 
 
@@ -183,78 +167,56 @@ def yielded(whole: Cells, owner: npt.NDArray[np.intp], k: int, wraps: bool) -> n
     return np.ascontiguousarray(averaged((others | beyond).astype(np.float32), wraps))
 
 
-def clamp_displacements(
-    device: Device,
-    layers: Sequence[WorkingLayer],
-    fields: Sequence[Buffer],
-    owner: npt.NDArray[np.intp],
-    whole: Cells,
-    grid: Grid,
-    cells: Grid,
-) -> None:
+def clamp_displacements(scene: Scene, owner: npt.NDArray[np.intp], whole: Cells) -> None:
     """Clamp displacements of what is taken from a layer (fields[...].xyz, in place) to what the layer shows:
     else another one would be seen along its border. owner, whole: of `cut`.
     """
-    for k, (layer, field) in enumerate(zip(layers, fields, strict=True)):
+    grid, cells = scene.grid, seam_grid(scene.grid)
+    for k, (layer, field) in enumerate(zip(scene.layers, scene.fields, strict=True)):
         its = whole & (owner == k)
         if its.any():  # of many layers nearly all
-            device.run(
+            scene.device.run(
                 "seam", "seam_clamp", layer.box[2:], layer.pixels, field, layer.box, grid.border, grid.lonlat,
-                device.upload(its.astype(np.uint8)), cells.border,
+                scene.device.upload(its.astype(np.uint8)), cells.border,
             )  # fmt: skip
 
 
-def cut_unaligned(
-    device: Device,
-    layers: Sequence[WorkingLayer],
-    fields: Sequence[Buffer],
-    pairs: Sequence[Pair],
-    correction: Correction,
-    masks: Masks,
-    grid: Grid,
-) -> None:
+def cut_unaligned(scene: Scene, correction: Correction) -> None:
     """Give each cell of every overlap of layers that are not aligned to one layer, as `cut` does."""
-    cells = grid.coarser(_FINE_CELL)
+    cells = scene.grid.coarser(_FINE_CELL)
     square = np.zeros(cells.shape)
-    unclipped = [(math.inf,) * 4] * len(layers)  # all pixels count
-    for its, found in _differences(device, layers, fields, pairs, correction, grid, cells, unclipped):
+    for its, found in _differences(scene, correction, cells):
         measured = found[_SHARE] > 0
         square[its] = np.maximum(square[its], np.where(measured, _SHORTER + found[_SQUARE], 0))
     whole = square > 0
-    choice = _choice(device, layers, fields, Residuals(square, square), whole, masks, grid, cells, _FINE_CUT)
-    owner, _ = choice.owners()
-    yields = [(whole & (owner != k)).astype(np.float32) for k in range(len(layers))]
-    _yield(device, layers, fields, yields, whole.astype(np.float32), grid, cells)
+    owner, _ = _choice(scene, Residuals(square, square), whole, cells, _FINE_CUT).owners()
+    yields = [(whole & (owner != k)).astype(np.float32) for k in range(len(scene.layers))]
+    _yield(scene, yields, whole.astype(np.float32), cells)
 
 
 def _choice(
-    device: Device,
-    layers: Sequence[WorkingLayer],
-    fields: Sequence[Buffer],
+    scene: Scene,
     residual: Residuals,
     whole: Cells,
-    masks: Masks,
-    grid: Grid,
     cells: Grid,
     cut_price: float,
     whole_factor: npt.NDArray[np.float64] | None = None,
-    clipping: Prices | None = None,
+    clipping_price: Prices | None = None,
 ) -> Choice:
     """The choice of the layer that each cell of the regions `whole` is taken from."""
-    cover = on_cells(masks.host, cells, np.logical_and)
-    shares = _weights(device, layers, fields, grid, cells)
+    cover = on_cells(scene.masks.host, cells, np.logical_and)
+    shares = _weights(scene, cells)
     shares /= np.maximum(shares.sum(0), 1e-12)
     residual = completed(residual, cover, cells.wraps)
-    return Choice(whole, residual, shares, cover, cells.wraps, cut_price, whole_factor, clipping)
+    return Choice(whole, residual, shares, cover, cells.wraps, cut_price, whole_factor, clipping_price)
 
 
-def _weights(
-    device: Device, layers: Sequence[WorkingLayer], fields: Sequence[Buffer], grid: Grid, cells: Grid
-) -> npt.NDArray[np.float64]:
+def _weights(scene: Scene, cells: Grid) -> npt.NDArray[np.float64]:
     """The layers' colour weights at the centres of cells, (layers, height, width)."""
-    rows, columns = (device.upload(one, np.int32) for one in _centres(cells, grid.shape))
-    weights = [device.empty(cells.shape) for _ in layers]
-    for layer, field, one in zip(layers, fields, weights, strict=True):
+    device = scene.device
+    rows, columns = (device.upload(one, np.int32) for one in _centres(cells, scene.grid.shape))
+    weights = [device.empty(cells.shape) for _ in scene.layers]
+    for layer, field, one in zip(scene.layers, scene.fields, weights, strict=True):
         device.run(
             "seam", "seam_weights", cells.border[:2], field, layer.box, rows, columns, cells.border, one
         )
@@ -262,19 +224,14 @@ def _weights(
 
 
 def _yield(
-    device: Device,
-    layers: Sequence[WorkingLayer],
-    fields: Sequence[Buffer],
-    yields: Sequence[npt.NDArray[np.float32]],
-    same: npt.NDArray[np.floating],
-    grid: Grid,
-    cells: Grid,
+    scene: Scene, yields: Sequence[npt.NDArray[np.float32]], same: npt.NDArray[np.floating], cells: Grid
 ) -> None:
     """Take the layers' colour weight away where they yield; where they are the `same`, 0..1, none weighs more
     than another one before.
     """
+    device, grid = scene.device, scene.grid
     anywhere, everywhere = same > 0, device.upload(same, np.float32)
-    for layer, field, one in zip(layers, fields, yields, strict=True):
+    for layer, field, one in zip(scene.layers, scene.fields, yields, strict=True):
         if any_around(anywhere, layer.box, grid, cells):  # of many layers few
             device.run(
                 "seam", "seam_yield", layer.box[2:],
@@ -283,18 +240,14 @@ def _yield(
 
 
 def _differences(
-    device: Device,
-    layers: Sequence[WorkingLayer],
-    fields: Sequence[Buffer],
-    pairs: Sequence[Pair],
-    correction: Correction,
-    grid: Grid,
-    cells: Grid,
-    clipped: Sequence[tuple[float, ...]],
+    scene: Scene, correction: Correction, cells: Grid, limits: Sequence[tuple[float, ...]] | None = None
 ) -> Iterator[tuple[tuple[slice, slice], npt.NDArray[np.float64]]]:
     """Of each two corrected layers, rows and columns of the cells that both may be in, and of these `_MEAN`
-    to `_SHARE`, (height, width, 8), of the pixels where neither is brighter than `clipped`.
+    to `_SHARE`, (height, width, 8), of the pixels that are not brighter than their layer's limits (r, g, b,
+    1); None: of all.
     """
+    device, layers, fields, grid = scene.device, scene.layers, scene.fields, scene.grid
+    limits = [(math.inf,) * 4] * len(layers) if limits is None else limits
     no_gain = device.zeros((*correction.grid.shape, 4))
 
     def start(pair: Pair) -> tuple[Box, Buffer, Buffer, Buffer]:
@@ -307,8 +260,8 @@ def _differences(
             sides += [layers[k].pixels, fields[k], layers[k].box, correction.gains[k] or no_gain]
         device.run(
             "seam", "seam_difference", (part.width, part.height), *sides, grid.border, grid.lonlat,
-            correction.grid.border, cells.border, part.place, correction.shoulder, clipped[pair.a],
-            clipped[pair.b], difference, square, variance,
+            correction.grid.border, cells.border, part.place, correction.shoulder, limits[pair.a],
+            limits[pair.b], difference, square, variance,
         )  # fmt: skip
         return part, difference, square, variance
 
@@ -319,10 +272,10 @@ def _differences(
         found = np.dstack([mean[..., :3], square.get(), variance.get()[..., :3], mean[..., 3]])
         return part.slices, found.astype(np.float64)
 
-    if not pairs:
+    if not scene.pairs:
         return
-    started = start(pairs[0])
-    for pair in pairs[1:]:
+    started = start(scene.pairs[0])
+    for pair in scene.pairs[1:]:
         found = fetch(*started)
         started = start(pair)  # the device goes on while the caller looks at what is found
         device.flush()

@@ -18,6 +18,7 @@ from hugin_abflow.geometry import Pair
 from hugin_abflow.layer import Canvas
 from hugin_abflow.opencl import Device
 from hugin_abflow.regions import Choice, Residuals
+from hugin_abflow.scene import Scene
 from hugin_abflow.working import Grid
 
 HEIGHT, WIDTH = 24, 60
@@ -181,7 +182,9 @@ def chosen(
     asked: list[int] = []
     monkeypatch.setattr(clones, "_look", lambda *given: asked.append(given[-1]) or (a, b)[given[-1]])
     layers = [SimpleNamespace(layer=SimpleNamespace(name=name)) for name in ("left.tif", "right.tif")]
-    found, gone = clones.owners(None, layers, [], [Pair(0, 1)], None, None, grid_of("plane"), choice)
+    found, gone = clones.owners(
+        Scene(None, layers, [Pair(0, 1)], [], None, None), None, grid_of("plane"), choice
+    )
     assert all((found[at] != k).all() for k, at in gone.items())
     return found, choice.owners()[0], asked
 

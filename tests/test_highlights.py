@@ -19,6 +19,7 @@ from hugin_abflow.geometry import Pair
 from hugin_abflow.layer import Canvas, Layer
 from hugin_abflow.opencl import Buffer, Device
 from hugin_abflow.regions import Residuals
+from hugin_abflow.scene import Scene
 from hugin_abflow.settings import Settings
 
 __all__ = ["one_device"]
@@ -289,23 +290,23 @@ def test_what_flow_cannot_explain_is_not_taken_from_the_photo_that_clips_it(
         gains.append(device.upload(values))
     correction = Correction(highlights.highlights_grid(grid), 0.0, tuple(gains))
     clipped = highlights.measure(device, layers, masks, grid, Settings()).excess
-    given = device, layers, fields, [Pair(0, 1)], correction
+    given = Scene(device, layers, [Pair(0, 1)], fields, masks, grid), correction
     everywhere = np.ones(cells.shape, bool)
-    prices = seam.clipping_prices(*given, clipped, everywhere, grid)
+    prices = seam.clipping_prices(*given, clipped, everywhere)
     assert not prices[0].any()  # grey is never clipped
     assert (prices[1, 4:, 3:5] == (seam._CLIPPED if light > 1 else 0)).all()
     assert not prices[1, :, 7:].any()  # alone
-    assert seam.clipping_prices(*given, 0 * clipped, everywhere, grid) is None
+    assert seam.clipping_prices(*given, 0 * clipped, everywhere) is None
     whole = np.zeros(cells.shape, bool)
     whole[3:, 2:6] = True  # columns 15 to 46, below the white corner
-    there = seam.clipping_prices(*given, clipped, whole, grid)
+    there = seam.clipping_prices(*given, clipped, whole)
     assert np.array_equal(there, prices * whole) and there.any() == (light > 1)
     whole[:] = np.arange(cells.width) >= 9  # alone
-    assert seam.clipping_prices(*given, clipped, whole, grid) is None
+    assert seam.clipping_prices(*given, clipped, whole) is None
     whole[:] = False
     whole[3:, 2:6] = True
     residual = Residuals(np.full(cells.shape, 0.3), np.zeros(cells.shape))
-    seam.cut(device, layers, fields, residual, whole, masks, grid, clipping=prices)
+    seam.cut(given[0], residual, whole, clipping_price=prices)
     # both cover all of it, and a cut beside the border of the white one is more than a cell away
     grey, white = (field.get()[38:48, 32:38, 3] for field in fields)
     assert (grey > 10 * white).all() if light > 1 else (grey < 1e-3 * white).all()
@@ -325,6 +326,7 @@ def test_what_is_cut_out_of_a_layer_that_gave_way_is_that_layers(device: Device)
     prices = np.zeros((3, *cells.shape))
     prices[[0, 2]] = 5
     highlights.restore_weights(device, layers, fields, extra, whole, grid, seam.seam_grid(grid))
-    seam.cut(device, layers, fields, residual, whole, masks, grid, clipping=prices)
+    scene = Scene(device, layers, [], fields, masks, grid)
+    seam.cut(scene, residual, whole, clipping_price=prices)
     grey, white, _ = (field.get()[38:48, 34, 3] for field in fields)
     assert (white > 100 * grey).all()

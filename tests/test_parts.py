@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from itertools import combinations
 
 import numpy as np
@@ -17,6 +18,7 @@ from hugin_abflow.gains import Difference, Measured, solve
 from hugin_abflow.geometry import Pair
 from hugin_abflow.layer import Box
 from hugin_abflow.opencl import Device
+from hugin_abflow.scene import Scene
 from hugin_abflow.settings import Settings
 from hugin_abflow.working import cells_under
 
@@ -92,15 +94,16 @@ def test_cells_beside_are_as_if_compared(device: Device, name: str, monkeypatch:
         of_all = [difference.mixing.shape == measured.grid.shape for difference in measured.differences]
         assert all(of_all) == everything
         correction = colour.correction(device, measured, Settings())
-        residual = seam.residuals(device, layers, fields, pairs, correction, grid)
+        masks = Masks(grid, tuple(device.upload(mask, np.uint8) for mask in covered), covered)
+        scene = Scene(device, layers, pairs, fields, masks, grid)
+        residual = seam.residuals(scene, correction)
         excess = np.ones((len(layers), *grid.shape), np.float32)
         everywhere = np.ones(seam.seam_grid(grid).shape, bool)
-        lost = seam.clipping_prices(device, layers, fields, pairs, correction, excess, everywhere, grid)
+        lost = seam.clipping_prices(scene, correction, excess, everywhere)
         gains = [gain.get() for gain in correction.gains]
         results.append([*gains, residual.mean, residual.rms, residual.smooth_rms, residual.measured, lost])
         cut = [device.copy(field) for field in fields]
-        masks = Masks(grid, tuple(device.upload(mask, np.uint8) for mask in covered), covered)
-        seam.cut_unaligned(device, layers, cut, pairs, correction, masks, grid)
+        seam.cut_unaligned(replace(scene, fields=cut), correction)
         results[-1] += [field.get() for field in cut]
     for few, every in zip(*results, strict=True):
         assert np.array_equal(few, every)

@@ -17,6 +17,7 @@ from hugin_abflow import colour, saturation, seam
 from hugin_abflow.geometry import Pair
 from hugin_abflow.layer import Canvas, Layer
 from hugin_abflow.opencl import Device
+from hugin_abflow.scene import Scene
 from hugin_abflow.working import WorkingLayer
 
 __all__ = ["one_device"]
@@ -209,7 +210,7 @@ def test_each_layer_is_compared_up_to_its_own_white(device: Device, clipped: int
     assert (np.sign(found.beyond[..., 3]) == {0: 1, 1: -1, None: 0}[clipped]).all()
     assert (overlap.misfit().max() > 0) == (clipped is None)
     none = colour.Correction(cells, 1.0, (None, None))
-    residual = seam.residuals(device, layers, still, [Pair(0, 1)], none, grid)
+    residual = seam.residuals(Scene(device, layers, [Pair(0, 1)], still, None, grid), none)
     assert residual.measured.all() == (clipped is None) == residual.measured.any()
 
 

@@ -16,8 +16,11 @@ from tolerances import POSITION, SUM, assert_close
 from hugin_abflow import seam
 from hugin_abflow.cells import averaged
 from hugin_abflow.coefficient import on_cells
+from hugin_abflow.geometry import Pair
 from hugin_abflow.opencl import Device
 from hugin_abflow.regions import Residuals
+from hugin_abflow.scene import Scene
+from hugin_abflow.working import Grid
 
 WRAPS = [False, True]
 
@@ -157,7 +160,7 @@ def test_weights_equal_their_twin(device: Device, place: tuple[int, int, int, in
     field = np.random.default_rng(4).random((place[3], place[2], 4)).astype(np.float32)
     rows, columns = seam._centres(cells, grid.shape)
     layers = [SimpleNamespace(box=place)]
-    found = seam._weights(device, layers, [device.upload(field)], grid, cells)
+    found = seam._weights(Scene(device, layers, [], [device.upload(field)], None, grid), cells)
     assert found.shape == (1, 7, 13) and 0 < (found > 0).mean() <= 1
     assert np.array_equal(found[0], seam_weights(field, place, rows, columns))
 
@@ -167,6 +170,11 @@ def test_weights_equal_their_twin(device: Device, place: tuple[int, int, int, in
 LAYERS = [SimpleNamespace(layer=SimpleNamespace(dtype=np.dtype(np.uint8)), white=(1.0, 1.0, 1.0))] * 2
 
 
+def scene_of(grid: Grid, pairs: list[Pair]) -> Scene:
+    """Two layers whose differences are given."""
+    return Scene(None, LAYERS, pairs, [], None, grid)
+
+
 def test_a_cell_of_which_little_is_seen_tells_as_much_less(monkeypatch: pytest.MonkeyPatch) -> None:
     """Of those around; a cut through it crosses what is seen."""
     found = np.zeros((9, 12, 8))
@@ -174,7 +182,7 @@ def test_a_cell_of_which_little_is_seen_tells_as_much_less(monkeypatch: pytest.M
     found[4, 6] = 0.5, -0.6, 0.1, 0.4, 0, 0, 0, 0.1
     found[4, 7] = 0
     monkeypatch.setattr(seam, "_differences", lambda *_: [(np.s_[0:9, 0:12], found)])
-    residual = seam.residuals(None, LAYERS, [], [seam.Pair(0, 1)], None, plane(96, 72))
+    residual = seam.residuals(scene_of(plane(96, 72), [Pair(0, 1)]), None)
     y, x = np.mgrid[0:9, 0:12]
     weight = np.exp(-0.5 * ((y - 4) ** 2 + (x - 6) ** 2)) * found[..., -1]
     assert np.isclose(residual.mean[4, 6], 0.6 * 0.1 / weight.sum(), rtol=0.01)
@@ -195,7 +203,7 @@ def test_a_cut_goes_through_a_gap_of_one_cell(monkeypatch: pytest.MonkeyPatch) -
     found[7, 2:10, :3], found[7, 2:10, 3] = 0.01, 0.001
     found[8:, 2:10, :3], found[8:, 2:10, 3] = 0.5, 0.3
     monkeypatch.setattr(seam, "_differences", lambda *_: [(np.s_[0:14, 0:12], found)])
-    residual = seam.residuals(None, LAYERS, [], [seam.Pair(0, 1)], None, plane(96, 112))
+    residual = seam.residuals(scene_of(plane(96, 112), [Pair(0, 1)]), None)
     cover = np.ones((2, 16, 12), bool)
     cover[0, 14:] = cover[1, 0] = False
     rows, columns = np.nonzero(np.ones((14, 12)))
@@ -212,7 +220,7 @@ def test_residuals_are_smoothed_across_the_border(monkeypatch: pytest.MonkeyPatc
         for shift in (0, 5):
             turned = np.roll(found, shift, 1)
             monkeypatch.setattr(seam, "_differences", lambda *_, its=turned: [(np.s_[0:9, 0:12], its)])
-            residual = seam.residuals(None, LAYERS, [], [seam.Pair(0, 1)], None, plane(96, 72, wraps))
+            residual = seam.residuals(scene_of(plane(96, 72, wraps), [Pair(0, 1)]), None)
             means.append(np.roll(residual.mean, -shift, 1))
     assert np.array_equal(means[0], means[1])
     assert not np.array_equal(means[2], means[3]) and not np.array_equal(means[0], means[2])
@@ -226,7 +234,7 @@ def test_a_cell_is_told_of_by_any_pair(monkeypatch: pytest.MonkeyPatch) -> None:
     asked = []
     everywhere = [(np.s_[0:9, 0:12], one) for one in found]
     monkeypatch.setattr(seam, "_differences", lambda *given: asked.append(given[-1]) or iter(everywhere))
-    residual = seam.residuals(None, LAYERS, [], [seam.Pair(0, 1)] * 2, None, plane(96, 72))
+    residual = seam.residuals(scene_of(plane(96, 72), [Pair(0, 1)] * 2), None)
     assert np.array_equal(residual.measured, (found[..., -1] > 0).any(0)) and asked == [
         [(0.98, 0.98, 0.98, 1.0)] * 2
     ]
@@ -261,13 +269,13 @@ def test_things_that_have_nothing_in_common_are_told(
     everywhere = [(np.s_[0:19, 0:22], one) for one in found]
     monkeypatch.setattr(seam, "_differences", lambda *_: iter(everywhere))
     grid = plane(176, 152)
-    residual = seam.residuals(None, LAYERS, [], [seam.Pair(0, 1)] * 2, None, grid)
+    residual = seam.residuals(scene_of(grid, [Pair(0, 1)] * 2), None)
     assert residual.unrelated is not None and residual.unrelated[9:, 9:13].all() == unrelated
     assert residual.unrelated.any() == unrelated and not residual.unrelated[:5].any()
     whole = seam.regions(residual, grid)
     assert whole[3:5, 9:13].all() and whole[10:, 9:13].all() == whole[12:].any() == unrelated
     monkeypatch.setattr(seam, "_differences", lambda *_: iter(everywhere[:1]))
-    assert not seam.regions(seam.residuals(None, LAYERS, [], [seam.Pair(0, 1)], None, grid), grid).any()
+    assert not seam.regions(seam.residuals(scene_of(grid, [Pair(0, 1)]), None), grid).any()
 
 
 def test_few_cells_tell_of_sharpness_together_alone() -> None:
@@ -340,7 +348,8 @@ def test_a_cut_is_where_it_was_chosen(device: Device, weight: float) -> None:
     layers = [SimpleNamespace(box=(0, 0, 184, 104))] * 2
     masks = SimpleNamespace(host=np.ones((2, 104, 184), bool))
     nothing = Residuals(np.zeros(shape), np.zeros(shape))
-    seam.cut(device, layers, fields, nothing, whole, masks, grid, choose=lambda _: (owner, {}))
+    scene = Scene(device, layers, [], fields, masks, grid)
+    seam.cut(scene, nothing, whole, choose=lambda _: (owner, {}))
     first, second = (field.get()[..., 3].astype(np.float64) for field in fields)
     share = first / (first + second)
     assert (share[20:56, 20:75] < 0.05).all() and (share[20:84, 85:132] > 0.95).all()

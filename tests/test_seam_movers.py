@@ -15,6 +15,7 @@ from hugin_abflow.colour import Correction
 from hugin_abflow.geometry import Pair
 from hugin_abflow.opencl import Device
 from hugin_abflow.regions import Residuals
+from hugin_abflow.scene import Scene
 
 WRAPS = [False, True]
 
@@ -147,10 +148,12 @@ def owners(device: Device, told: np.ndarray, residual: np.ndarray, turn: int = 0
     )
     fields = [np.stack([0 * s] * 3 + [s], -1).repeat(8, 0).repeat(8, 1) for s in (1 - share, share)]
     choice = seam._choice(
-        device, [SimpleNamespace(box=(0, 0, 240, 96))] * 2,
-        [device.upload(field, np.float32) for field in fields],
-        Residuals(residual, residual, told), region, SimpleNamespace(host=covers), grid,
-        seam.seam_grid(grid), seam._CUT, seam._SINGLE_FACTOR * region,
+        Scene(
+            device, [SimpleNamespace(box=(0, 0, 240, 96))] * 2, [],
+            [device.upload(field, np.float32) for field in fields], SimpleNamespace(host=covers), grid,
+        ),
+        Residuals(residual, residual, told), region, seam.seam_grid(grid), seam._CUT,
+        seam._SINGLE_FACTOR * region,
     )  # fmt: skip
     return np.roll(choice.owners()[0], -turn, 1)
 
@@ -176,13 +179,13 @@ def test_a_region_comes_from_one_layer_and_an_overlap_from_both(
         fields.append(device.upload(field))
     masks = coefficient.masks(device, layers, grid)
     correction = Correction(grid.resized(4, 4), 1.0, (None, None))
-    pairs = [Pair(0, 1)]
+    scene = Scene(device, layers, [Pair(0, 1)], fields, masks, grid)
     if flow:
-        residual = seam.residuals(device, layers, fields, pairs, correction, grid)
+        residual = seam.residuals(scene, correction)
         whole = seam.regions(residual, grid) | np.pad(np.ones((8, 20), bool), ((2, 2), (5, 5)))
-        seam.cut(device, layers, fields, residual, whole, masks, grid)
+        seam.cut(scene, residual, whole)
     else:
-        seam.cut_unaligned(device, layers, fields, pairs, correction, masks, grid)
+        seam.cut_unaligned(scene, correction)
     inside = [field.get()[24:72, 56:184, 3] for field in fields]
     first = inside[0] > inside[1]
     assert first.all() or not first.any() if flow else 0.2 < first.mean() < 0.8
@@ -208,10 +211,9 @@ def test_one_layer_may_cost_more_where_something_moved(
     fields = [device.upload(np.stack([0 * s] * 3 + [s], -1), np.float32) for s in (share, 1 - share)]
     residual = np.where(region, 0.3, 0.0)
     residual[:, 14:16] = 0
-    found, _ = seam.cut(
-        device, [SimpleNamespace(box=(0, 0, 240, 96))] * 2, fields, Residuals(residual, residual), region,
-        SimpleNamespace(host=np.ones((2, 12, 30), bool)), grid, once,
-    )  # fmt: skip
+    masks = SimpleNamespace(host=np.ones((2, 12, 30), bool))
+    scene = Scene(device, [SimpleNamespace(box=(0, 0, 240, 96))] * 2, [], fields, masks, grid)
+    found, _ = seam.cut(scene, Residuals(residual, residual), region, once)
     assert len(seen) == 1
     assert (len(np.unique(found[region])) == 2) == cut
 
