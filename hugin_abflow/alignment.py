@@ -108,8 +108,8 @@ def _fields(
     least_strain = transition.wanted(flows, settings)
     coefficients = coefficient.coefficients(device, layers, masks, grid, even=least_strain)
     if least_strain:
-        unlike = clipped.excess.max(0)
-        transition.minimise_strain(device, layers, coefficients, flows, masks, grid, settings, unlike)
+        uneven = clipped.excess.max(0)
+        transition.minimise_strain(device, layers, coefficients, flows, masks, grid, settings, uneven)
     intermediate.replace_flows(device, layers, coefficients, flows, grid, settings)
     fields = geometry.fields(device, layers, coefficients, flows, grid, settings)
     if settings.flow and settings.intermediate:  # else nothing is displaced, or as published

@@ -1,5 +1,5 @@
-"""Cells of a grid on the host, and a pair's flow at those of its chart: for what is taken from one photo,
-whole (single.py, seam.py).
+"""Cells on the host: those of a chart, with a pair's flow, for what is taken from one photo, whole
+(single.py); and what seams, regions and others do with cells of any grid.
 """
 
 from __future__ import annotations
@@ -22,7 +22,8 @@ Places = npt.NDArray[np.float64]  # (n, 2): x right, y down, px of the chart; a 
 # Cells of a chart, (height, width), by the number of the thing that they show; 0: none.
 Things = npt.NDArray[np.int32]
 
-# Chart pixels per cell; a cell has the flow at its centre.
+# Chart pixels per cell; a cell has the flow at pixel CELL // 2 of it, whose centre is half a pixel right of
+# and below the cell's.
 CELL = 4
 # Cells by which what is found is grown: flow is smooth across outlines.
 GROWN = 3
@@ -150,7 +151,9 @@ class CellFlow:
 
 
 def at_centres(values: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
-    """What pixels have, (height, width, ...), at cells' centres."""
+    """What pixels have, (height, width, ...), at cells' centres; cells cut short by the border count if they
+    have that pixel.
+    """
     return values[CELL // 2 :: CELL, CELL // 2 :: CELL]
 
 
@@ -177,7 +180,7 @@ def ends_within(
 
 
 def grown(mask: Mask, by: int, wraps: bool) -> Mask:
-    """With as many cells around."""
+    """With as many cells around, across a wrapped border, but not across poles."""
     modes = "constant", "wrap" if wraps else "constant"
     found: Mask = scipy.ndimage.maximum_filter(mask, 2 * by + 1, mode=modes)
     return found

@@ -37,7 +37,7 @@ from hugin_abflow.scene import Scene
 from hugin_abflow.working import Grid, cells_under, connected
 
 # l: how unlike his two images may be, against how unlike he is to what is behind him.
-_UNLIKE = 3.0
+_CONTRAST = 3.0
 # Squared difference, summed over r, g, b, from which on two cells show different things.
 _DIFFERS = 0.02
 # Cells between his places, at least, and at most across and down; people keep to the ground.
@@ -227,7 +227,7 @@ class _Search:
         both = self._open[here] & self._open[there]  # a few cells of thousands
         off = (self._off[here][both] + self._off[there][both]) / 2
         gain = np.zeros(both.shape, np.float32)
-        gain[both] = off - _UNLIKE * _apart(self._a[here][both], self._b[there][both])
+        gain[both] = off - _CONTRAST * _apart(self._a[here][both], self._b[there][both])
         mean = cv2.blur(gain, (3, 3), borderType=cv2.BORDER_CONSTANT)
         return np.where(gain > 0, np.maximum(mean, 0), 0), here, there
 

@@ -80,6 +80,7 @@ def find(
     found = [np.zeros(one.flow.shown.shape, bool) for one in matches]
     for candidate in refused:
         finest = candidate.finest(chart.width, chart.height)
+        # a search is as exact as half a pixel of the level that it was made on
         gap = CONSISTENT * max(1.0, 2.0 ** (candidate.level - 1))
         matches += [_Matches.of(chart, finest, views, index, gap, refused=True) for index in (0, 1)]
     for one in matches:

@@ -199,7 +199,8 @@ def parts(mask: Cells, wraps: bool) -> list[Cells]:
 
 def completed(residual: Residuals, cover: npt.NDArray[np.bool_], wraps: bool) -> Residuals:
     """With the nearest cell's residual in cells without a measured one, from a layer's border on: flow leads
-    away from there, so that a cut would cost nothing, and leave half of somebody.
+    away from there, so that a cut would cost nothing, and leave half of somebody. What else residuals tell,
+    by which regions are found, is left out.
 
     cover       (layers, height, width): the cells that each of them covers.
     """

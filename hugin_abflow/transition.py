@@ -91,12 +91,12 @@ def minimise_strain(
     masks: Masks,
     grid: Grid,
     settings: Settings,
-    unlike: Values,
+    uneven: Values,
 ) -> None:
     """Make coefficients those of least strain, in place; see `wanted`. What they were where several layers
     overlap does not count.
 
-    unlike      where layers cannot be brought to one brightness, 0..1: (height, width) on any coarse grid
+    uneven      where layers cannot be brought to one brightness, 0..1: (height, width) on any coarse grid
                 over the same region.
     """
     grids = [grid.coarser(pixels) for pixels in _CELLS]
@@ -106,7 +106,7 @@ def minimise_strain(
     for cells, cover in zip(grids, covers, strict=True):
         finer = Shares.equal(device, cells, cover)
         east, south = links(_means(price, cells), cover.max(0), cells)
-        well = wells(cells, grid, settings.transition_strain, unlike)
+        well = wells(cells, grid, settings.transition_strain, uneven)
         system = tuple(device.upload(one) for one in (east, south, well))
         if shares is None:
             relax(device, finer, system, 0.0, _FIRST_SWEEPS)
@@ -211,12 +211,12 @@ def links(price: npt.NDArray[np.float64], union: Mask, cells: Grid) -> tuple[Val
     return result[0], result[1]
 
 
-def wells(cells: Grid, grid: Grid, strain: float, unlike: Values) -> Values:
-    """(2 strain)^2 times the area of each cell, in squared working px, (height, width); 0 where layers are
-    unlike.
+def wells(cells: Grid, grid: Grid, strain: float, uneven: Values) -> Values:
+    """(2 strain)^2 times the area of each cell, in squared working px, (height, width); less where layers are
+    uneven, 0..1: (height, width) on any grid over the same region.
     """
     area = grid.width / cells.width * grid.height / cells.height * _narrowing(cells)
-    alike = 1 - _means(unlike, cells)
+    alike = 1 - _means(uneven, cells)
     prices: Values = ((2 * strain) ** 2 * area[:, None] * alike).astype(np.float32)
     return prices
 

@@ -85,7 +85,7 @@ static inline blend_samples blend_correct(blend_samples c, blend_correction by, 
     return v < 0.0f && c >= 0.0f ? (blend_samples)(0.0f) : v;
 }
 
-/* atan2 of positive x; a few terms of the series do where angles are small, as they nearly always are. */
+/* atan2: a few terms of the series do where x is positive and the angle small, as it nearly always is. */
 static inline blend_real blend_angles(blend_real y, blend_real x) {
     const blend_real t = y / x, t2 = t * t;
     const blend_int small = x > 0.0f && t2 < 0.01f;

@@ -12,12 +12,12 @@
 /* How surely layers show the same at a place of a grid, 0..1. d: how one of them differs from the mean of all, of
    which `rest` is the others' share. */
 static inline float content_same(float3 d, float3 mean, float rest, float2 place, __global const float *moved,
-                                 __global const float *unlike, int4 cells, float shoulder) {
+                                 __global const float *other, int4 cells, float shoulder) {
     const float3 own = mean + d, others = own - d / GREATEST(rest, CONTENT_LITTLE);
     const float dark = (darker_channel(own, others) - CONTENT_BLACK) / (CONTENT_SEEN - CONTENT_BLACK);
     const float seen = shoulder > 0.0f ? LIMITED(dark, 0.0f, 1.0f) : 1.0f;
-    const float other = seen * bilinear_scalar(unlike, place, cells);
-    return 1.0f - GREATEST(other, bilinear_scalar(moved, place, cells));
+    const float surely = seen * bilinear_scalar(other, place, cells);
+    return 1.0f - GREATEST(surely, bilinear_scalar(moved, place, cells));
 }
 
 /* Sums for a fit, over the pixels of a cell: with d = (1 - share) e the difference of a layer from the mean of all, of
@@ -27,7 +27,7 @@ __kernel void content_gather(__global const float4 *difference,  /* (box.w, box.
                              int4 box, int4 grid,                /* place; its grid */
                              __global const float4 *mean,        /* (grid.y, grid.x): colour, valid */
                              __global const float *moved,        /* (cells.y, cells.x), 0..1 */
-                             __global const float *unlike,       /* the same, of what is not too dark to tell */
+                             __global const float *other,        /* the same, of what is not too dark to tell */
                              int4 cells,                         /* run size; over the same region */
                              float shoulder,                     /* of the exposure scale */
                              __global float4 *sums)              /* (cells.y, cells.x): r, g, b, weight */
@@ -45,7 +45,7 @@ __kernel void content_gather(__global const float4 *difference,  /* (box.w, box.
             const float3 d = difference[at].xyz, m = mean[y * grid.x + x].xyz;
             const float2 place = grid_place(x, y, grid, cells);
             const float rest = 1.0f - share[at];
-            const float w = rest * content_same(d, m, rest, place, moved, unlike, cells, shoulder);
+            const float w = rest * content_same(d, m, rest, place, moved, other, cells, shoulder);
             sum += w * (float4)(d, rest);
         }
     const int n = (its.z - its.x) * (its.w - its.y);
@@ -55,7 +55,7 @@ __kernel void content_gather(__global const float4 *difference,  /* (box.w, box.
 /* In place of a difference where layers show different things, that which the cells tell: e of the fit. */
 __kernel void content_complete(__global float4 *difference, __global const float *share, /* (box.w, box.z) */
                                int4 box, int4 grid, /* place, run size; its grid */
-                               __global const float4 *mean, __global const float *moved, __global const float *unlike,
+                               __global const float4 *mean, __global const float *moved, __global const float *other,
                                __global const float4 *expected, /* (cells.y, cells.x): e, unused */
                                int4 cells, float shoulder)
 {
@@ -65,7 +65,7 @@ __kernel void content_complete(__global float4 *difference, __global const float
     const float2 place = grid_place(x + box.x, y + box.y, grid, cells);
     const float3 d = difference[at].xyz, m = mean[(y + box.y) * grid.x + x + box.x].xyz;
     const float rest = 1.0f - share[at];
-    const float same = content_same(d, m, rest, place, moved, unlike, cells, shoulder);
+    const float same = content_same(d, m, rest, place, moved, other, cells, shoulder);
     if (same == 1.0f)
         return;
     const float4 e = bilinear_colour(expected, place, cells);

@@ -358,6 +358,38 @@ def test_a_cut_is_where_it_was_chosen(device: Device, weight: float) -> None:
     assert (first[60:, :60] > 0).all() and (second[60:, :60] == 0).all()
 
 
+def test_who_is_gone_is_wholly_gone(device: Device) -> None:
+    """A cell beyond him as well, where another layer is taken; what only gives way has a rest there."""
+    grid = plane(184, 104)
+    shape = seam.seam_grid(grid).shape
+    whole, owner = np.zeros(shape, bool), np.ones(shape, int)
+    whole[3:9, 4:12] = True
+    gone = np.zeros(shape, bool)
+    gone[3:9, 4:7] = True
+    fields = [device.upload(np.ones((104, 184, 4), np.float32)) for _ in range(2)]
+    layers = [SimpleNamespace(box=(0, 0, 184, 104))] * 2
+    nothing = Residuals(np.zeros(shape), np.zeros(shape))
+    scene = Scene(device, layers, [], fields, SimpleNamespace(host=np.ones((2, 104, 184), bool)), grid)
+    seam.cut(scene, nothing, whole, choose=lambda _: (owner, {0: gone}))
+    first, second = (field.get()[..., 3] for field in fields)
+    assert (second == 1).all()
+    rows, beside, beyond = slice(40, 56), slice(26, 30), slice(98, 102)  # centres of cells at each side
+    assert (first[rows, beside] < 1e-3).all() and (first[rows, beyond] > 5e-3).all()
+
+
+def test_no_cell_comes_from_a_layer_that_covers_a_part_of_it(device: Device) -> None:
+    grid = plane(184, 104)
+    cells = seam.seam_grid(grid)
+    masks = np.ones((2, 104, 184), bool)
+    masks[0, 50, 90] = False
+    fields = [device.upload(np.ones((104, 184, 4), np.float32))] * 2
+    layers = [SimpleNamespace(box=(0, 0, 184, 104))] * 2
+    scene = Scene(device, layers, [], fields, SimpleNamespace(host=masks), grid)
+    nothing = Residuals(np.zeros(cells.shape), np.zeros(cells.shape))
+    choice = seam._choice(scene, nothing, np.ones(cells.shape, bool), cells, 1.0)
+    assert np.argwhere(~choice.cover).tolist() == [[0, 50 // 8, 90 // 8]]
+
+
 def test_cells_that_a_layer_covers_whole() -> None:
     covered = np.ones((2, 53, 77), bool)
     covered[0, 12, 20] = covered[1, 52, 76] = False

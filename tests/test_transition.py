@@ -206,13 +206,13 @@ def test_links_of_a_sphere_are_those_of_its_surface() -> None:
 
 
 def test_wells_are_as_large_as_their_cells() -> None:
-    """On a plane all alike, on a sphere less towards the poles, and none where layers are unlike."""
-    unlike = np.zeros((2, 4), np.float32)
-    unlike[1, 2] = 1
-    flat = transition.wells(plane(8, 4), plane(80, 40), 0.5, unlike)
+    """On a plane all alike, on a sphere less towards the poles, and none where layers are uneven."""
+    uneven = np.zeros((2, 4), np.float32)
+    uneven[1, 2] = 1
+    flat = transition.wells(plane(8, 4), plane(80, 40), 0.5, uneven)
     assert flat[:2] == pytest.approx(100) and flat[2:, :4] == pytest.approx(100)
     assert not flat[2:, 4:6].any() and flat[2:, 6:] == pytest.approx(100)
-    coarse = transition.wells(plane(2, 1), plane(80, 40), 0.5, unlike)  # of all cells below, in equal parts
+    coarse = transition.wells(plane(2, 1), plane(80, 40), 0.5, uneven)  # of all cells below, in equal parts
     assert coarse[0] == pytest.approx([1600, 1600 * 3 / 4])
     curved = transition.wells(sphere(40, 20), sphere(400, 200), 0.5, np.zeros((1, 1), np.float32))
     latitudes = math.pi / 2 - (np.arange(20) + 0.5) * math.pi / 20
@@ -269,10 +269,10 @@ def scene(device: Device, grid: Grid, covers: Sequence[np.ndarray], shift: np.nd
 
 
 def minimised(
-    device: Device, grid: Grid, made: Scene, settings: Settings | None = None, unlike: float = 0.0
+    device: Device, grid: Grid, made: Scene, settings: Settings | None = None, uneven: float = 0.0
 ) -> list[np.ndarray]:
     layers, coefficients, flows, masks = made
-    everywhere = np.full(highlights.highlights_grid(grid).shape, unlike, np.float32)
+    everywhere = np.full(highlights.highlights_grid(grid).shape, uneven, np.float32)
     transition.minimise_strain(
         device, layers, coefficients, flows, masks, grid, settings or Settings(), everywhere
     )
@@ -313,7 +313,7 @@ def test_a_transition_takes_the_overlap_if_that_is_narrow(device: Device, flow: 
 def test_layers_that_are_not_alike_change_over_across_the_overlap(device: Device) -> None:
     made = scene(device, WIDE, left_and_right(WIDE, 20), np.full(WIDE.shape, 1.0))
     before = made[1][1].get()
-    assert minimised(device, WIDE, made, unlike=1.0)[1] == pytest.approx(before, abs=0.03)
+    assert minimised(device, WIDE, made, uneven=1.0)[1] == pytest.approx(before, abs=0.03)
 
 
 def test_a_near_thing_within_the_overlap_is_one_photo_s(device: Device) -> None:

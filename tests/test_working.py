@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from grids import plane
 from reference.working import working_compare, working_reduce
 from tolerances import SUM, assert_close
 
@@ -353,3 +354,17 @@ def test_parts_of_a_mask_meet_across_the_border_and_at_corners() -> None:
         assert (number[0, 0] == number[1, 6]) == wraps and number[3, 2] != number[0, 0]
     for shape in ((0, 7), (5, 0), (5, 7)):
         assert not working.connected(np.zeros(shape, bool), True).any()
+
+
+@pytest.mark.parametrize("wraps", [False, True])
+def test_what_lies_beside_a_place_is_around_it(wraps: bool) -> None:
+    """A cell farther than what it reaches into, in rows and columns, across a wrapped border as well."""
+    grid = plane(80, 40, wraps)
+    for row, column, seen in (
+        (9, 0, True), (9, 4, True), (9, 5, False), (9, 19, wraps), (9, 18, False),
+        (7, 2, True), (6, 2, False),
+    ):  # fmt: skip
+        mask = np.zeros((10, 20), bool)
+        mask[row, column] = True
+        assert working.any_around(mask, (0, 32, 13, 8), grid, grid.coarser(4)) == seen
+        assert not working.any_around(mask, (0, 0, 13, 20), grid, grid.coarser(4))
