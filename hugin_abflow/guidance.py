@@ -182,32 +182,29 @@ def contradict(
     flows: Flows,
     guides: ChartGuides,
     times: int,
-    parameters: GuidanceParameters | None = None,
 ) -> bool:
     """Whether guides of a pair say something else than its flows, a to b and back, as `lead` sees it.
 
     chart       of both, `times` as fine as that on which guides lead.
     """
-    agreement = (parameters or GuidanceParameters()).agreement
-    return bool(_wrong(_directed(chart.border, flows, guides), times * agreement).any())
+    agreement = times * GuidanceParameters().agreement
+    return bool(_wrong(_directed(chart.border, flows, guides), agreement).any())
 
 
 def held(
     images: tuple[Level, Level],
     flows: tuple[Buffer, Buffer],
     guides: ChartGuides,
-    parameters: GuidanceParameters | None = None,
 ) -> tuple[Values, Values]:
     """The guides that both images show and both flows agree with: their places and moves, (n, 4) px, from a
     to b and back.
     """
-    agreement = (parameters or GuidanceParameters()).agreement
     directed = _directed(images[0].grid, (flows[0].get(), flows[1].get()), guides)
     agree = np.ones(len(guides), bool)
     for image, its in zip(images, directed, strict=True):
         inside, (row, column) = pixels_at(its.places, image.grid)
         agree &= inside & (image.mask.get()[row * inside, column * inside] > 0)
-        agree &= np.linalg.norm(its.residuals, axis=1) <= agreement
+        agree &= np.linalg.norm(its.residuals, axis=1) <= GuidanceParameters().agreement
     there, back = (np.hstack([its.places, its.moves])[agree] for its in directed)
     return there, back
 

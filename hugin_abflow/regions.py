@@ -123,6 +123,18 @@ class Choice:
         candidates = np.flatnonzero(self.cover[:, rows, columns].any(1))
         if candidates.size < 2:
             return np.full(rows.size, candidates[0] if candidates.size else 0), 0.0
+        plain = wanted = self._graph(rows, columns, candidates)
+        if unwanted is not None:
+            wanted = replace(plain, price=plain.price + unwanted[candidates][:, rows, columns])
+        labels = least(wanted)
+        if self.whole_factor is not None:
+            labels = _alone(wanted, labels, self.whole_factor[rows, columns].max())
+        return candidates[labels], _energy(plain, labels)
+
+    def _graph(
+        self, rows: npt.NDArray[np.intp], columns: npt.NDArray[np.intp], candidates: npt.NDArray[np.intp]
+    ) -> Graph:
+        """The energy of a region's cells, taken from the layers `candidates`."""
         weight, rough = self.residual.mean[rows, columns], self.residual.rms[rows, columns]
         present = self.cover[candidates][:, rows, columns]
         price = np.where(present, weight * (1 - self.shares[candidates][:, rows, columns]), _FORBIDDEN)
@@ -141,18 +153,18 @@ class Choice:
                 links.append(np.stack([linked, number[there][linked]]))
         first, second = np.concatenate(links, 1)
         cuts = self.cut_price * (rough[first] + rough[second]) / 2
-        plain = Graph(rows, columns, price, present, first, second, cuts)
-        wanted = plain
-        if unwanted is not None:
-            wanted = replace(plain, price=price + unwanted[candidates][:, rows, columns])
-        labels = least(wanted)
-        if self.whole_factor is not None:
-            factor = self.whole_factor[rows, columns].max()
-            alone = [np.where(one, k, labels) for k, one in enumerate(present) if one.mean() > _MOSTLY]
-            energies = [_energy(wanted, one) for one in (labels, *alone)]
-            if alone and min(energies[1:]) <= factor * energies[0]:
-                labels = alone[int(np.argmin(energies[1:]))]
-        return candidates[labels], _energy(plain, labels)
+        return Graph(rows, columns, price, present, first, second, cuts)
+
+
+def _alone(graph: Graph, labels: Labels, factor: float) -> Labels:
+    """The labels that take all cells from one layer, as far as it goes, which has most of them, if that costs
+    no more than `factor` times as much as `labels`; else these.
+    """
+    alone = [np.where(one, k, labels) for k, one in enumerate(graph.possible) if one.mean() > _MOSTLY]
+    least_found, *energies = (_energy(graph, one) for one in (labels, *alone))
+    if alone and min(energies) <= factor * least_found:
+        return alone[int(np.argmin(energies))]
+    return labels
 
 
 def find(residual: Residuals, cells: Grid, single: Cells) -> list[Cells]:
