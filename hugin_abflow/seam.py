@@ -45,9 +45,9 @@ _FINE_CUT = 120.0
 # Layers show unrelated things: what they differ by in all frequencies, at least, its square's share of the
 # sum of their variances (1 of what has nothing in common), and how many times one's is the other's (1 of one
 # texture that is not aligned); and how much of the smoother one, in all such cells that touch, may be in the
-# other as well (1 of what is the same and less sharp: photos of which one was out of focus, or shaken), of
-# which less than so many do not tell by themselves, but all such together.
-_UNRELATED, _OF_VARIANCES, _VARIANCE_RATIO, _RELATED, _ENOUGH = 0.06, 0.7, 1.5, 0.7, 32
+# other as well (1 of what is the same and less sharp: photos of which one was out of focus, or shaken). So
+# many cells tell that by themselves, fewer as all such of both layers do.
+_UNRELATED, _OF_VARIANCES, _VARIANCE_RATIO, _RELATED, _ENOUGH = 0.06, 0.7, 1.5, 0.7, 64
 # Residual of layers that agree, without flow: of two cuts that nobody sees the shorter one is taken.
 _SHORTER = 0.005
 # Price of a cell that is clipped, and is not in another layer, as of a residual that nothing favours; and by
@@ -59,9 +59,10 @@ _TRACE = 1e-12
 # things once and whole: of what single.py found, and of any other.
 _SINGLE_FACTOR, _WHOLE_FACTOR = 2.0, 1.65
 # Of what `_differences` finds of a cell: the mean of the layers' difference in r, g, b, the largest mean
-# square of these, each layer's variance, their covariance, and the share of the cell that tells.
-_MEAN, _SQUARE, _VARIANCES, _COVARIANCE, _SHARE = (
-    np.s_[..., :3], np.s_[..., 3], np.s_[..., 4:6], np.s_[..., 6], np.s_[..., 7],
+# square of these, each layer's variance, those of blocks, in which noise is less, and their covariance, and
+# the share of the cell that tells.
+_MEAN, _SQUARE, _VARIANCES, _COARSE, _COVARIANCE, _SHARE = (
+    np.s_[..., :3], np.s_[..., 3], np.s_[..., 4:6], np.s_[..., 6:8], np.s_[..., 8], np.s_[..., 9],
 )  # fmt: skip
 
 
@@ -243,7 +244,7 @@ def _differences(
     scene: Scene, correction: Correction, cells: Grid, limits: Sequence[tuple[float, ...]] | None = None
 ) -> Iterator[tuple[tuple[slice, slice], npt.NDArray[np.float64]]]:
     """Of each two corrected layers, rows and columns of the cells that both may be in, and of these `_MEAN`
-    to `_SHARE`, (height, width, 8), of the pixels that are not brighter than their layer's limits (r, g, b,
+    to `_SHARE`, (height, width, 10), of the pixels that are not brighter than their layer's limits (r, g, b,
     1); None: of all.
     """
     device, layers, fields, grid = scene.device, scene.layers, scene.fields, scene.grid
@@ -254,22 +255,22 @@ def _differences(
         part = shared_cells(layers[pair.a], layers[pair.b], grid, cells)
         difference = device.empty((part.height, part.width, 4))
         square = device.empty((part.height, part.width))
-        variance = device.empty((part.height, part.width, 4))
+        texture = device.empty((part.height, part.width, 8))
         sides: list[Any] = []
         for k in (pair.a, pair.b):
             sides += [layers[k].pixels, fields[k], layers[k].box, correction.gains[k] or no_gain]
         device.run(
             "seam", "seam_difference", (part.width, part.height), *sides, grid.border, grid.lonlat,
             correction.grid.border, cells.border, part.place, correction.shoulder, limits[pair.a],
-            limits[pair.b], difference, square, variance,
+            limits[pair.b], difference, square, texture,
         )  # fmt: skip
-        return part, difference, square, variance
+        return part, difference, square, texture
 
     def fetch(
-        part: Box, difference: Buffer, square: Buffer, variance: Buffer
+        part: Box, difference: Buffer, square: Buffer, texture: Buffer
     ) -> tuple[tuple[slice, slice], npt.NDArray[np.float64]]:
         mean = difference.get()
-        found = np.dstack([mean[..., :3], square.get(), variance.get()[..., :3], mean[..., 3]])
+        found = np.dstack([mean[..., :3], square.get(), texture.get()[..., :5], mean[..., 3]])
         return part.slices, found.astype(np.float64)
 
     if not scene.pairs:
@@ -290,12 +291,14 @@ def _unrelated(found: npt.NDArray[np.float64], cells: Grid) -> Cells:
     square, variances = found[_SQUARE], found[_VARIANCES]
     apart = (square > _UNRELATED**2) & (square > _OF_VARIANCES * variances.sum(-1))
     apart &= variances.max(-1) > _VARIANCE_RATIO * variances.min(-1)
+    smoother = np.take_along_axis(found[_COARSE], variances.argmin(-1)[..., None], -1)[..., 0]
     number = connected(apart, cells.wraps and apart.shape[1] == cells.width)
-    number[apart & (np.bincount(number.flat) < _ENOUGH)[number]] = 0  # all of them together
-    common, smoother = (
-        np.bincount(number.flat, (apart * one).flat) for one in (found[_COVARIANCE], variances.min(-1))
+    common, own, count = (
+        np.bincount(number.flat, (apart * one).flat) for one in (found[_COVARIANCE], smoother, 1.0)
     )
-    unrelated: Cells = apart & (common <= _RELATED * smoother)[number]
+    few = count < _ENOUGH
+    common[few], own[few] = common.sum(), own.sum()
+    unrelated: Cells = apart & (common <= _RELATED * own)[number]
     return unrelated
 
 

@@ -53,7 +53,7 @@ class SearchParameters:
     gap: float = 2.0  # px of a level between start and return from which on flow is not consistent
     always: bool = False  # keep what is found, whatever becomes of it
     # px from which flow is taken over, in turns, per level as for `radius`: short on finer levels, where the
-    # rails of a chair in the sample room took over what fits them by chance (benchmarks/RESULTS.md, Parts)
+    # rails of a chair in the sample room took over what fits them by chance (benchmarks/HISTORY.md, Parts)
     steps: tuple[tuple[int, ...], ...] = ((6, 3, 1), (6, 3, 1), (16, 8, 4, 2, 1))
     refined_steps: tuple[int, ...] = (12, 6, 3, 1)  # where flow is refined, and thin things are wider
     refined_patience: float = 0.2  # likewise; with less, outlines of what moves far get ragged

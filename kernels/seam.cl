@@ -1,8 +1,9 @@
 /* Where one layer is taken whole. */
 
 /* Mean difference a - b of two aligned, corrected layers over the pixels of a cell (every second one in x and y)
-   that both show unclipped, the share of these, the mean square of the channel that differs most, and the variance of
-   what each shows and their covariance, means of the channels. */
+   that both show unclipped, the share of these, the mean square of the channel that differs most, and what tells of
+   their textures, means of the channels: the variance of what each shows; and of the means of blocks of up to four
+   such pixels, in which noise is less, the variances and their covariance. */
 __kernel void seam_difference(__global const float4 *layer_a, __global const float4 *field_a, int4 box_a,
                               __global const float4 *gain_a, /* (colours.y, colours.x) */
                               __global const float4 *layer_b, __global const float4 *field_b, int4 box_b,
@@ -14,7 +15,7 @@ __kernel void seam_difference(__global const float4 *layer_a, __global const flo
                               float4 clipped_a, float4 clipped_b, /* brighter samples are not used */
                               __global float4 *difference, /* (part.w, part.z): r, g, b, share */
                               __global float *square,      /* (part.w, part.z) */
-                              __global float4 *variance)   /* the same: of a, of b, their covariance, 0 */
+                              __global float8 *texture)    /* the same: variances, of blocks, their covariance, 0 */
 {
     const int column = get_global_id(0), row = get_global_id(1);
     if (column >= part.z || row >= part.w)
@@ -23,34 +24,54 @@ __kernel void seam_difference(__global const float4 *layer_a, __global const flo
     const int4 its = cell_pixels(cx, cy, border, cells);
     const int g = gain_index(cx, cy, cells, colours);
     float3 sum = (float3)(0.0f), squares = sum, sum_a = sum, sum_b = sum, squares_a = sum, squares_b = sum;
-    float3 products = sum;
-    float n = 0.0f, tried = 0.0f;
-    for (int y = its.y; y < its.w; y += 2)
-        for (int x = its.x; x < its.z; x += 2) {
-            tried += 1.0f;
-            float4 a, b;
-            const int2 p = (int2)(x, y);
-            if (!layer_pair(layer_a, field_a, box_a, layer_b, field_b, box_b, p, border, lonlat, &a, &b) ||
-                any(a.xyz > clipped_a.xyz) || any(b.xyz > clipped_b.xyz))
+    float3 mean_a = sum, mean_b = sum, means_a = sum, means_b = sum, products = sum;
+    float n = 0.0f, tried = 0.0f, blocks = 0.0f;
+    for (int top = its.y; top < its.w; top += 4)
+        for (int left = its.x; left < its.z; left += 4) {
+            float3 block_a = (float3)(0.0f), block_b = block_a;
+            float count = 0.0f;
+            for (int y = top; y < top + 4 && y < its.w; y += 2)
+                for (int x = left; x < left + 4 && x < its.z; x += 2) {
+                    tried += 1.0f;
+                    float4 a, b;
+                    const int2 p = (int2)(x, y);
+                    if (!layer_pair(layer_a, field_a, box_a, layer_b, field_b, box_b, p, border, lonlat, &a, &b) ||
+                        any(a.xyz > clipped_a.xyz) || any(b.xyz > clipped_b.xyz))
+                        continue;
+                    const float3 look_a = exposure_look(a.xyz, gain_a[g].xyz, shoulder);
+                    const float3 look_b = exposure_look(b.xyz, gain_b[g].xyz, shoulder), d = look_a - look_b;
+                    sum += d;
+                    squares += d * d;
+                    block_a += look_a;
+                    block_b += look_b;
+                    squares_a += look_a * look_a;
+                    squares_b += look_b * look_b;
+                    count += 1.0f;
+                }
+            if (count == 0.0f)
                 continue;
-            const float3 look_a = exposure_look(a.xyz, gain_a[g].xyz, shoulder);
-            const float3 look_b = exposure_look(b.xyz, gain_b[g].xyz, shoulder), d = look_a - look_b;
-            sum += d;
-            squares += d * d;
-            sum_a += look_a;
-            sum_b += look_b;
-            squares_a += look_a * look_a;
-            squares_b += look_b * look_b;
-            products += look_a * look_b;
-            n += 1.0f;
+            sum_a += block_a;
+            sum_b += block_b;
+            n += count;
+            block_a /= count;
+            block_b /= count;
+            mean_a += block_a;
+            mean_b += block_b;
+            means_a += block_a * block_a;
+            means_b += block_b * block_b;
+            products += block_a * block_b;
+            blocks += 1.0f;
         }
     const int at = row * part.z + column;
     difference[at] = n > 0.0f ? (float4)(sum / n, n / tried) : (float4)(0.0f);
     square[at] = n > 0.0f ? GREATEST(squares.x, GREATEST(squares.y, squares.z)) / n : 0.0f;
-    const float count = GREATEST(n, 1.0f);
+    const float count = GREATEST(n, 1.0f), some = GREATEST(blocks, 1.0f);
     const float3 spread_a = squares_a - sum_a * sum_a / count, spread_b = squares_b - sum_b * sum_b / count;
-    const float3 common = products - sum_a * sum_b / count, each = 1.0f / (3.0f * count);
-    variance[at] = (float4)(dot(spread_a, each), dot(spread_b, each), dot(common, each), 0.0f);
+    const float3 coarse_a = means_a - mean_a * mean_a / some, coarse_b = means_b - mean_b * mean_b / some;
+    const float3 common = products - mean_a * mean_b / some;
+    const float3 each = 1.0f / (3.0f * count), of_blocks = 1.0f / (3.0f * some);
+    texture[at] = (float8)(dot(spread_a, each), dot(spread_b, each), dot(coarse_a, of_blocks), dot(coarse_b, of_blocks),
+                           dot(common, of_blocks), 0.0f, 0.0f, 0.0f);
 }
 
 /* The least weight that is told from none, about exp(-87). */

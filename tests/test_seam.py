@@ -73,13 +73,13 @@ def test_difference_equals_its_twin(device: Device, name: str, shoulder: float, 
         gain = np.random.default_rng(9 + k).normal(size=(3, 5, 4)).astype(np.float32)
         sides += [pixels, field, box, gain]
     part, of_part = (2, 1, 7, 5), np.s_[1:6, 2:9]
-    out, square, variance = device.empty((5, 7, 4)), device.empty((5, 7)), device.empty((5, 7, 4))
+    out, square, texture = device.empty((5, 7, 4)), device.empty((5, 7)), device.empty((5, 7, 8))
     uploaded = [device.upload(one) if isinstance(one, np.ndarray) else one for one in sides]
     device.run(
         "seam", "seam_difference", part[2:], *uploaded, grid.border, grid.lonlat, colours, cells, part,
-        shoulder, *clipped, out, square, variance,
+        shoulder, *clipped, out, square, texture,
     )  # fmt: skip
-    expected, squares, variances = seam_difference(
+    expected, squares, textures = seam_difference(
         *sides, grid.border, grid.lonlat, colours, cells, shoulder, *clipped
     )
     assert (expected[..., 3] > 0).mean() > 0.4
@@ -87,7 +87,8 @@ def test_difference_equals_its_twin(device: Device, name: str, shoulder: float, 
     # a pixel more or less at a mask's rim is one of some ten of a cell
     assert_close(out.get(), expected[of_part], 10 * POSITION, decisions=0.05)
     assert_close(square.get(), squares[of_part], 10 * POSITION, decisions=0.05)
-    assert_close(variance.get(), variances[of_part], 10 * POSITION, decisions=0.05)
+    assert_close(texture.get(), textures[of_part], 10 * POSITION, decisions=0.05)
+    assert (textures[..., 2:4] < 0.7 * textures[..., :2]).mean() > 0.3
 
 
 @pytest.mark.parametrize("name", list(GRIDS))
@@ -177,9 +178,9 @@ def scene_of(grid: Grid, pairs: list[Pair]) -> Scene:
 
 def test_a_cell_of_which_little_is_seen_tells_as_much_less(monkeypatch: pytest.MonkeyPatch) -> None:
     """Of those around; a cut through it crosses what is seen."""
-    found = np.zeros((9, 12, 8))
+    found = np.zeros((9, 12, 10))
     found[..., -1] = 1
-    found[4, 6] = 0.5, -0.6, 0.1, 0.4, 0, 0, 0, 0.1
+    found[4, 6] = 0.5, -0.6, 0.1, 0.4, 0, 0, 0, 0, 0, 0.1
     found[4, 7] = 0
     monkeypatch.setattr(seam, "_differences", lambda *_: [(np.s_[0:9, 0:12], found)])
     residual = seam.residuals(scene_of(plane(96, 72), [Pair(0, 1)]), None)
@@ -197,7 +198,7 @@ def test_a_cut_goes_through_a_gap_of_one_cell(monkeypatch: pytest.MonkeyPatch) -
     """Between somebody's head, which one layer shows whole, and his body, which it cuts off: also where the
     head is as bright as what is behind.
     """
-    found = np.zeros((14, 12, 8))
+    found = np.zeros((14, 12, 10))
     found[..., -1] = 1
     found[:7, 2:10, :3], found[:7, 2:10, 3] = 0.1, 0.02
     found[7, 2:10, :3], found[7, 2:10, 3] = 0.01, 0.001
@@ -214,7 +215,7 @@ def test_a_cut_goes_through_a_gap_of_one_cell(monkeypatch: pytest.MonkeyPatch) -
 
 def test_residuals_are_smoothed_across_the_border(monkeypatch: pytest.MonkeyPatch) -> None:
     """Of a canvas that wraps, by what is compared all along it; the same at each column."""
-    found = np.random.default_rng(4).random((9, 12, 8))
+    found = np.random.default_rng(4).random((9, 12, 10))
     means = []
     for wraps in (True, False):
         for shift in (0, 5):
@@ -228,7 +229,7 @@ def test_residuals_are_smoothed_across_the_border(monkeypatch: pytest.MonkeyPatc
 
 def test_a_cell_is_told_of_by_any_pair(monkeypatch: pytest.MonkeyPatch) -> None:
     """What is as bright as clipped pixels are is not compared, but without flow."""
-    found = np.zeros((2, 9, 12, 8))
+    found = np.zeros((2, 9, 12, 10))
     found[0, :, :5, -1], found[1, 3, 3:, -1] = 0.2, 1
     found[0, 3, 3, 3], found[1, 3, 3, 3], found[1, 3, 8, 3] = 0.09, 0.01, 0.04
     asked = []
@@ -261,10 +262,10 @@ def test_things_that_have_nothing_in_common_are_told(
     unrelated: bool,
 ) -> None:
     """As bright as each other, by any pair; they join a region that differs, and make none."""
-    found = np.zeros((2, 19, 22, 8))
+    found = np.zeros((2, 19, 22, 10))
     found[..., -1] = 1
     found[0, 7:, 8:14, 3] = square
-    found[0, 7:, 8:14, 4:7] = *variances, covariance
+    found[0, 7:, 8:14, 4:9] = *variances, *variances, covariance
     found[1, 2:6, 8:14, :3] = 0.5
     everywhere = [(np.s_[0:19, 0:22], one) for one in found]
     monkeypatch.setattr(seam, "_differences", lambda *_: iter(everywhere))
@@ -278,7 +279,7 @@ def test_things_that_have_nothing_in_common_are_told(
     assert not seam.regions(seam.residuals(scene_of(grid, [Pair(0, 1)]), None), grid).any()
 
 
-def test_few_cells_tell_of_sharpness_together_alone() -> None:
+def test_few_cells_tell_of_sharpness_as_all_do() -> None:
     """Whether a photo is out of focus, or shaken, is told by cells that touch if they are many, else by all
     such of both layers.
     """
@@ -286,19 +287,22 @@ def test_few_cells_tell_of_sharpness_together_alone() -> None:
 
     def unrelated(*slopes: tuple[int, float]) -> list[bool]:
         """Of squares of so many cells whose smoother layer has so much in common with the other."""
-        found = np.zeros((40, 60, 8))
+        found = np.zeros((40, 60, 10))
         for k, (side, slope) in enumerate(slopes):
-            variances = 0.0095, 0.0015
+            variances, coarse = (0.0095, 0.0015), (0.005, 0.001)
             square = sum(variances) - 2 * slope * variances[1]
-            found[2 : 2 + side, 10 * k : 10 * k + side] = 0, 0, 0, square, *variances, slope * variances[1], 1
+            found[2 : 2 + side, 12 * k : 12 * k + side] = (
+                0, 0, 0, square, *variances, *coarse, slope * coarse[1], 1,
+            )  # fmt: skip
         told = seam._unrelated(found, cells)
-        squares = [told[2 : 2 + side, 10 * k : 10 * k + side] for k, (side, _) in enumerate(slopes)]
+        squares = [told[2 : 2 + side, 12 * k : 12 * k + side] for k, (side, _) in enumerate(slopes)]
         assert all(one.all() == one.any() for one in squares)
         return [bool(one.any()) for one in squares]
 
-    assert unrelated((6, 0.1), (6, 0.9)) == [True, False]
-    assert unrelated((4, 0.1), (4, 0.9), (5, 0.2)) == [True] * 3
-    assert unrelated((3, 0.1), (4, 0.9), (5, 0.95), (6, 0.1)) == [False] * 3 + [True]
+    assert unrelated((8, 0.1), (8, 0.9)) == [True, False]
+    assert unrelated((7, 0.1), (7, 0.9), (6, 0.2)) == [True] * 3
+    assert unrelated((3, 0.1), (7, 0.9), (7, 0.95)) == [False] * 3
+    assert unrelated((3, 0.9), (8, 0.1), (8, 0.8)) == [True, True, False]
 
 
 # Yields

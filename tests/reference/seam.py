@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 
@@ -35,8 +35,9 @@ def seam_difference(
     clipped_b: Numbers,
 ) -> tuple[Array, Array, Array]:
     """Mean corrected difference a - b of every cell's pixels, every other one in x and y, with their share,
-    the largest channel's mean square, and the variance of a, of b, their covariance, means of the channels',
-    and 0; samples brighter than `clipped` of their layer are left out."""
+    the largest channel's mean square, and, means of the channels', the variances of a and b, those of the
+    means of blocks of four, their covariance, and zeros; samples brighter than `clipped` of their layer are
+    left out."""
     looks = []
     usable = np.ones((border[1], border[0]), bool)
     sides = (layer_a, field_a, box_a, gain_a, clipped_a), (layer_b, field_b, box_b, gain_b, clipped_b)
@@ -44,15 +45,27 @@ def seam_difference(
         seen, look = layer_look(*side, border, lonlat, colours, cells, shoulder)
         usable &= (seen[..., 3] > 0) & (seen[..., :3] <= np.float32(clipped)[:3]).all(-1)
         looks.append(look)
-    result, square, variance = (np.zeros((cells[1], cells[0], *n)) for n in ((4,), (), (4,)))
+    result, square, texture = (np.zeros((cells[1], cells[0], *n)) for n in ((4,), (), (8,)))
     for place, part in cell_parts(border, cells, 2):
         values = (looks[0] - looks[1])[part][usable[part]]
         if len(values):
             result[place] = [*values.mean(0), len(values) / usable[part].size]
             square[place] = (values**2).mean(0).max()
-            off = [look[part][usable[part]] - look[part][usable[part]].mean(0) for look in looks]
-            variance[place] = [*(one.var() for one in off), (off[0] * off[1]).mean(), 0]
-    return result, square, variance
+            shown = [look[part][usable[part]] for look in looks]
+            blocks = [np.array(list(block_means(look[part], usable[part]))) for look in looks]
+            a, b = (one - one.mean(0) for one in blocks)
+            spread = [one.var(0).mean() for one in (*shown, *blocks)]
+            texture[place] = [*spread, (a * b).mean(), 0, 0, 0]
+    return result, square, texture
+
+
+def block_means(values: Array, usable: Array) -> Iterator[Array]:
+    """Of 2 x 2 places, in turn, the means of those that are usable, if any is."""
+    for y in range(0, values.shape[0], 2):
+        for x in range(0, values.shape[1], 2):
+            some = usable[y : y + 2, x : x + 2]
+            if some.any():
+                yield values[y : y + 2, x : x + 2][some].mean(0)
 
 
 def seam_yield(
