@@ -110,8 +110,9 @@ def show_project(
     options     of our own command line that say how to blend; the other arguments are `stitch_project`'s.
                 Of settings, keep_layers and metadata the commands know by these options alone.
 
-    Photos that miss the crop, which nona tells later, are taken for part of the panorama. Raises as
-    `stitch_project` does for what the project can get wrong.
+    Photos that miss the crop, which nona tells later, are taken for part of the panorama; where the other
+    layers are there, nona fails on such a one, and nothing is missed. Raises as `stitch_project` does for
+    what the project can get wrong.
     """
     plan = read_plan(path)
     canvas, name = plan.canvas, plan.file.name
