@@ -190,3 +190,9 @@ def test_shares_of_phases_add_up() -> None:
     record = Record(Path("a.pto"), "made", seconds=10.0, phases={"read": 2.0, "flow": 5.5})
     rows = [" ".join(line.split()) for line in phase_table(record)[1:5]]
     assert rows == ["read 2.00 20%", "flow 5.50 55%", "other 2.50 25%", "total 10.00 100%"]
+
+
+def test_phases_that_take_all_of_the_time_leave_nothing() -> None:
+    """And no less: clocks differ by a little."""
+    record = Record(Path("a.pto"), "made", seconds=10.0, phases={"read": 4.0, "flow": 6.001})
+    assert phase_table(record)[3].split() == ["other", "0.00", "0%"]

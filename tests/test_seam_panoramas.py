@@ -274,10 +274,10 @@ def test_weights_outside_the_regions_stay(device: Device, monkeypatch: pytest.Mo
     """The cut takes weight away only where its cells, grown and blurred by one, reach; a trace is left."""
     seen = {}
 
-    def remember(device, layers, fields, *rest, original=seam.cut, **named):
-        seen["before"], seen["regions"] = [f.get() for f in fields], rest[1]
-        result = original(device, layers, fields, *rest, **named)
-        seen["after"] = [f.get() for f in fields]
+    def remember(scene, residual, whole, *rest, original=seam.cut, **named):
+        seen["before"], seen["regions"] = [f.get() for f in scene.fields], whole
+        result = original(scene, residual, whole, *rest, **named)
+        seen["after"] = [f.get() for f in scene.fields]
         return result
 
     monkeypatch.setattr(seam, "cut", remember)
