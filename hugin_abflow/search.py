@@ -122,7 +122,7 @@ def exhaustive(
     for way, out in enumerate(agreed):
         device.run(
             "search", "search_agree", size, costs[way], found[way], found[1 - way], flows[way], grid, reach,
-            parameters.tolerance, parameters.distinct, costs[way].shape[2], out,
+            way, parameters.tolerance, parameters.distinct, costs[way].shape[2], out,
         )  # fmt: skip
     return agreed
 
@@ -137,16 +137,16 @@ def volumes(
     """
     width, height = grid[:2]
     count, pitch, wide = (2 * reach[0] + 1) * (2 * reach[1] + 1), _pitch(grid), a.shape[2]
-    pixel_cost = device.empty((height, count, pitch))
-    costs = device.empty((height, count, pitch)), device.empty((height, count, pitch))
+    pixel_cost, cost = (device.empty((height, count, pitch)) for _ in range(2))
+    device.run(
+        "search", "search_pixel_cost", (pitch // _CHUNK * count * height,), a, b, grid, reach, wide, outside,
+        pitch, pixel_cost,
+    )  # fmt: skip
     rows = (-(-width // _CHUNK) * count * height,)
-    for here, there, cost in ((a, b, costs[0]), (b, a, costs[1])):
-        device.run(
-            "search", "search_pixel_cost", (pitch // _CHUNK * count * height,),
-            here, there, grid, reach, wide, outside, pitch, pixel_cost,
-        )  # fmt: skip
-        device.run("search", "search_cost", rows, pixel_cost, grid, count, outside, pitch, cost)
-    return costs
+    device.run("search", "search_cost", rows, pixel_cost, grid, count, outside, pitch, cost)
+    turned = pixel_cost  # has done its part
+    device.run("search", "search_turned", rows, cost, grid, reach, outside, pitch, turned)
+    return cost, turned
 
 
 def _coupled(

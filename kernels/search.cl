@@ -125,6 +125,36 @@ __kernel void search_cost(__global const float *pixel_cost, /* (grid.y, displace
     vstore8(weight > 0.0f ? sum / weight : (float8)(outside), 0, cost + row * pitch + x);
 }
 
+/* The costs from b to a: what b shows at q, a shows at q + d, so it is that of -d there. Eight pixels at a time. */
+__kernel void search_turned(__global const float *cost, /* (grid.y, displacements, pitch) from a to b */
+                            int4 grid,                  /* run size: ceil(grid.x / 8) x displacements x grid.y */
+                            int2 reach,                 /* px */
+                            float outside,              /* cost of what lies beyond the grid */
+                            int pitch,
+                            __global float *turned)     /* (grid.y, displacements, pitch) */
+{
+    const int span = 2 * reach.x + 1, count = span * (2 * reach.y + 1);
+    const int2 eight = search_eight((grid.x + 7) / 8);
+    const int x = eight.x, row = eight.y;
+    const int y = row / count, index = row - y * count, there = y + index / span - reach.y;
+    if (y >= grid.y)
+        return;
+    const int from = x + index % span - reach.x;
+    __global const float *source = cost + (there * count + count - 1 - index) * pitch;
+    float8 costs;
+    if (there >= 0 && there < grid.y && from >= 0 && from + 8 <= grid.x)
+        costs = vload8(0, source + from);
+    else {
+        float lanes[8];
+        for (int i = 0; i < 8; ++i) {
+            int2 p = (int2)(from + i, there);
+            lanes[i] = grid_border(&p, grid) ? source[p.x] : outside;
+        }
+        costs = vload8(0, lanes);
+    }
+    vstore8(costs, 0, turned + row * pitch + x);
+}
+
 /* The displacement that costs least, with what it is away from `flow`; eight pixels at a time. No cost is below 0, so
    what is so far away from all eight that this alone is more than they pay next to their flow is not tried. */
 __kernel void search_best(__global const float *cost,  /* (grid.y, displacements, pitch) of this direction */
@@ -208,6 +238,7 @@ __kernel void search_agree(__global const float *cost,   /* (grid.y, displacemen
                            __global const float2 *flow,  /* (grid.y, grid.x) px */
                            int4 grid,                    /* run size */
                            int2 reach,                   /* px */
+                           int backward,                 /* 1: what lies beyond the grid is no rival */
                            float tolerance,              /* px */
                            float distinct,               /* how much more any other displacement costs */
                            int pitch,
@@ -229,7 +260,10 @@ __kernel void search_agree(__global const float *cost,   /* (grid.y, displacemen
     const float limit = cost[((d.y + reach.y) * span + d.x + reach.x) * pitch] + distinct;
     for (int v = -reach.y; v <= reach.y; ++v)
         for (int u = -reach.x; u <= reach.x; ++u, cost += pitch) {
-            if (*cost < limit && max(abs(u - d.x), abs(v - d.y)) > 2)
+            if (*cost >= limit || max(abs(u - d.x), abs(v - d.y)) <= 2)
+                continue;
+            p = (int2)(x + u, y + v);
+            if (!backward || grid_border(&p, grid))
                 return;
         }
     agreed[at] = found[at];
