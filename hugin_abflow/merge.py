@@ -245,8 +245,8 @@ def _target(plan: Plan, layers: Sequence[Layer], output: Path | str | None) -> P
     return Path(output)
 
 
-def default_target(plan: Plan, layers: Iterable[Path]) -> Path:
-    """The file of the panorama that nobody names: none of its layers, nor of those that are there and are
+def default_target(plan: Plan, layers: Iterable[Path] = ()) -> Path:
+    """The file of the panorama that nobody names: none of `layers`, nor of those that are there, which may be
     made again.
     """
     there = [file for found in candidates(plan) for file in found.in_order()]

@@ -167,39 +167,37 @@ def _alone(graph: Graph, labels: Labels, factor: float) -> Labels:
     return labels
 
 
-def find(residual: Residuals, cells: Grid, single: Cells) -> list[Cells]:
+def find(residual: Residuals, cells: Grid, single: Cells) -> Cells:
     """Connected outskirts, grown by a cell, that hold enough strong residual, are filled with what differs by
     less and in texture as well, or have any cell of `single`. What is unrelated beside them belongs to them,
     and they to each other.
     """
     smooth_rms = residual.rms if residual.smooth_rms is None else residual.smooth_rms
+    unrelated = np.zeros_like(single) if residual.unrelated is None else residual.unrelated
     weak = (residual.mean > _WEAK) | (smooth_rms > _STRONG) | single
     area = np.broadcast_to(cells.row_widths[:, None], weak.shape)
     strong = area * np.interp(residual.mean, (_STRONG - _DOUBT, _STRONG + _DOUBT), (0, 1))
     share = residual.mean / np.maximum(smooth_rms, 1e-12)
     textured = area * np.interp(residual.mean, _FAINT, (0, 1)) * np.interp(share, _TEXTURED, (0, 1, 1, 0))
-    outskirts = grown(weak, 1, cells.wraps)
-    found = np.zeros_like(weak)
+    outskirts, found = grown(weak, 1, cells.wraps), np.zeros_like(weak)
     for part in parts(outskirts, cells.wraps):
-        if (
-            strong[part].sum() >= _LEAST
-            or textured[part].sum() >= max(_LEAST, _FILLED * area[part].sum())
-            or single[part].any()
-        ):
+        filled = textured[part].sum() >= max(_LEAST, _FILLED * area[part].sum())
+        if filled or single[part].any():
             found |= part
-    if residual.unrelated is not None and residual.unrelated.any():
-        for part in parts(_extended(outskirts, residual.unrelated, cells.wraps), cells.wraps):
-            if strong[part].sum() >= _LEAST:
-                found |= part
-        found = _extended(found, residual.unrelated, cells.wraps)
-    return parts(found, cells.wraps)
+    for part in parts(_extended(outskirts, unrelated, cells.wraps), cells.wraps):
+        if strong[part].sum() >= _LEAST:
+            found |= part
+    return _extended(found, unrelated, cells.wraps)
 
 
 def _extended(regions: Cells, unrelated: Cells, wraps: bool) -> Cells:
     """Regions with what is unrelated, grown by a cell, that leads away from them, but not far."""
     unrelated = grown(unrelated, 1, wraps)
     for _ in range(_FAR):
-        regions = regions | (grown(regions, 1, wraps) & unrelated)
+        beside = grown(regions, 1, wraps) & unrelated & ~regions
+        if not beside.any():
+            break
+        regions = regions | beside
     return regions
 
 

@@ -121,9 +121,7 @@ def regions(residual: Residuals, grid: Grid, aligned: bool = True, single: Cells
     single      what single.py found: cells that belong to a region whatever the layers show there.
     """
     residual = residual if aligned else Residuals(residual.mean, residual.mean)
-    nowhere = np.zeros(residual.mean.shape, bool)
-    found = find(residual, seam_grid(grid), nowhere if single is None else single)
-    return np.asarray(np.any([nowhere, *found], 0))
+    return find(residual, seam_grid(grid), np.zeros(residual.mean.shape, bool) if single is None else single)
 
 
 def cut(

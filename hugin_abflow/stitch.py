@@ -123,8 +123,10 @@ def show_project(
     ]
     stored = _storing(compression, jpeg_quality)
     if output or prefix or layers:
-        there = layers_there(plan, prefix, layers, remap)
-        target = str(Path(output).absolute()) if output else default_target(plan, there).name
+        if output:
+            target = str(Path(output).absolute())
+        else:
+            target = default_target(plan, layers_there(plan, prefix, layers, remap)).name
         named = ["--layers", *(str(Path(layer).absolute()) for layer in layers)] if layers else []
         named = ["--prefix", _from_anywhere(plan, prefix)] if prefix else named
         remapped, found = ([], "") if named else _remapping(plan, remap)
@@ -136,7 +138,7 @@ def show_project(
         remapped, found = _remapping(branch.plan, _remap(branch.plan, remap))
         lines += remapped
         if Kind.PANORAMA in branch.kinds:
-            target = default_target(plan, layers_there(plan, None, None, remap)).name
+            target = default_target(plan).name
             lines.append(shlex.join([BLEND, *options, *stored, "-o", target, name, "--prefix", found]))
         own, asked = branch.plan.output, _stored(branch.plan, compression, jpeg_quality)
         differs = _storing(

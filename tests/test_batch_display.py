@@ -193,6 +193,6 @@ def test_shares_of_phases_add_up() -> None:
 
 
 def test_phases_that_take_all_of_the_time_leave_nothing() -> None:
-    """And no less: clocks differ by a little."""
+    """And no less: each of them is rounded."""
     record = Record(Path("a.pto"), "made", seconds=10.0, phases={"read": 4.0, "flow": 6.001})
     assert phase_table(record)[3].split() == ["other", "0.00", "0%"]

@@ -139,7 +139,7 @@ def test_a_border_is_priced_by_all_frequencies() -> None:
 
 def found(residual: Residuals, cells: Grid) -> list[np.ndarray]:
     """Each of them, where nothing moved."""
-    return regions.find(residual, cells, np.zeros(cells.shape, bool))
+    return regions.parts(regions.find(residual, cells, np.zeros(cells.shape, bool)), cells.wraps)
 
 
 @pytest.mark.parametrize("wraps", WRAPS)

@@ -41,7 +41,7 @@ def outcome(record: Record) -> str:
 def phase_table(record: Record) -> list[str]:
     """Seconds and shares of the phases, as lines."""
     whole = max(record.seconds, 1e-9)
-    other = max(0.0, whole - sum(record.phases.values()))  # clocks differ by a little
+    other = max(0.0, whole - sum(record.phases.values()))  # each of them is rounded
     rows = {**record.phases, "other": other, "total": whole}
     shares = [f"{phase:<9}{seconds:8.2f}{seconds / whole:6.0%}" for phase, seconds in rows.items()]
     peak = [] if record.memory is None else [f"peak memory: {size(record.memory)}"]
