@@ -12,6 +12,8 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import numpy as np
+
 from hugin_abflow.opencl import Buffer, Device
 from hugin_abflow.pyramid import on_level
 
@@ -116,37 +118,46 @@ def exhaustive(
     """
     size = grid[:2]
     reach = min(largest, size[0] // 2), min(largest, size[1] // 2)
-    costs = volumes(device, a, b, grid, reach, parameters.outside)
-    found = [_coupled(device, *one, grid, reach, parameters) for one in zip(costs, flows, strict=True)]
+    count = (2 * reach[0] + 1) * (2 * reach[1] + 1)
+    # both ways in the same memory, which is most that is needed for flow
+    room = [device.empty((grid[1], count, _pitch(grid))) for _ in range(2)]
+    found, distinct = [], []
+    for here, there, flow in ((a, b, flows[0]), (b, a, flows[1])):
+        cost = costs(device, here, there, grid, reach, parameters.outside, room)
+        found.append(_coupled(device, cost, flow, grid, reach, parameters))
+        distinct.append(device.empty(size[::-1], np.uint8))
+        device.run(
+            "search", "search_distinct", size, cost, found[-1], grid, reach, parameters.distinct,
+            cost.shape[2], distinct[-1],
+        )  # fmt: skip
     agreed = [device.empty(flow.shape) for flow in flows]
     for way, out in enumerate(agreed):
         device.run(
-            "search", "search_agree", size, costs[way], found[way], found[1 - way], flows[way], grid, reach,
-            way, parameters.tolerance, parameters.distinct, costs[way].shape[2], out,
+            "search", "search_agree", size, found[way], found[1 - way], distinct[way], flows[way], grid,
+            parameters.tolerance, out,
         )  # fmt: skip
     return agreed
 
 
-def volumes(
-    device: Device, a: Buffer, b: Buffer, grid: Grid, reach: tuple[int, int], outside: float
-) -> tuple[Buffer, Buffer]:
-    """What displacements within reach cost, from a to b and from b to a: float32 (height, displacements,
-    columns), of which as many columns count as the grid has.
+def costs(
+    device: Device, a: Buffer, b: Buffer, grid: Grid, reach: tuple[int, int], outside: float,
+    room: Sequence[Buffer],
+) -> Buffer:  # fmt: skip
+    """What displacements within reach cost, from a to b: float32 (height, displacements, columns), of which
+    as many columns count as the grid has; it is the second of `room`, two of that shape.
 
     a, b: descriptors; outside: the cost of what the other image does not show.
     """
     width, height = grid[:2]
-    count, pitch, wide = (2 * reach[0] + 1) * (2 * reach[1] + 1), _pitch(grid), a.shape[2]
-    pixel_cost, cost = (device.empty((height, count, pitch)) for _ in range(2))
+    pixel_cost, cost = room
+    count, pitch = cost.shape[1:]
     device.run(
-        "search", "search_pixel_cost", (pitch // _CHUNK * count * height,), a, b, grid, reach, wide, outside,
-        pitch, pixel_cost,
+        "search", "search_pixel_cost", (pitch // _CHUNK * count * height,), a, b, grid, reach, a.shape[2],
+        outside, pitch, pixel_cost,
     )  # fmt: skip
     rows = (-(-width // _CHUNK) * count * height,)
     device.run("search", "search_cost", rows, pixel_cost, grid, count, outside, pitch, cost)
-    turned = pixel_cost  # has done its part
-    device.run("search", "search_turned", rows, cost, grid, reach, outside, pitch, turned)
-    return cost, turned
+    return cost
 
 
 def _coupled(

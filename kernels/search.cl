@@ -125,36 +125,6 @@ __kernel void search_cost(__global const float *pixel_cost, /* (grid.y, displace
     vstore8(weight > 0.0f ? sum / weight : (float8)(outside), 0, cost + row * pitch + x);
 }
 
-/* The costs from b to a: what b shows at q, a shows at q + d, so it is that of -d there. Eight pixels at a time. */
-__kernel void search_turned(__global const float *cost, /* (grid.y, displacements, pitch) from a to b */
-                            int4 grid,                  /* run size: ceil(grid.x / 8) x displacements x grid.y */
-                            int2 reach,                 /* px */
-                            float outside,              /* cost of what lies beyond the grid */
-                            int pitch,
-                            __global float *turned)     /* (grid.y, displacements, pitch) */
-{
-    const int span = 2 * reach.x + 1, count = span * (2 * reach.y + 1);
-    const int2 eight = search_eight((grid.x + 7) / 8);
-    const int x = eight.x, row = eight.y;
-    const int y = row / count, index = row - y * count, there = y + index / span - reach.y;
-    if (y >= grid.y)
-        return;
-    const int from = x + index % span - reach.x;
-    __global const float *source = cost + (there * count + count - 1 - index) * pitch;
-    float8 costs;
-    if (there >= 0 && there < grid.y && from >= 0 && from + 8 <= grid.x)
-        costs = vload8(0, source + from);
-    else {
-        float lanes[8];
-        for (int i = 0; i < 8; ++i) {
-            int2 p = (int2)(from + i, there);
-            lanes[i] = grid_border(&p, grid) ? source[p.x] : outside;
-        }
-        costs = vload8(0, lanes);
-    }
-    vstore8(costs, 0, turned + row * pitch + x);
-}
-
 /* The displacement that costs least, with what it is away from `flow`; eight pixels at a time. No cost is below 0, so
    what is so far away from all eight that this alone is more than they pay next to their flow is not tried. */
 __kernel void search_best(__global const float *cost,  /* (grid.y, displacements, pitch) of this direction */
@@ -230,43 +200,50 @@ __kernel void search_mean(__global const float2 *flow, /* (grid.y, grid.x) */
     mean[y * grid.x + x] = sum / weight;
 }
 
-/* What was found, where the other direction found the same and nothing else, more than 2 px away, fits nearly as
-   well (on what repeats); elsewhere what was there before. */
-__kernel void search_agree(__global const float *cost,   /* (grid.y, displacements, pitch) of this direction */
-                           __global const float2 *found, /* (grid.y, grid.x) px, whole numbers within reach */
-                           __global const float2 *back,  /* (grid.y, grid.x) px, of the other direction, likewise */
-                           __global const float2 *flow,  /* (grid.y, grid.x) px */
-                           int4 grid,                    /* run size */
-                           int2 reach,                   /* px */
-                           int backward,                 /* 1: what lies beyond the grid is no rival */
-                           float tolerance,              /* px */
-                           float distinct,               /* how much more any other displacement costs */
-                           int pitch,
-                           __global float2 *agreed)      /* (grid.y, grid.x) px */
+/* Whether nothing else, more than 2 px away, fits nearly as well as what was found (on what repeats). */
+__kernel void search_distinct(__global const float *cost,   /* (grid.y, displacements, pitch) of this direction */
+                              __global const float2 *found, /* (grid.y, grid.x) px, whole numbers within reach */
+                              int4 grid,                    /* run size */
+                              int2 reach,                   /* px */
+                              float more,                   /* how much more any other displacement costs */
+                              int pitch,
+                              __global uchar *distinct)     /* (grid.y, grid.x) */
 {
     const int x = get_global_id(0), y = get_global_id(1);
     if (x >= grid.x || y >= grid.y)
         return;
     const int at = y * grid.x + x, span = 2 * reach.x + 1;
     const int2 d = convert_int2(found[at]);
-    agreed[at] = flow[at];
-    int2 p = (int2)(x, y) + d;
-    if (!grid_border(&p, grid))
-        return;
-    const float2 away = found[at] + back[p.y * grid.x + p.x];
-    if (dot(away, away) > tolerance * tolerance)
-        return;
     cost += y * span * (2 * reach.y + 1) * pitch + x;
-    const float limit = cost[((d.y + reach.y) * span + d.x + reach.x) * pitch] + distinct;
+    const float limit = cost[((d.y + reach.y) * span + d.x + reach.x) * pitch] + more;
+    distinct[at] = 0;
     for (int v = -reach.y; v <= reach.y; ++v)
-        for (int u = -reach.x; u <= reach.x; ++u, cost += pitch) {
-            if (*cost >= limit || max(abs(u - d.x), abs(v - d.y)) <= 2)
-                continue;
-            p = (int2)(x + u, y + v);
-            if (!backward || grid_border(&p, grid))
+        for (int u = -reach.x; u <= reach.x; ++u, cost += pitch)
+            if (*cost < limit && max(abs(u - d.x), abs(v - d.y)) > 2)
                 return;
-        }
-    agreed[at] = found[at];
+    distinct[at] = 1;
+}
+
+/* What was found, where that is distinct and the other direction found the same; elsewhere what was there before. */
+__kernel void search_agree(__global const float2 *found,   /* (grid.y, grid.x) px, whole numbers */
+                           __global const float2 *back,    /* (grid.y, grid.x) px, of the other direction, likewise */
+                           __global const uchar *distinct, /* (grid.y, grid.x) of search_distinct */
+                           __global const float2 *flow,    /* (grid.y, grid.x) px */
+                           int4 grid,                      /* run size */
+                           float tolerance,                /* px */
+                           __global float2 *agreed)        /* (grid.y, grid.x) px */
+{
+    const int x = get_global_id(0), y = get_global_id(1);
+    if (x >= grid.x || y >= grid.y)
+        return;
+    const int at = y * grid.x + x;
+    int2 p = (int2)(x, y) + convert_int2(found[at]);
+    bool agrees = distinct[at] && grid_border(&p, grid);
+    if (agrees) {
+        const float2 away = found[at] + back[p.y * grid.x + p.x];
+        agrees = dot(away, away) <= tolerance * tolerance;
+    }
+    agreed[at] = agrees ? found[at] : flow[at];
 }
 
 /* Weights of a window, by rows of SEARCH_ROW, and their sum: pixels that look like the middle count most, what is not

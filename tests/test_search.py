@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from grids import patches
@@ -14,6 +16,7 @@ from tolerances import DECISIONS, SUM, TRIGONOMETRY, assert_close
 
 from hugin_abflow import search
 from hugin_abflow.opencl import Buffer, Device
+from hugin_abflow.search import SearchParameters
 
 GRIDS = {"plane": (37, 23, 0, 0), "cylinder": (38, 23, 1, 0), "odd cylinder": (37, 23, 1, 0)}
 REACH = (4, 3)
@@ -37,7 +40,11 @@ def descriptors(seed: int, grid: tuple[int, int, int, int]) -> tuple[np.ndarray,
 
 def run(device: Device, name: str, grid: tuple[int, int, int, int], *arguments: object, channels: int = 2):
     """One output over the grid; arrays among the arguments are uploaded, each once."""
-    arrays = {id(v): device.upload(v.astype(np.float32)) for v in arguments if isinstance(v, np.ndarray)}
+    arrays = {
+        id(v): device.upload(v.astype(np.uint8 if v.dtype == bool else np.float32))
+        for v in arguments
+        if isinstance(v, np.ndarray)
+    }
     sent = [arrays.get(id(v), v) for v in arguments]
     out = device.empty((grid[1], grid[0], channels))
     device.run("search", name, grid[:2], *sent, out)
@@ -81,15 +88,13 @@ def test_descriptor_is_blind_to_contrast(device: Device) -> None:
 
 
 @pytest.mark.parametrize("name", list(GRIDS))
-def test_costs_equal_their_twins(device: Device, name: str) -> None:
+def test_costs_equal_their_twin(device: Device, name: str) -> None:
     grid = GRIDS[name]
     a, b = descriptors(5, grid)
     sent = planes(device, a, grid), planes(device, b, grid)
-    both = search.volumes(device, *sent, grid, REACH, 0.5)
-    there, back = (np.moveaxis(cost.get()[..., : grid[0]], 1, 0) for cost in both)
-    expected = twin.costs(a, b, grid, REACH, 0.5)
-    assert_close(there, expected, SUM)
-    assert_close(back, twin.search_turned(expected, grid, REACH, 0.5), SUM)
+    room = [device.empty((grid[1], 63, search._pitch(grid))) for _ in range(2)]
+    cost = search.costs(device, *sent, grid, REACH, 0.5, room).get()
+    assert_close(np.moveaxis(cost[..., : grid[0]], 1, 0), twin.costs(a, b, grid, REACH, 0.5), SUM)
 
 
 @pytest.mark.parametrize("name", list(GRIDS))
@@ -132,21 +137,17 @@ def test_twin_of_cost_by_hand() -> None:
 
 
 @pytest.mark.parametrize("name", list(GRIDS))
-@pytest.mark.parametrize("backward", [0, 1])
 @pytest.mark.parametrize("coupling", [0.0, 0.03])
-def test_best_equals_its_twin(device: Device, name: str, backward: int, coupling: float) -> None:
+def test_best_equals_its_twin(device: Device, name: str, coupling: float) -> None:
     grid = GRIDS[name]
     cost = twin.costs(*descriptors(9, grid), grid, REACH, 0.5).astype(np.float32)
     near = 2 * noise(13, grid, 2, 3)
-    directed = volume(twin.directed(cost, grid, REACH, 0.5, backward))
     out = device.empty((grid[1], grid[0], 2))
-    sent = device.upload(directed, np.float32), device.upload(near, np.float32)
+    sent = device.upload(volume(cost), np.float32), device.upload(near, np.float32)
     device.run("search", "search_best", (5 * grid[1],), *sent, grid, REACH, coupling, 48, out)
     best = out.get()
-    expected = twin.search_best(cost, near, grid, REACH, 0.5, coupling, backward)
-    assert_close(best, expected, 0, DECISIONS)
-    true = np.array([2, -1]) * (1 - 2 * backward)
-    assert (best == true).all(-1).mean() > 0.3
+    assert_close(best, twin.search_best(cost, near, REACH, coupling), 0, DECISIONS)
+    assert (best == (2, -1)).all(-1).mean() > 0.3
 
 
 @settings(max_examples=40)
@@ -179,14 +180,17 @@ def test_best_tries_all_that_could_be(
     assert_close(paid, total.min(0), 1e-5)
 
 
-def test_backward_costs_are_those_of_the_exchanged_images() -> None:
-    """One array serves both directions, where masks are whole and nothing leaves the grid."""
-    grid = (38, 23, 1, 0)
-    a, b = (noise(seed, grid, 4, 1.0) for seed in (15, 16))
-    a[..., 3] = b[..., 3] = 1
-    forward = twin.costs(a, b, grid, REACH, 0.5)
-    backward = twin.directed(forward, grid, REACH, 0.5, 1)
-    assert np.allclose(backward[:, 5:-5], twin.costs(b, a, grid, REACH, 0.5)[:, 5:-5])
+@pytest.mark.parametrize("name", list(GRIDS))
+def test_found_is_the_same_whichever_image_comes_first(device: Device, name: str) -> None:
+    """Up to the borders of ragged masks, and of the grid."""
+    grid = GRIDS[name]
+    a, b = (planes(device, one, grid) for one in descriptors(15, grid))
+    zero = [device.zeros((grid[1], grid[0], 2)) for _ in range(2)]
+    how = replace(SearchParameters(), distinct=0.05)
+    there, back = (one.get() for one in search.exhaustive(device, a, b, zero, grid, 4, how))
+    turned = [one.get() for one in search.exhaustive(device, b, a, zero, grid, 4, how)]
+    assert np.array_equal(there, turned[1]) and np.array_equal(back, turned[0])
+    assert 0.2 < (there == (2, -1)).all(-1).mean() < 0.9
 
 
 @pytest.mark.parametrize("name", list(GRIDS))
@@ -200,32 +204,41 @@ def test_mean_equals_its_twin_and_scipys(device: Device, name: str) -> None:
     assert np.allclose(expected[0, 0], values[np.ix_([0, 1], [-1, 0, 1] if grid[2] else [0, 1])].mean((0, 1)))
 
 
+def distinct(
+    device: Device, cost: np.ndarray, found: np.ndarray, grid: tuple[int, int, int, int]
+) -> np.ndarray:
+    """`search_distinct` of costs (displacements, height, width)."""
+    out = device.empty((grid[1], grid[0]), np.uint8)
+    sent = device.upload(volume(cost), np.float32), device.upload(found, np.float32)
+    device.run("search", "search_distinct", grid[:2], *sent, grid, REACH, 0.05, 48, out)
+    return out.get() == 1
+
+
 @pytest.mark.parametrize("name", list(GRIDS))
-@pytest.mark.parametrize("backward", [0, 1])
-def test_agree_equals_its_twin(device: Device, name: str, backward: int) -> None:
+def test_distinct_and_agree_equal_their_twins(device: Device, name: str) -> None:
     grid = GRIDS[name]
-    cost = twin.costs(*descriptors(19, grid), grid, REACH, 0.5).astype(np.float32)
+    a, b = descriptors(19, grid)
+    costs = [twin.costs(*both, grid, REACH, 0.5).astype(np.float32) for both in ((a, b), (b, a))]
     zero = np.zeros((grid[1], grid[0], 2))
-    ways = [twin.search_best(cost, zero, grid, REACH, 0.5, 0.0, way) for way in (0, 1)]
-    before = noise(23, grid, 2, 2)
-    arguments = (cost, ways[backward], ways[1 - backward], before, grid, REACH, backward, 1.5, 0.05)
+    there, back = (twin.search_best(cost, zero, REACH, 0.0) for cost in costs)
+    alone = twin.search_distinct(costs[0], there, REACH, 0.05)
+    assert 0.2 < alone.mean() < 0.9
+    assert (distinct(device, costs[0], there, grid) != alone).mean() <= DECISIONS
+    arguments = (there, back, alone, noise(23, grid, 2, 2), grid, 1.5)
     expected = twin.search_agree(*arguments)
-    kept = (expected == ways[backward]).all(-1).mean()
-    assert 0.2 < kept < 0.9
-    sent = (volume(twin.directed(cost, grid, REACH, 0.5, backward)), *arguments[1:], 48)
-    assert_close(run(device, "search_agree", grid, *sent), expected, 1e-6, DECISIONS)
+    kept = (expected == there).all(-1)
+    assert 0.2 < kept.mean() < 0.9 and (alone & ~kept).any()
+    assert_close(run(device, "search_agree", grid, *arguments), expected, 1e-6, DECISIONS)
 
 
-def test_agree_refuses_what_repeats(device: Device) -> None:
-    """A pattern that repeats within reach says nothing: the flow before stays."""
+def test_nothing_is_distinct_where_it_repeats(device: Device) -> None:
+    """A pattern that repeats within reach says nothing."""
     grid = (40, 24, 1, 0)
     x, y = common.pixels(40, 24)
     waves = [np.sin(2 * np.pi * (x + shift) / 4) * np.cos(y / 2.0) for shift in (0, 1, 2)]
     image = np.stack([*waves, np.ones(x.shape)], -1).astype(np.float32)
     cost = twin.costs(image, image, grid, REACH, 0.5)
-    zero, before = np.zeros((24, 40, 2)), np.full((24, 40, 2), 0.25, np.float32)
-    arguments = (volume(cost), zero, zero, before, grid, REACH, 0, 1.5, 0.05, 48)
-    assert np.array_equal(run(device, "search_agree", grid, *arguments), before)
+    assert not distinct(device, cost, np.zeros((24, 40, 2)), grid).any()
 
 
 @pytest.mark.parametrize("name", list(GRIDS))

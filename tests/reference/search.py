@@ -65,29 +65,11 @@ def costs(a: Array, b: Array, grid: Sequence[int], reach: Sequence[int], outside
     return search_cost(search_pixel_cost(a, b, grid, reach, outside), grid, outside)
 
 
-def directed(cost: Array, grid: Sequence[int], reach: Sequence[int], outside: float, backward: int) -> Array:
-    """The costs of one direction."""
-    return search_turned(cost, grid, reach, outside) if backward else cost.astype(np.float64)
-
-
-def search_turned(cost: Array, grid: Sequence[int], reach: Sequence[int], outside: float) -> Array:
-    """The costs from b to a; what lies beyond the grid costs `outside`."""
-    x, y = pixels(grid[0], grid[1])
-    result = []
-    for index, (u, v) in enumerate(displacements(reach)):
-        there, inside = on_grid(cost[len(cost) - 1 - index], grid, x + u, y + v)
-        result.append(np.where(inside, there, outside))
-    return np.stack(result)
-
-
-def search_best(
-    cost: Array, flow: Array, grid: Sequence[int], reach: Sequence[int], outside: float, coupling: float,
-    backward: int,
-) -> Array:  # fmt: skip
+def search_best(cost: Array, flow: Array, reach: Sequence[int], coupling: float) -> Array:
     """The displacement of least cost and squared distance from flow."""
     tried = np.array(displacements(reach), np.float64)
     away = ((tried[:, None, None] - flow.astype(np.float64)) ** 2).sum(-1)
-    return tried[(directed(cost, grid, reach, outside, backward) + coupling * away).argmin(0)]
+    return tried[(cost.astype(np.float64) + coupling * away).argmin(0)]
 
 
 def search_mean(flow: Array, grid: Sequence[int]) -> Array:
@@ -95,21 +77,24 @@ def search_mean(flow: Array, grid: Sequence[int]) -> Array:
     return windows(flow, grid, 1).sum(0) / windows(np.ones(flow.shape), grid, 1).sum(0)
 
 
-def search_agree(
-    cost: Array, found: Array, back: Array, flow: Array, grid: Sequence[int], reach: Sequence[int],
-    backward: int, tolerance: float, distinct: float,
-) -> Array:  # fmt: skip
-    """`found` where `back` is its opposite and no other displacement rivals it, else `flow`."""
-    x, y = pixels(grid[0], grid[1])
-    whole = found.astype(int)
-    answer, inside = on_grid(back, grid, x + whole[..., 0], y + whole[..., 1])
-    agrees = inside & (np.linalg.norm(found + answer, axis=-1) <= tolerance)
-    every = directed(cost, grid, reach, np.inf, backward)
+def search_distinct(cost: Array, found: Array, reach: Sequence[int], distinct: float) -> Array:
+    """Whether every displacement more than 2 px away costs at least so much more than the one found."""
+    whole, every = found.astype(int), cost.astype(np.float64)
     index = (whole[..., 1] + reach[1]) * (2 * reach[0] + 1) + whole[..., 0] + reach[0]
     own = np.take_along_axis(every, index[None], 0)[0]
     far = np.abs(np.array(displacements(reach))[:, None, None] - whole).max(-1) > 2
-    rival = np.where(far, every, np.inf).min(0)
-    return np.where((agrees & (rival >= own + distinct))[..., None], found, flow)
+    return np.where(far, every, np.inf).min(0) >= own + distinct
+
+
+def search_agree(
+    found: Array, back: Array, distinct: Array, flow: Array, grid: Sequence[int], tolerance: float
+) -> Array:
+    """`found` where it is distinct and `back` is its opposite, else `flow`."""
+    x, y = pixels(grid[0], grid[1])
+    whole = found.astype(int)
+    answer, inside = on_grid(back, grid, x + whole[..., 0], y + whole[..., 1])
+    agrees = distinct & inside & (np.linalg.norm(found + answer, axis=-1) <= tolerance)
+    return np.where(agrees[..., None], found, flow)
 
 
 def window_misfit(
