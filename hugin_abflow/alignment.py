@@ -85,9 +85,10 @@ def align(
         reaches = [geometry.reach(device, *one, grid) for one in zip(layers, fields, strict=True)]
         regions = _find_regions(scene, gains, strict, single, settings) if strict else None
         if regions and not settings.flow:
+            unlike = seam.unlike(scene, regions.correction)
             seam.cut_unaligned(scene, regions.correction)
-            # what is not aligned tells little of exposures; bands of frequencies change over as they are
-            return Aligned(fields, reaches, gains.none().result(), None, None)
+            # what is not aligned tells little of exposures: that is left to bands of frequencies
+            return Aligned(fields, reaches, gains.none().result(), None, unlike)
         if regions is None or regions.whole is None:
             return Aligned(fields, reaches, (early or gains.final(None)).result(), None, None)
         final = gains.final(regions.whole)

@@ -25,6 +25,7 @@ import scipy
 from hugin_abflow.cells import averaged, grown
 from hugin_abflow.coefficient import on_cells
 from hugin_abflow.colour import Correction, clipping
+from hugin_abflow.content import Unlike
 from hugin_abflow.geometry import Pair
 from hugin_abflow.layer import Box
 from hugin_abflow.opencl import Buffer
@@ -178,6 +179,19 @@ def clamp_displacements(scene: Scene, owner: npt.NDArray[np.intp], whole: Cells)
                 "seam", "seam_clamp", layer.box[2:], layer.pixels, field, layer.box, grid.border, grid.lonlat,
                 scene.device.upload(its.astype(np.uint8)), cells.border,
             )  # fmt: skip
+
+
+def unlike(scene: Scene, correction: Correction) -> Unlike:
+    """Where layers that are not aligned show different things, by their low frequencies. Each cell tells by
+    itself: an edge that is elsewhere in another layer is no wider than a cell or two.
+    """
+    cells = seam_grid(scene.grid)
+    mean = np.zeros(cells.shape)
+    limits = [clipping(layer) for layer in scene.layers]
+    for its, found in _differences(scene, correction, cells, limits):
+        apart = np.abs(found[_MEAN]).max(-1)
+        mean[its] = np.maximum(mean[its], np.where(found[_SHARE] > 0, apart, 0))
+    return Unlike.of(cells, mean, np.ones(cells.shape, bool), None)
 
 
 def cut_unaligned(scene: Scene, correction: Correction) -> None:

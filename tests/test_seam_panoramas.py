@@ -393,3 +393,19 @@ def test_without_flow_none_is_looked_for(monkeypatch: pytest.MonkeyPatch) -> Non
     monkeypatch.setattr(joint.pairflow, "solve", None)
     layers, canvas, *_ = scene("plane", None, dx=5)
     assert (merged(layers, canvas, flow=False)[..., 3] == 255).all()
+
+
+@pytest.mark.usefixtures(one_device.__name__)
+def test_without_flow_an_edge_that_is_elsewhere_leaves_no_shade_at_the_cut() -> None:
+    """A post before a bright wall is cut along itself, and is as dark there as both layers have it."""
+    canvas = Canvas.plane(480, 208)
+    middle = 270
+    _, columns = pixel_places(canvas.height, canvas.width)
+    layers = []
+    for by, mask in zip((-8, 8), halves(canvas, middle), strict=True):
+        picture = np.full((canvas.height, canvas.width, 4), 255, np.uint8)
+        picture[..., :3] = np.where(np.abs(columns - middle - by) < 15, 60, 150)[..., None]
+        layers.append(masked(picture, mask))
+    result = merged(layers, canvas, flow=False)[..., 1].astype(int)
+    assert np.abs(result[:, middle - 16 : middle + 16] - 60).max() <= 5  # of 90
+    assert np.abs(result[:, : middle - 40] - 150).max() <= 2
