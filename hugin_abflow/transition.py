@@ -5,17 +5,18 @@ by P / t, its strain. The published coefficient changes over across the whole ov
 are in it. These are shown between their places in the photos, as sharp and as straight as the flow is right.
 A retoucher would lead the transition around them. So the coefficients are those that minimise
 
-    sum_k  integral  (P^2 + P0^2) |grad w_k|^2  +  (2 strain)^2 w_k (1 - w_k),
+    sum_k  integral  (P^2 + P0^2) |grad w_k|^2  +  ((2 strain)^2 + b |grad f|^2) w_k (1 - w_k),
 
 of all that sum to 1 and are 0 where layer k is not. The first term is the strain; the second, of a double
-well, is the price of each place that no photo shows as it is. Together a transition costs about the parallax
-that it meets along its length, so that it runs where there is little, and is pi P / (2 strain) wide, at which
-the strain is what is wanted, where the overlap has room for it: a phase field (Modica and Mortola 1977; with
-this well Blowey and Elliott 1991). Near things that end within an overlap are left to one photo. What shows
-nothing, such as a sky or a wall, counts as without parallax: flow spreads over it from what is beside it,
-but nobody sees it bend. So transitions run there, round posts and letters. Where layers cannot be brought to
-one brightness there is no well, and transitions of layers that reach beyond each other are as wide as the
-overlap. Layers of one and the same mask share it evenly.
+well, is the price of each place that no photo shows as it is: more where flow f itself bends what is shown
+between its places in the photos, as along outlines of near things, and where it is wrong. Together a
+transition costs about the parallax that it meets along its length, so that it runs where there is little, and
+is pi P / (2 strain) wide, at which the strain is what is wanted, where the overlap has room for it: a phase
+field (Modica and Mortola 1977; with this well Blowey and Elliott 1991). Near things that end within an
+overlap are left to one photo. What shows nothing, such as a sky or a wall, counts as without parallax: flow spreads
+over it from what is beside it, but nobody sees it bend. So transitions run there, round posts and letters.
+Where layers cannot be brought to one brightness there is no well, and transitions of layers that reach beyond
+each other are as wide as the overlap. Layers of one and the same mask share it evenly.
 
 Layers end hard at their borders in overlaps that are thinner than a cell, as in holes of their masks. The sum
 is minimised by relaxation on a pyramid of cells. On the coarsest the well is deepened step by step, since
@@ -43,7 +44,10 @@ from hugin_abflow.working import Grid, Place, WorkingLayer, cells_under
 _CELLS = (32, 16, 8, 4)
 # P0, working pixels: flow is hardly more exact, and no transition is to be narrower.
 _LEAST_PARALLAX = 2.0
-# Cells of the finest grid over which parallax is averaged.
+# b: of the squared strain of the flow itself. With 1, which it would be if colours changed over as w does,
+# transitions get so narrow that they are seen where there is no way around.
+_BENT = 0.3
+# Cells of the finest grid over which parallax and strain are averaged.
 _SIGMA = 1.0
 # Sweeps of over-relaxation on each grid, and on the coarsest before there is a well and while it gets deeper.
 _SWEEPS, _FIRST_SWEEPS, _DEEPER_SWEEPS = 20, 100, 30
@@ -101,12 +105,12 @@ def minimise_strain(
     """
     grids = [grid.coarser(pixels) for pixels in _CELLS]
     covers = _covers(masks, grids)
-    price = _price(device, layers, flows, masks, grid, grids[-1], covers[-1])
+    price, bent = _prices(device, layers, flows, masks, grid, grids[-1], covers[-1])
     shares: Shares | None = None
     for cells, cover in zip(grids, covers, strict=True):
         finer = Shares.equal(device, cells, cover)
         east, south = links(_means(price, cells), cover.max(0), cells)
-        well = wells(cells, grid, settings.transition_strain, uneven)
+        well = wells(cells, grid, settings.transition_strain, bent, uneven)
         system = tuple(device.upload(one) for one in (east, south, well))
         if shares is None:
             relax(device, finer, system, 0.0, _FIRST_SWEEPS)
@@ -133,7 +137,7 @@ def _covers(masks: Masks, grids: Sequence[Grid]) -> list[Mask]:
     return result[::-1]
 
 
-def _price(
+def _prices(
     device: Device,
     layers: Sequence[WorkingLayer],
     flows: Sequence[PairFlow],
@@ -141,11 +145,11 @@ def _price(
     grid: Grid,
     cells: Grid,
     cover: Mask,
-) -> npt.NDArray[np.float64]:
-    """P^2 + P0^2 in cells, (height, width), in squared working px; P is 0 where no layer shows anything that
-    may be seen there.
+) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
+    """P^2 + P0^2, in squared working px, and b |grad f|^2 in cells, (height, width); P and |grad f| are 0
+    where no layer shows anything that may be seen there.
     """
-    squared = device.zeros(cells.shape)
+    parallax, strain = (device.zeros(cells.shape) for _ in range(2))
     textures = [_texture(device, layer, grid, cells) for layer in layers]
     for flow in flows:
         chart = flow.chart
@@ -153,16 +157,25 @@ def _price(
             "transition", "transition_parallax", cells.border[:2], flow.forward, flow.backward,
             chart.border, chart.transform, masks.buffers[flow.a],
             masks.buffers[flow.b], masks.grid.border, *textures[flow.a], *textures[flow.b],
-            grid.border, grid.lonlat, cells.border, squared,
+            grid.border, grid.lonlat, cells.border, parallax, strain,
         )  # fmt: skip
     several = (cover.sum(0) > 1).astype(np.float64)
+    length, bent = (
+        _averaged(one, several, cells) for one in (np.sqrt(parallax.get().astype(np.float64)), strain.get())
+    )
+    return np.square(length) + _LEAST_PARALLAX**2, _BENT * bent
+
+
+def _averaged(
+    values: npt.NDArray[np.floating], several: npt.NDArray[np.float64], cells: Grid
+) -> npt.NDArray[np.float64]:
+    """Means over the cells around in which several layers are, of values of all."""
     modes = ("nearest", "wrap" if cells.wraps else "nearest")
     sums, counts = (
-        scipy.ndimage.gaussian_filter(one, _SIGMA, mode=modes)
-        for one in (np.sqrt(squared.get().astype(np.float64)) * several, several)
+        scipy.ndimage.gaussian_filter(one, _SIGMA, mode=modes) for one in (values * several, several)
     )
-    price: npt.NDArray[np.float64] = np.square(sums / np.maximum(counts, 1e-6)) + _LEAST_PARALLAX**2
-    return price
+    averaged: npt.NDArray[np.float64] = sums / np.maximum(counts, 1e-6)
+    return averaged
 
 
 def _texture(device: Device, layer: WorkingLayer, grid: Grid, cells: Grid) -> tuple[Buffer, Place]:
@@ -211,13 +224,17 @@ def links(price: npt.NDArray[np.float64], union: Mask, cells: Grid) -> tuple[Val
     return result[0], result[1]
 
 
-def wells(cells: Grid, grid: Grid, strain: float, uneven: Values) -> Values:
-    """(2 strain)^2 times the area of each cell, in squared working px, (height, width); less where layers are
-    uneven, 0..1: (height, width) on any grid over the same region.
+def wells(
+    cells: Grid, grid: Grid, strain: float, bent: npt.NDArray[np.floating], uneven: npt.NDArray[np.floating]
+) -> Values:
+    """(2 strain)^2 and b |grad f|^2, times the area of each cell, in squared working px, (height, width).
+
+    bent    b |grad f|^2. uneven: where layers are, and by how much of all it is less there, 0..1. Both are
+            (height, width) on any grid over the same region.
     """
     area = grid.width / cells.width * grid.height / cells.height * _narrowing(cells)
     alike = 1 - _means(uneven, cells)
-    prices: Values = ((2 * strain) ** 2 * area[:, None] * alike).astype(np.float32)
+    prices: Values = (((2 * strain) ** 2 + _means(bent, cells)) * area[:, None] * alike).astype(np.float32)
     return prices
 
 

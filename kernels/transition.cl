@@ -14,6 +14,9 @@
 #define TRANSITION_PLAIN 0.012f
 #define TRANSITION_TEXTURED 0.035f
 
+/* Squared strain of a flow from which on the picture is torn: by more it is no worse. */
+#define TRANSITION_TORN 1.0f
+
 /* Cells of a displacement that are looked at, about. */
 #define TRANSITION_FAR 64.0f
 
@@ -65,8 +68,16 @@ static inline float transition_met(__global const float *texture, int4 place, fl
     return met;
 }
 
-/* Squared parallax of a pair in cells, in working px: the longest flow, either way, at places where both layers are, as
-   far as it is seen: what shows nothing may be bent. */
+/* The squared strain of a flow: how it differs from place to place, over two px. */
+static inline float transition_strain(__global const float2 *flow, float2 u, int4 grid) {
+    const float2 right = (float2)(1.0f, 0.0f), below = (float2)(0.0f, 1.0f);
+    const float2 across = bilinear_flow(flow, u + right, grid) - bilinear_flow(flow, u - right, grid);
+    const float2 down = bilinear_flow(flow, u + below, grid) - bilinear_flow(flow, u - below, grid);
+    return LEAST(0.25f * (square2(across) + square2(down)), TRANSITION_TORN);
+}
+
+/* Squared parallax of a pair in cells, in working px: the longest flow, either way, at places where both layers are;
+   and the mean squared strain of both. Each as far as it is seen: what shows nothing may be bent. */
 __kernel void transition_parallax(__global const float2 *flow,   /* chart grid, px: F_ab */
                                   __global const float2 *back,   /* chart grid, px: F_ba */
                                   int4 grid, float16 chart,      /* chart */
@@ -77,14 +88,15 @@ __kernel void transition_parallax(__global const float2 *flow,   /* chart grid, 
                                   __global const float *texture_b, int4 place_b, /* of transition_texture */
                                   int4 border, float4 lonlat,    /* working grid */
                                   int4 cells,                    /* run size */
-                                  __global float *parallax)      /* (cells.y, cells.x) that of no pair before is less */
+                                  __global float *parallax,      /* (cells.y, cells.x) those of no pair before are */
+                                  __global float *strain)        /* (cells.y, cells.x) less */
 {
     const int x = get_global_id(0), y = get_global_id(1);
     if (x >= cells.x || y >= cells.y)
         return;
     const float2 size = (float2)(border.x, border.y), unit = (float2)(lonlat.y == 0.0f ? 1.0f : 1.0f / lonlat.y);
     const float2 per_pixel = unit / (float2)(chart.s9, chart.sa);
-    float longest = 0.0f;
+    float longest = 0.0f, bent = 0.0f;
     for (int part = 0; part < 4; ++part) {
         const float2 share = ((float2)(x, y) + 0.25f + 0.5f * (float2)(part & 1, part >> 1)) /
                              (float2)(cells.x, cells.y);
@@ -94,8 +106,10 @@ __kernel void transition_parallax(__global const float2 *flow,   /* chart grid, 
         const float2 u = chart_position(canvas_point(share * size, lonlat), &chart);
         longest = GREATEST(longest, square2(bilinear_flow(flow, u, grid) * per_pixel));
         longest = GREATEST(longest, square2(bilinear_flow(back, u, grid) * per_pixel));
+        bent += 0.125f * (transition_strain(flow, u, grid) + transition_strain(back, u, grid));
     }
-    if (longest > parallax[y * cells.x + x]) {
+    const int at = y * cells.x + x;
+    if (longest > parallax[at] || bent > strain[at]) {
         const float2 p = grid_place(x, y, cells, border);
         const float2 u = chart_position(canvas_point(p, lonlat), &chart);
         const float2 to_a = canvas_position(chart_point(u + bilinear_flow(back, u, grid), &chart), lonlat);
@@ -104,7 +118,8 @@ __kernel void transition_parallax(__global const float2 *flow,   /* chart grid, 
                                    transition_met(texture_b, place_b, p, to_b, border, lonlat, cells));
         const float seen = (met - TRANSITION_PLAIN) / (TRANSITION_TEXTURED - TRANSITION_PLAIN);
         const float share = LIMITED(seen, 0.0f, 1.0f);
-        parallax[y * cells.x + x] = GREATEST(parallax[y * cells.x + x], longest * share * share);
+        parallax[at] = GREATEST(parallax[at], longest * share * share);
+        strain[at] = GREATEST(strain[at], bent * share * share);
     }
 }
 

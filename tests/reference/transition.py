@@ -20,6 +20,7 @@ from reference.common import (
 )
 
 TRACE, WEAKEST = 1e-6, 0.25
+TORN = 1.0  # squared strain of a flow
 PLAIN, TEXTURED, FAR = 0.012, 0.035, 64.0
 
 
@@ -81,6 +82,19 @@ def transition_met(
     return met
 
 
+def read_flow(flow: Array, grid: Sequence[int], x: Array, y: Array) -> Array:
+    """Flow between the pixels of a grid, of those that exist."""
+    total, share = bilinear(flow, grid, x, y)
+    return total / np.maximum(share, 1e-6)[..., None]
+
+
+def flow_strain(flow: Array, grid: Sequence[int], x: Array, y: Array) -> Array:
+    """The sum of the squares of a flow's four derivatives, over two px, but no more than that of a tear."""
+    across = (read_flow(flow, grid, x + 1, y) - read_flow(flow, grid, x - 1, y)) / 2
+    down = (read_flow(flow, grid, x, y + 1) - read_flow(flow, grid, x, y - 1)) / 2
+    return np.minimum((across**2 + down**2).sum(-1), TORN)
+
+
 def transition_parallax(
     flows: Sequence[Array],
     chart_grid: Sequence[int],
@@ -90,15 +104,15 @@ def transition_parallax(
     border: Sequence[int],
     lonlat: Numbers,
     cells: Sequence[int],
-    parallax: Array,
-) -> Array:
-    """The squares of the longest flow of both ways in each cell, as far as it is seen, or `parallax`, where
-    that is more.
+    before: Sequence[Array],
+) -> tuple[Array, Array]:
+    """The squares of the longest flow of both ways in each cell, and the mean of their squared strain, as far
+    as they are seen, or what was `before`, where that is more.
 
     masks: of both layers, any (height, width) over the same region. textures: with their places.
     """
     lonlat, chart = np.asarray(lonlat, np.float64), np.asarray(chart, np.float64)
-    longest = np.zeros(parallax.shape)
+    longest, bent = np.zeros((2, *before[0].shape))
     columns, rows = pixels(cells[0], cells[1])
     for down in (0.25, 0.75):
         for right in (0.25, 0.75):
@@ -109,18 +123,18 @@ def transition_parallax(
             point = canvas_point(x * border[0], y * border[1], lonlat)
             at = chart_position(point, chart)
             for flow in flows:
-                total, share = bilinear(flow, chart_grid, *at)
-                found = total / np.maximum(share, 1e-6)[..., None] / chart[9:11] / (lonlat[1] or 1)
+                found = read_flow(flow, chart_grid, *at) / chart[9:11] / (lonlat[1] or 1)
                 longest = np.where(both, np.maximum(longest, (found**2).sum(-1)), longest)
+                bent = bent + both * flow_strain(flow, chart_grid, *at) / 8
     x, y = (columns + 0.5) * border[0] / cells[0], (rows + 0.5) * border[1] / cells[1]
     at, met = chart_position(canvas_point(x, y, lonlat), chart), 0.0
     for (texture, place), flow in zip(textures, flows[::-1], strict=True):
-        total, share = bilinear(flow, chart_grid, *at)
-        u, v = (at[k] + total[..., k] / np.maximum(share, 1e-6) for k in (0, 1))
+        u, v = np.moveaxis(np.stack(at, -1) + read_flow(flow, chart_grid, *at), -1, 0)
         end = np.stack(canvas_position(chart_point(u, v, chart), lonlat), -1)
         seen = transition_met(texture, place, np.stack([x, y], -1), end, border, lonlat, cells)
         met = np.maximum(met, seen)
-    return np.maximum(parallax, longest * np.clip((met - PLAIN) / (TEXTURED - PLAIN), 0, 1) ** 2)
+    share = np.clip((met - PLAIN) / (TEXTURED - PLAIN), 0, 1) ** 2
+    return np.maximum(before[0], longest * share), np.maximum(before[1], bent * share)
 
 
 def transition_refine(coarse: Array, cells: Sequence[int], owns: Array) -> Array:
