@@ -188,13 +188,18 @@ def write_project(folder: Path, cameras: Sequence[Camera], width: int) -> None:
     (folder / "project.pto").write_text(project_text(cameras, names, width), encoding="utf-8")
 
 
-def write_layer(path: Path, layer: Pixels, left: int, top: int, width: int) -> None:
-    """A TIFF with nona's tags: LZW, 150 dpi, position in inches, the canvas in PIXAR's tags."""
+def write_layer(
+    path: Path, layer: Pixels, left: int, top: int, width: int, height: int | None = None
+) -> None:
+    """A TIFF with nona's tags: LZW, 150 dpi, position in inches, the canvas in PIXAR's tags.
+
+    height: of the canvas; None: half its width.
+    """
     tags = [
         (286, 5, 1, _rational(left / 150), True),
         (287, 5, 1, _rational(top / 150), True),
         (33300, 4, 1, width, True),
-        (33301, 4, 1, width // 2, True),
+        (33301, 4, 1, height or width // 2, True),
     ]
     tifffile.imwrite(
         path,
