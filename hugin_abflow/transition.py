@@ -46,7 +46,7 @@ _CELLS = (32, 16, 8, 4)
 _LEAST_PARALLAX = 2.0
 # b: of the squared strain of the flow itself. With 1, which it would be if colours changed over as w does,
 # transitions get so narrow that they are seen where there is no way around.
-_BENT = 0.3
+_BENT = 0.25
 # Cells of the finest grid over which parallax and strain are averaged.
 _SIGMA = 1.0
 # Sweeps of over-relaxation on each grid, and on the coarsest before there is a well and while it gets deeper.
