@@ -46,7 +46,7 @@ class Aligned:
 
     fields      where each is sampled, and its weight. reaches: how far from there, by rows (geometry.py).
     whole       where one layer was taken, on the seam grid; None: nowhere, or, without flow, everywhere.
-    unlike      where they show different things there; None as well.
+    unlike      where they show different things, with flow there alone; None: nowhere.
     """
 
     fields: list[Buffer]

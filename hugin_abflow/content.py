@@ -23,7 +23,7 @@ from hugin_abflow.opencl import Buffer, Device
 from hugin_abflow.working import Grid, Place, any_around
 
 # Residuals up to which layers surely show the same, and from which on surely not.
-_ALIKE, _OTHER = 0.06, 0.15
+ALIKE, _OTHER = 0.06, 0.15
 # Cells of the Gaussians that places around are averaged with, the widest first.
 _SIGMAS = (16.0, 8.0, 4.0, 2.0)
 # Places around are enough if they are this share of what is averaged; if less, the next wider ones count in
@@ -63,7 +63,7 @@ class Unlike:
         """By what low frequencies of aligned layers differ, of full scale, in regions `whole`, each of them
         taken from one layer; all (height, width) on `grid`.
         """
-        other = whole * np.clip((residual - _ALIKE) / (_OTHER - _ALIKE), 0, 1)
+        other = whole * np.clip((residual - ALIKE) / (_OTHER - ALIKE), 0, 1)
         anywhere = np.zeros(whole.shape, bool) if moved is None else moved
         return cls(grid, anywhere.astype(np.float32), other.astype(np.float32))
 

@@ -8,7 +8,8 @@ difference: it is brighter in the other by an unknown amount, and changes over b
 
 Where there is no flow, layers are not aligned, and each overlap is such a region, whole: on finer cells, with
 the mean square of the difference in place of r and t, since fine texture is as much in the way, and with
-narrow transitions; multiband.py blends low frequencies across them.
+narrow transitions; multiband.py blends low frequencies across them, but for those that differ because edges
+lie elsewhere.
 """
 
 from __future__ import annotations
@@ -22,6 +23,7 @@ import numpy as np
 import numpy.typing as npt
 import scipy
 
+from hugin_abflow import content
 from hugin_abflow.cells import averaged, grown
 from hugin_abflow.coefficient import on_cells
 from hugin_abflow.colour import Correction, clipping
@@ -51,6 +53,8 @@ _FINE_CUT = 120.0
 _UNRELATED, _OF_VARIANCES, _VARIANCE_RATIO, _RELATED, _ENOUGH = 0.06, 0.7, 1.5, 0.7, 64
 # Residual of layers that agree, without flow: of two cuts that nobody sees the shorter one is taken.
 _SHORTER = 0.005
+# The share of an overlap in which layers that are not aligned may show different things, at most.
+_FEW = 0.5
 # Price of a cell that is clipped, and is not in another layer, as of a residual that nothing favours; and by
 # how much, of full scale, that may be darker: what is white here and darker there is something else.
 _CLIPPED, _DARKER = 0.5, 0.05
@@ -182,15 +186,19 @@ def clamp_displacements(scene: Scene, owner: npt.NDArray[np.intp], whole: Cells)
 
 
 def unlike(scene: Scene, correction: Correction) -> Unlike:
-    """Where layers that are not aligned show different things, by their low frequencies. Each cell tells by
-    itself: an edge that is elsewhere in another layer is no wider than a cell or two.
+    """Where layers that are not aligned show different things, by their low frequencies.
+
+    Each cell tells by itself: an edge that is elsewhere in another layer is no wider than a cell or two. Of
+    two layers that differ in most cells of their overlap it is their exposure that does.
     """
     cells = seam_grid(scene.grid)
     mean = np.zeros(cells.shape)
     limits = [clipping(layer) for layer in scene.layers]
     for its, found in _differences(scene, correction, cells, limits):
-        apart = np.abs(found[_MEAN]).max(-1)
-        mean[its] = np.maximum(mean[its], np.where(found[_SHARE] > 0, apart, 0))
+        measured = found[_SHARE] > 0
+        apart = np.where(measured, np.abs(found[_MEAN]).max(-1), 0)
+        if np.count_nonzero(apart > content.ALIKE) <= _FEW * np.count_nonzero(measured):
+            mean[its] = np.maximum(mean[its], apart)
     return Unlike.of(cells, mean, np.ones(cells.shape, bool), None)
 
 

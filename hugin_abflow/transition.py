@@ -11,8 +11,8 @@ of all that sum to 1 and are 0 where layer k is not. The first term is the strai
 well, is the price of each place that no photo shows as it is: more where flow f itself bends what is shown
 between its places in the photos, as along outlines of near things, and where it is wrong. Together a
 transition costs about the parallax that it meets along its length, so that it runs where there is little, and
-is pi P / (2 strain) wide, at which the strain is what is wanted, where the overlap has room for it: a phase
-field (Modica and Mortola 1977; with this well Blowey and Elliott 1991). Near things that end within an
+is pi P / (2 strain) wide, at which the strain is what is wanted, where f itself bends nothing and the overlap
+has room for it: a phase field (Modica and Mortola 1977; with this well Blowey and Elliott 1991). Near things that end within an
 overlap are left to one photo. What shows nothing, such as a sky or a wall, counts as without parallax: flow
 spreads over it from what is beside it, but nobody sees it bend. So transitions run there, round posts and
 letters. Where layers cannot be brought to one brightness there is no well, and transitions of layers that

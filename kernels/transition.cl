@@ -68,16 +68,23 @@ static inline float transition_met(__global const float *texture, int4 place, fl
     return met;
 }
 
+/* A flow where it is known: beside the outermost pixels it is theirs. */
+static inline float2 transition_flow(__global const float2 *flow, float2 u, int4 grid) {
+    const float2 within = LIMITED(u, (float2)(0.5f), (float2)(grid.x - 0.5f, grid.y - 0.5f));
+    return bilinear_flow(flow, (float2)(grid.z ? u.x : within.x, within.y), grid);
+}
+
 /* The squared strain of a flow: how it differs from place to place, over two px. */
 static inline float transition_strain(__global const float2 *flow, float2 u, int4 grid) {
     const float2 right = (float2)(1.0f, 0.0f), below = (float2)(0.0f, 1.0f);
-    const float2 across = bilinear_flow(flow, u + right, grid) - bilinear_flow(flow, u - right, grid);
-    const float2 down = bilinear_flow(flow, u + below, grid) - bilinear_flow(flow, u - below, grid);
+    const float2 across = transition_flow(flow, u + right, grid) - transition_flow(flow, u - right, grid);
+    const float2 down = transition_flow(flow, u + below, grid) - transition_flow(flow, u - below, grid);
     return LEAST(0.25f * (square2(across) + square2(down)), TRANSITION_TORN);
 }
 
 /* Squared parallax of a pair in cells, in working px: the longest flow, either way, at places where both layers are;
-   and the mean squared strain of both. Each as far as it is seen: what shows nothing may be bent. */
+   and the mean squared strain of both ways, 0 at other places. As far as they are seen: what shows nothing may be
+   bent. */
 __kernel void transition_parallax(__global const float2 *flow,   /* chart grid, px: F_ab */
                                   __global const float2 *back,   /* chart grid, px: F_ba */
                                   int4 grid, float16 chart,      /* chart */

@@ -191,6 +191,24 @@ def test_a_region_comes_from_one_layer_and_an_overlap_from_both(
     assert first.all() or not first.any() if flow else 0.2 < first.mean() < 0.8
 
 
+def test_unlike_is_what_any_two_layers_differ_by_in_a_small_part(device: Device) -> None:
+    """Not what they differ by all over."""
+    grid = plane(96, 64)
+    pictures = np.full((4, 64, 96, 4), 0.5, np.float32)
+    pictures[..., 3] = 1
+    pictures[1, 16:24, 32:40, :3] = 0.9
+    pictures[3, ..., :3] = 0.8
+    layers = [on_device(device, one) for one in pictures]
+    fields = [device.zeros((64, 96, 4)) for _ in layers]
+    correction = Correction(grid.resized(4, 4), 1.0, (None,) * 4)
+    pairs = [Pair(1, 2), Pair(2, 3), Pair(0, 2)]
+    masks = coefficient.masks(device, layers, grid)
+    other = seam.unlike(Scene(device, layers, pairs, fields, masks, grid), correction).other
+    expected = np.zeros((8, 12), bool)
+    expected[2, 4] = True
+    assert np.array_equal(other > 0, expected)
+
+
 @pytest.mark.parametrize(("cost", "moved", "cut"), [
     (1.6, False, False), (1.8, False, True), (1.8, True, False), (2.1, True, True),
 ])  # fmt: skip

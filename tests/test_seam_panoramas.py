@@ -409,3 +409,20 @@ def test_without_flow_an_edge_that_is_elsewhere_leaves_no_shade_at_the_cut() -> 
     result = merged(layers, canvas, flow=False)[..., 1].astype(int)
     assert np.abs(result[:, middle - 16 : middle + 16] - 60).max() <= 5  # of 90
     assert np.abs(result[:, : middle - 40] - 150).max() <= 2
+
+
+@pytest.mark.usefixtures(one_device.__name__)
+@pytest.mark.parametrize(("wide", "light", "steepest"), [(8, 0.25, 3.0), (24, 0.7, 1.6)])
+def test_without_flow_what_differs_all_over_is_exposure(wide: int, light: float, steepest: float) -> None:
+    """Texture that is 12 px off, in an overlap that tells no gains: brightness changes without a step."""
+    canvas = Canvas.plane(640, 240)
+    texture = ndimage.gaussian_filter(np.random.default_rng(1).normal(size=(240, 660)), 3)
+    texture = np.clip(0.18 * (texture - texture.mean(0)) / texture.std() + 0.5, 0, 1)
+    columns = pixel_places(canvas.height, canvas.width)[1]
+    layers = []
+    for by, gain, mask in ((0, 1.0, columns < 320 + wide // 2), (12, light, columns >= 320 - wide // 2)):
+        picture = np.full((240, 640, 4), 255, np.uint8)
+        picture[..., :3] = np.rint(255 * gain * texture[:, by : by + 640, None])
+        layers.append(masked(picture, mask))
+    seen = ndimage.gaussian_filter1d(merged(layers, canvas, flow=False)[..., 1].mean(0), 4)
+    assert np.abs(np.diff(seen)).max() < steepest

@@ -184,13 +184,22 @@ def test_best_tries_all_that_could_be(
 def test_found_is_the_same_whichever_image_comes_first(device: Device, name: str) -> None:
     """Up to the borders of ragged masks, and of the grid."""
     grid = GRIDS[name]
-    a, b = (planes(device, one, grid) for one in descriptors(15, grid))
-    zero = [device.zeros((grid[1], grid[0], 2)) for _ in range(2)]
+    images = descriptors(15, grid)
+    a, b = (planes(device, one, grid) for one in images)
+    starts = [0.3 * noise(seed, grid, 2, 3) + sign * np.float32([1, 0]) for seed, sign in ((27, 1), (29, -1))]
+    flows = [device.upload(one) for one in starts]
     how = replace(SearchParameters(), distinct=0.05)
-    there, back = (one.get() for one in search.exhaustive(device, a, b, zero, grid, 4, how))
-    turned = [one.get() for one in search.exhaustive(device, b, a, zero, grid, 4, how)]
+    there, back = (one.get() for one in search.exhaustive(device, a, b, flows, grid, 4, how))
+    turned = [one.get() for one in search.exhaustive(device, b, a, flows[::-1], grid, 4, how)]
     assert np.array_equal(there, turned[1]) and np.array_equal(back, turned[0])
-    assert 0.2 < (there == (2, -1)).all(-1).mean() < 0.9
+    for found, start, true, pair in (
+        (there, starts[0], (2, -1), images), (back, starts[1], (-2, 1), images[::-1]),
+    ):  # fmt: skip
+        kept, right = (found == start).all(-1), (found == true).all(-1)
+        assert 0.2 < right.mean() < 0.9 and kept.mean() > 0.05
+        cost = twin.costs(*pair, grid, (4, 4), how.outside)
+        distinct = twin.search_distinct(cost, np.where(kept[..., None], 0, found), (4, 4), how.distinct)
+        assert distinct[~kept].mean() > 1 - DECISIONS
 
 
 @pytest.mark.parametrize("name", list(GRIDS))

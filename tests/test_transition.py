@@ -70,7 +70,10 @@ def test_parallax_equals_its_twin(device: Device, name: str) -> None:
     ]
     before = [(most * random.random(cells.shape)).astype(np.float32) for most in (4, 0.5)]
     places = (0, 0, *cells.border[:2]), (3, 2, 12, 7)
-    textures = [(0.05 * patches(5 + k, *its[2:], 0.35, 3)).astype(np.float32) for k, its in enumerate(places)]
+    textures = [
+        (0.05 * patches(5 + k, *its[2:], 0.35, 3) * random.random(its[:1:-1])).astype(np.float32)
+        for k, its in enumerate(places)
+    ]
     placed = list(zip(textures, places, strict=True))
     found = [device.upload(one) for one in before]
     chart_grid = (chart.width, chart.height, int(chart.wraps), 0)
@@ -86,6 +89,24 @@ def test_parallax_equals_its_twin(device: Device, name: str) -> None:
     for its, was, result in zip(expected, before, found, strict=True):
         assert 0.2 < (its > was).mean() < 1
         assert_close(result.get(), its, 100 * POSITION)
+
+
+@pytest.mark.parametrize("name", list(GRIDS))
+def test_flow_that_is_everywhere_the_same_has_no_strain(device: Device, name: str) -> None:
+    """Up to the borders of charts that are coarser than the grid."""
+    grid = GRIDS[name]
+    cells, everywhere = grid.coarser(4), np.ones((21, 40), np.uint8)
+    mask_grid = grid.resized(40, 21)
+    chart = pair_chart(everywhere > 0, mask_grid, grid, coarse=2)
+    flow = device.upload(np.full((chart.height, chart.width, 2), 8, np.float32))
+    mask, texture = device.upload(everywhere), device.upload(np.full(cells.shape, 0.05, np.float32))
+    parallax, strain = (device.zeros(cells.shape) for _ in range(2))
+    its = texture, (0, 0, *cells.border[:2])
+    device.run(
+        "transition", "transition_parallax", cells.border[:2], flow, flow, chart.border, chart.transform,
+        mask, mask, mask_grid.border, *its, *its, grid.border, grid.lonlat, cells.border, parallax, strain,
+    )  # fmt: skip
+    assert (parallax.get() > 60).mean() > 0.9 and strain.get().max() < 1e-9
 
 
 @pytest.mark.parametrize("name", list(GRIDS))
@@ -223,6 +244,7 @@ def test_wells_are_as_large_as_their_cells() -> None:
     bent[1, 3] = 0.7
     flat = transition.wells(plane(8, 4), plane(80, 40), 0.5, bent, uneven)
     assert flat[1, 3] == pytest.approx(170) and flat[1, 2] == pytest.approx(100)
+    assert not transition.wells(plane(8, 4), plane(80, 40), 0.5, bent, np.ones((1, 1))).any()
     curved = transition.wells(sphere(40, 20), sphere(400, 200), 0.5, *np.zeros((2, 1, 1)))
     latitudes = math.pi / 2 - (np.arange(20) + 0.5) * math.pi / 20
     assert curved == pytest.approx(np.repeat(100 * np.cos(latitudes)[:, None], 40, 1), rel=1e-5)
@@ -357,7 +379,7 @@ def test_what_crosses_the_overlap_bends_little_more_than_wanted(device: Device) 
     second = minimised(device, grid, scene(device, grid, left_and_right(grid, 20), shift))[1]
     strain = 15 * np.diff(second, axis=1).max(1)
     assert strain[150:].min() > STRAIN and strain[150:].max() < 1.2 * STRAIN
-    assert strain[64:].max() < 1.8 * STRAIN
+    assert 1.5 * STRAIN < strain[64:].max() < 1.8 * STRAIN
 
 
 def test_a_transition_avoids_where_flow_is_torn(device: Device) -> None:

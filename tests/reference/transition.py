@@ -89,9 +89,15 @@ def read_flow(flow: Array, grid: Sequence[int], x: Array, y: Array) -> Array:
 
 
 def flow_strain(flow: Array, grid: Sequence[int], x: Array, y: Array) -> Array:
-    """The sum of the squares of a flow's four derivatives, over two px, but no more than that of a tear."""
-    across = (read_flow(flow, grid, x + 1, y) - read_flow(flow, grid, x - 1, y)) / 2
-    down = (read_flow(flow, grid, x, y + 1) - read_flow(flow, grid, x, y - 1)) / 2
+    """The sum of the squares of a flow's four derivatives, over two px, but no more than that of a tear.
+    Beyond the centres of the outermost pixels flow goes on as it is there.
+    """
+
+    def at(x: Array, y: Array) -> Array:
+        x = x if grid[2] else np.clip(x, 0.5, grid[0] - 0.5)
+        return read_flow(flow, grid, x, np.clip(y, 0.5, grid[1] - 0.5))
+
+    across, down = (at(x + 1, y) - at(x - 1, y)) / 2, (at(x, y + 1) - at(x, y - 1)) / 2
     return np.minimum((across**2 + down**2).sum(-1), TORN)
 
 
