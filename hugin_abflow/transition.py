@@ -12,11 +12,12 @@ well, is the price of each place that no photo shows as it is: more where flow f
 between its places in the photos, as along outlines of near things, and where it is wrong. Together a
 transition costs about the parallax that it meets along its length, so that it runs where there is little, and
 is pi P / (2 strain) wide, at which the strain is what is wanted, where f itself bends nothing and the overlap
-has room for it: a phase field (Modica and Mortola 1977; with this well Blowey and Elliott 1991). Near things that end within an
-overlap are left to one photo. What shows nothing, such as a sky or a wall, counts as without parallax: flow
-spreads over it from what is beside it, but nobody sees it bend. So transitions run there, round posts and
-letters. Where layers cannot be brought to one brightness there is no well, and transitions of layers that
-reach beyond each other are as wide as the overlap. Layers of one and the same mask share it evenly.
+has room for it: a phase field (Modica and Mortola 1977; with this well Blowey and Elliott 1991). Near things
+that end within an overlap are left to one photo. What shows nothing, such as a sky or a wall, counts as
+without parallax: flow spreads over it from what is beside it, but nobody sees it bend. So transitions run
+there, round posts and letters. Where layers cannot be brought to one brightness there is no well, and
+transitions of layers that reach beyond each other are as wide as the overlap. Layers of one and the same mask
+share it evenly.
 
 Layers end hard at their borders in overlaps that are thinner than a cell, as in holes of their masks. The sum
 is minimised by relaxation on a pyramid of cells. On the coarsest the well is deepened step by step, since
