@@ -119,7 +119,7 @@ def exhaustive(
     size = grid[:2]
     reach = min(largest, size[0] // 2), min(largest, size[1] // 2)
     count = (2 * reach[0] + 1) * (2 * reach[1] + 1)
-    # both ways in the same memory, which is most that is needed for flow
+    # one way after the other in the same memory: no part of the flow needs as much
     room = [device.empty((grid[1], count, _pitch(grid))) for _ in range(2)]
     found, distinct = [], []
     for here, there, flow in ((a, b, flows[0]), (b, a, flows[1])):

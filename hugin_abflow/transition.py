@@ -228,10 +228,10 @@ def links(price: npt.NDArray[np.float64], union: Mask, cells: Grid) -> tuple[Val
 def wells(
     cells: Grid, grid: Grid, strain: float, bent: npt.NDArray[np.floating], uneven: npt.NDArray[np.floating]
 ) -> Values:
-    """(2 strain)^2 and b |grad f|^2, times the area of each cell, in squared working px, (height, width).
+    """The sum of (2 strain)^2 and b |grad f|^2, times the area of each cell, in squared working px, (height,
+    width); less where layers are uneven.
 
-    bent    b |grad f|^2. uneven: where layers are, and by how much of all it is less there, 0..1. Both are
-            (height, width) on any grid over the same region.
+    bent    b |grad f|^2. uneven: 0..1. Both are (height, width) on any grid over the same region.
     """
     area = grid.width / cells.width * grid.height / cells.height * _narrowing(cells)
     alike = 1 - _means(uneven, cells)
