@@ -10,11 +10,13 @@ program that takes a panorama and its layers and prints ``bad=`` and ``step=``. 
 from __future__ import annotations
 
 import argparse
+import itertools
 import re
 import shlex
 import subprocess
 import sys
 import tempfile
+from collections.abc import Iterable
 from pathlib import Path
 
 import cv2
@@ -24,9 +26,8 @@ import numpy.typing as npt
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
 from benchmarks.flow_pairs import Pair, public_pairs
+from benchmarks.quality import ROOT, abflow
 from benchmarks.rigs import write_layer
-
-ROOT = Path(__file__).resolve().parent.parent
 
 OVERLAPS = (0.25, 0.5)
 # Photos of fewer columns are shown twice as large, as working grids would be very small.
@@ -57,11 +58,9 @@ def make_set(folder: Path, pair: Pair, overlap: float, swapped: bool) -> None:
 def blend(folder: Path, name: str, options: list[str]) -> Path:
     """The panorama that hugin-abflow with `options` makes, or enblend."""
     out, layers = folder / f"{name}.tif", sorted(folder.glob("layer*.tif"))
-    if name == "enblend":
-        command = ["enblend", "-o", str(out), *map(str, layers)]
-    else:
-        command = [sys.executable, "-m", "hugin_abflow", "-q", "--remap", "never", *options]
-        command += ["--prefix", str(folder / "layer"), "-o", str(out), str(folder / "project.pto")]
+    command = ["enblend", "-o", str(out), *map(str, layers)]
+    if name != "enblend":
+        command = abflow("-q", "--remap", "never", *options)(folder, layers, 0, out)
     subprocess.run(command, cwd=ROOT, check=True, stdout=subprocess.DEVNULL)
     return out
 
@@ -78,25 +77,24 @@ def scores(scorer: list[str], panorama: Path) -> tuple[float, float]:
     return float(bad[1]), float(step[1])
 
 
+def row(title: str, found: Iterable[tuple[float, float]]) -> str:
+    """A row of the table: bad and step of each blender."""
+    return f"| {title} | {' | '.join(f'{bad:.2f} / {step:.3f}' for bad, step in found)} |"
+
+
 def run(pairs: Path, scorer: list[str], options: list[str], keep: Path) -> None:
     """A table of all pairs, and their means."""
     names = ["hugin-abflow", "enblend"]
     print(f"| pair, overlap, left | {' | '.join(names)} |\n|---|{'---|' * len(names)}")
     every = []
-    for pair in public_pairs(pairs):
-        for overlap in OVERLAPS:
-            for swapped in (False, True):
-                title = f"{pair.name}, {overlap:.0%}, {'b' if swapped else 'a'}"
-                folder = keep / re.sub(r"\W+", "-", title)
-                folder.mkdir(parents=True, exist_ok=True)
-                make_set(folder, pair, overlap, swapped)
-                every.append([scores(scorer, blend(folder, name, options)) for name in names])
-                print(
-                    f"| {title} | {' | '.join(f'{bad:.2f} / {step:.3f}' for bad, step in every[-1])} |",
-                    flush=True,
-                )
-    means = np.mean(every, 0)
-    print(f"| mean | {' | '.join(f'{bad:.2f} / {step:.3f}' for bad, step in means)} |")
+    for pair, overlap, swapped in itertools.product(public_pairs(pairs), OVERLAPS, (False, True)):
+        title = f"{pair.name}, {overlap:.0%}, {'b' if swapped else 'a'}"
+        folder = keep / re.sub(r"\W+", "-", title)
+        folder.mkdir(parents=True, exist_ok=True)
+        make_set(folder, pair, overlap, swapped)
+        every.append([scores(scorer, blend(folder, name, options)) for name in names])
+        print(row(title, every[-1]), flush=True)
+    print(row("mean", np.mean(every, 0)))
 
 
 def main() -> None:

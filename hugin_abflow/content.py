@@ -40,7 +40,8 @@ class Unlike:
     """How surely layers show different things, both float32 (height, width) on `grid`, 0..1.
 
     moved   what flow tells of, whatever the layers show.
-    other   what differs though layers are aligned, unless it is nearly black.
+    other   what differs though layers are aligned, unless it is nearly black; without flow, as edges do that
+            lie elsewhere.
     """
 
     grid: Grid
@@ -60,8 +61,8 @@ class Unlike:
         whole: npt.NDArray[np.bool_],
         moved: npt.NDArray[np.bool_] | None,
     ) -> Unlike:
-        """By what low frequencies of aligned layers differ, of full scale, in regions `whole`, each of them
-        taken from one layer; all (height, width) on `grid`.
+        """By what low frequencies of layers differ, of full scale, in regions `whole`, which are cut or taken
+        from one layer; all (height, width) on `grid`.
         """
         other = whole * np.clip((residual - ALIKE) / (_OTHER - ALIKE), 0, 1)
         anywhere = np.zeros(whole.shape, bool) if moved is None else moved

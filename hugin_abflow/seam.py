@@ -23,11 +23,10 @@ import numpy as np
 import numpy.typing as npt
 import scipy
 
-from hugin_abflow import content
 from hugin_abflow.cells import averaged, grown
 from hugin_abflow.coefficient import on_cells
 from hugin_abflow.colour import Correction, clipping
-from hugin_abflow.content import Unlike
+from hugin_abflow.content import ALIKE, Unlike
 from hugin_abflow.geometry import Pair
 from hugin_abflow.layer import Box
 from hugin_abflow.opencl import Buffer
@@ -197,7 +196,7 @@ def unlike(scene: Scene, correction: Correction) -> Unlike:
     for its, found in _differences(scene, correction, cells, limits):
         measured = found[_SHARE] > 0
         apart = np.where(measured, np.abs(found[_MEAN]).max(-1), 0)
-        if np.count_nonzero(apart > content.ALIKE) <= _FEW * np.count_nonzero(measured):
+        if np.count_nonzero(apart > ALIKE) <= _FEW * np.count_nonzero(measured):
             mean[its] = np.maximum(mean[its], apart)
     return Unlike.of(cells, mean, np.ones(cells.shape, bool), None)
 

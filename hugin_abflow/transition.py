@@ -161,22 +161,13 @@ def _prices(
             grid.border, grid.lonlat, cells.border, parallax, strain,
         )  # fmt: skip
     several = (cover.sum(0) > 1).astype(np.float64)
-    length, bent = (
-        _averaged(one, several, cells) for one in (np.sqrt(parallax.get().astype(np.float64)), strain.get())
-    )
-    return np.square(length) + _LEAST_PARALLAX**2, _BENT * bent
-
-
-def _averaged(
-    values: npt.NDArray[np.floating], several: npt.NDArray[np.float64], cells: Grid
-) -> npt.NDArray[np.float64]:
-    """Means over the cells around in which several layers are, of values of all."""
     modes = ("nearest", "wrap" if cells.wraps else "nearest")
-    sums, counts = (
-        scipy.ndimage.gaussian_filter(one, _SIGMA, mode=modes) for one in (values * several, several)
+    around, length, bent = (
+        scipy.ndimage.gaussian_filter(one * several, _SIGMA, mode=modes)
+        for one in (1.0, np.sqrt(parallax.get().astype(np.float64)), strain.get())
     )
-    averaged: npt.NDArray[np.float64] = sums / np.maximum(counts, 1e-6)
-    return averaged
+    counts = np.maximum(around, 1e-6)
+    return np.square(length / counts) + _LEAST_PARALLAX**2, _BENT * (bent / counts)
 
 
 def _texture(device: Device, layer: WorkingLayer, grid: Grid, cells: Grid) -> tuple[Buffer, Place]:

@@ -240,14 +240,17 @@ def test_distinct_and_agree_equal_their_twins(device: Device, name: str) -> None
     assert_close(run(device, "search_agree", grid, *arguments), expected, 1e-6, DECISIONS)
 
 
-def test_nothing_is_distinct_where_it_repeats(device: Device) -> None:
-    """A pattern that repeats within reach says nothing."""
+def test_agree_refuses_what_repeats(device: Device) -> None:
+    """A pattern that repeats within reach says nothing: the flow before stays."""
     grid = (40, 24, 1, 0)
     x, y = common.pixels(40, 24)
     waves = [np.sin(2 * np.pi * (x + shift) / 4) * np.cos(y / 2.0) for shift in (0, 1, 2)]
     image = np.stack([*waves, np.ones(x.shape)], -1).astype(np.float32)
     cost = twin.costs(image, image, grid, REACH, 0.5)
-    assert not distinct(device, cost, np.zeros((24, 40, 2)), grid).any()
+    zero, before = np.zeros((24, 40, 2)), np.full((24, 40, 2), 0.25, np.float32)
+    alone = distinct(device, cost, zero, grid)
+    assert not alone.any()
+    assert np.array_equal(run(device, "search_agree", grid, zero, zero, alone, before, grid, 1.5), before)
 
 
 @pytest.mark.parametrize("name", list(GRIDS))
