@@ -64,21 +64,36 @@ def across(u: Points, v: Points, direction: Points) -> npt.NDArray[np.float64]:
 
 def known_move(u: Points, v: Points) -> Points | None:
     """The camera's `move` that motion from u to v (n, 3) tells, if most of it is that of still things."""
-    u, v = (points[:: max(1, len(points) // _MOST)] for points in (u, v))
+    u, v = _some(u, v)
     if len(u) < _LEAST:
         return None
     direction = move(u, v)
-    return direction if _still(u, v, direction) else None
+    return direction if _mostly(along(u, v, direction)) else None
 
 
 def parallax(known: tuple[Points, Points], found: tuple[Points, Points]) -> bool:
     """Whether the motion in `found` is that of still things, for the camera's move that `known` tells; not so
     if it tells none. Each is where points are seen from the first and from the second place.
+
+    Layers that were aligned on what is near are turned against each other, so that what is farther goes the
+    other way: if what is known does so, what is found may as well.
     """
-    direction = known_move(*known) if len(found[0]) else None
-    return direction is not None and _still(*found, direction)
+    known = _some(*known)
+    if len(known[0]) < _LEAST or not len(found[0]):
+        return False
+    direction = move(*known)
+    its, others = (along(*one, direction) for one in (found, known))
+    if _mostly(others):
+        return _mostly(its)
+    return _mostly(abs(others)) and _mostly(abs(its))
 
 
-def _still(u: Points, v: Points, direction: Points) -> bool:
-    """Whether most of what moves from u to v stands still, if the camera moved so."""
-    return float((along(u, v, direction) > _ALONG).mean()) >= _MOSTLY
+def _some(u: Points, v: Points) -> tuple[Points, Points]:
+    """No more points than tell the move."""
+    step = max(1, len(u) // _MOST)
+    return u[::step], v[::step]
+
+
+def _mostly(cosines: npt.NDArray[np.float64]) -> bool:
+    """Whether most of what moves stands still, by what is `along`."""
+    return float((cosines > _ALONG).mean()) >= _MOSTLY

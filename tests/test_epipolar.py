@@ -53,6 +53,26 @@ def test_what_walks_is_no_parallax(direction: tuple[float, float, float], expect
     assert epipolar.parallax(known, (u, unit(u + 0.2 * np.array(direction)))) is expected
 
 
+@pytest.mark.parametrize(
+    ("direction", "expected"),
+    [((1, 0, 0), True), ((-1, 0, 0), True), ((0, 0, 1), False), ((0, 0, -1), False)],
+)
+def test_layers_aligned_on_what_is_near_move_both_ways(
+    direction: tuple[float, float, float], expected: bool
+) -> None:
+    """The second photo is turned so far that half of what is known goes back; what is found may as well, but
+    not up or down.
+    """
+    u, v = seen(2, 2000, np.array([-0.1, 0, 0]), np.array([0, 1.0, 0]))
+    u, v = u[u[:, 1] > 0.9], v[u[:, 1] > 0.9]
+    turn = -float(np.median(v[:, 0] - u[:, 0]))
+    v = v @ np.array([[np.cos(turn), -np.sin(turn), 0], [np.sin(turn), np.cos(turn), 0], [0, 0, 1.0]])
+    assert 0.4 < float((v[:, 0] > u[:, 0]).mean()) < 0.6
+    near, _ = seen(3, 300, np.zeros(3), np.array([0, 5.0, 0]))
+    assert epipolar.known_move(u, v) is None
+    assert epipolar.parallax((u, v), (near, unit(near + 0.2 * np.array(direction)))) is expected
+
+
 def test_still_points_are_not_led_away() -> None:
     """Whatever their distance; for them all of their motion is along, and nothing of it for another move."""
     move = unit(np.array([0.3, -0.5, 0.2]))
