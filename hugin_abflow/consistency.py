@@ -1,12 +1,13 @@
 """Flow that leads back to where it started is trusted; elsewhere it is filled (kernels/consistency.cl).
 
 A flow from a to b and the flow from b to a undo each other where both are right. Where they do not
-(occlusions, surfaces without texture), flow is carried on from the trusted flow around, hardly across edges
-of the image: a thing keeps its motion up to its outline, and what is behind it has its own. It is a diffusion
-that stops at edges, on a pyramid of trust-weighted means: each level starts from the filled coarser one, and
-a few sweeps do the rest (after Bornemann, Deuflhard, "The cascadic multigrid method for elliptic problems",
-1996). The place of what is taken from one photo (single.py) is filled with wide means, without regard to
-edges: what is beside it was matched half with it.
+(occlusions, surfaces without texture), a pixel takes over trusted flow from around if what the images show
+fits it: the floor beside somebody who went is where it was. Else flow is carried on from the trusted flow
+around, hardly across edges of the image: a thing keeps its motion up to its outline, and what is behind it
+has its own. It is a diffusion that stops at edges, on a pyramid of trust-weighted means: each level starts
+from the filled coarser one, and a few sweeps do the rest (after Bornemann, Deuflhard, "The cascadic multigrid
+method for elliptic problems", 1996). The place of what is taken from one photo (single.py) is filled with
+wide means, without regard to edges: what is beside it was matched half with it.
 """
 
 from __future__ import annotations
@@ -18,6 +19,7 @@ import numpy as np
 
 from hugin_abflow.cells import CELL, Mask, SingleSource
 from hugin_abflow.chart import Chart
+from hugin_abflow.flow import FlowParameters, adopt
 from hugin_abflow.geometry import Pair, PairFlow
 from hugin_abflow.opencl import Buffer, Device
 from hugin_abflow.pyramid import Level
@@ -61,19 +63,30 @@ class WeightedFlow(Pair):
 
 
 def weigh(
-    device: Device, pair: PairFlow, images: Sequence[Level], single: SingleSource | None = None
-) -> WeightedFlow:
-    """How far a pair's flows are trusted.
+    device: Device, pair: PairFlow, images: Sequence[Level], parameters: FlowParameters,
+    single: SingleSource | None = None,
+) -> WeightedFlow:  # fmt: skip
+    """How far a pair's flows are trusted. Where they are not, each pixel may have taken over flow that is:
+    beside somebody who is gone the floor is where it was.
 
     images      log brightness of both layers on the pair's chart.
+    parameters  by which flow was found.
     single      what is taken from a single one of them: flow there is not trusted.
     """
-    flows = [(pair.forward, pair.backward), (pair.backward, pair.forward)]
     excluded = (single.first, single.second) if single else (None, None)
-    forward, backward = (
-        _supported(device, trust(device, *both, pair.chart.wraps, level.image, cells), pair.chart.wraps)
-        for both, level, cells in zip(flows, images, excluded, strict=True)
-    )
+    wraps = pair.chart.wraps
+
+    def weighed(forward: Buffer, backward: Buffer) -> tuple[Buffer, Buffer]:
+        there, back = (
+            _supported(device, trust(device, flow, other, wraps, level.image, cells), wraps)
+            for flow, other, level, cells in zip(
+                (forward, backward), (backward, forward), images, excluded, strict=True
+            )
+        )
+        return there, back
+
+    adopted = adopt(device, images, weighed(pair.forward, pair.backward), parameters)
+    forward, backward = weighed(*(_flow(device, one, wraps) for one in adopted))
     return WeightedFlow(pair.a, pair.b, pair.chart, forward, backward, bool(single))
 
 
@@ -173,8 +186,7 @@ def _coarser(device: Device, fine: Buffer, wraps: bool) -> Buffer:
 
 def _carried(device: Device, levels: Sequence[Buffer], wraps: bool, sweeps: int) -> Buffer:
     """The finest level's flow, filled coarse to fine; without sweeps by wide means of what is around."""
-    filled = device.empty((1, 1, 2))
-    device.run("consistency", "consistency_flow", (1, 1), levels[-1], (1, 1, 0, 0), filled)
+    filled = _flow(device, levels[-1], wraps=False)
     for level in levels[-2::-1]:
         grid, coarse = _grid(level, wraps), filled
         filled = device.empty((*level.shape[:2], 2))
@@ -186,6 +198,13 @@ def _carried(device: Device, levels: Sequence[Buffer], wraps: bool, sweeps: int)
             half = (-(-grid[0] // 2), grid[1])
             device.repeat("consistency", "consistency_relax", half, calls, sweeps)
     return filled
+
+
+def _flow(device: Device, trusted: Buffer, wraps: bool) -> Buffer:
+    """The flow alone, float32 (height, width, 2), px."""
+    alone, grid = device.empty((*trusted.shape[:2], 2)), _grid(trusted, wraps)
+    device.run("consistency", "consistency_flow", grid[:2], trusted, grid, alone)
+    return alone
 
 
 def _grid(buffer: Buffer, wraps: bool) -> tuple[int, int, int, int]:

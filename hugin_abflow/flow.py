@@ -205,6 +205,24 @@ def finest_features(device: Device, image: Level, parameters: FlowParameters) ->
     return _features(device, [(image, pyramid.reduce(device, image))], parameters)
 
 
+def adopt(
+    device: Device, images: Sequence[Level], trusted: Sequence[Buffer], parameters: FlowParameters
+) -> list[Buffer]:
+    """`trusted`, of both ways, where each pixel that is not has taken over the flow of one around that is, if
+    it fits what the images show (search.py).
+
+    images: log brightness with masks. trusted: float32 (height, width, 4), flow to the other image in px,
+    trust 0..1, and something that stays.
+    """
+    how, grid = parameters.search, images[0].grid
+    features = (_unstacked(device, finest_features(device, image, parameters))[0] for image in images)
+    a, b = (search.descriptor(device, one, grid, how) for one in features)
+    return [
+        search.adopt(device, here, there, its, grid, how)
+        for here, there, its in ((a, b, trusted[0]), (b, a, trusted[1]))
+    ]
+
+
 def _choose(
     device: Device,
     features: Buffer,

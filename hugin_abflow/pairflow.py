@@ -231,7 +231,7 @@ class _Solver:
             found = flow.refine(device, *images, *found, parameters)
             its_flow = PairFlow(pair.a, pair.b, job.finest, *found)
             from_one = from_one and from_one.finer()
-        return _Solved(consistency.weigh(device, its_flow, images, from_one), from_one, held)
+        return _Solved(consistency.weigh(device, its_flow, images, parameters, from_one), from_one, held)
 
     def unsolved(self, job: _Job) -> _Solved:
         """A pair whose flow is not found: it is to be inferred from others."""

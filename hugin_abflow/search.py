@@ -59,6 +59,12 @@ class SearchParameters:
     steps: tuple[tuple[int, ...], ...] = ((6, 3, 1), (6, 3, 1), (16, 8, 4, 2, 1))
     refined_steps: tuple[int, ...] = (12, 6, 3, 1)  # where flow is refined, and thin things are wider
     refined_patience: float = 0.2  # likewise; with less, outlines of what moves far get ragged
+    # Where flow is not trusted: px from which that of trusted pixels is taken over, in turns, by how much it
+    # must fit better, the misfit from which on nothing fits, and the trust that is enough.
+    adopted_steps: tuple[int, ...] = (64, 32, 16, 8, 4, 2, 1)
+    adopted_patience: float = 0.3
+    adopted_misfit: float = 0.3
+    adopted_trust: float = 0.5
 
     def __post_init__(self) -> None:
         if max(self.radius) > _LARGEST_RADIUS:
@@ -70,7 +76,9 @@ class SearchParameters:
 def descriptor(device: Device, feature: Buffer, grid: Grid, parameters: SearchParameters) -> Buffer:
     """Descriptors float32 (height, 4, columns) of features (height, width, 4): see kernels/search.cl."""
     single, wide = device.empty(feature.shape), _pitch(grid) + 2 * _MARGIN
-    device.run("search", "search_descriptor", grid[:2], feature, grid, parameters.noise, single)
+    energy = device.empty((grid[1], grid[0], 2))
+    device.run("search", "search_energy", grid[:2], feature, grid, energy)
+    device.run("search", "search_descriptor", grid[:2], feature, energy, grid, parameters.noise, single)
     result = device.empty((grid[1], 4, wide))
     device.run("search", "search_planes", (wide, grid[1]), single, grid, wide, result)
     return result
@@ -196,3 +204,23 @@ def choose(
         )  # fmt: skip
         flow = other = chosen
     return flow
+
+
+def adopt(
+    device: Device, a: Buffer, b: Buffer, trusted: Buffer, grid: Grid, parameters: SearchParameters
+) -> Buffer:
+    """`trusted`, float32 (height, width, 4), with the flow of what is trusted around where it is not and that
+    fits: flow from a to b in px, trust 0..1, and something that stays.
+
+    a, b: descriptors.
+    """
+    outside = parameters.own_outside, parameters.other_outside
+    for step in parameters.adopted_steps:
+        adopted = device.empty(trusted.shape)
+        device.run(
+            "search", "search_adopt", grid[:2], a, b, trusted, grid, a.shape[2], step, parameters.radius[0],
+            parameters.focus, outside, parameters.adopted_patience, parameters.adopted_misfit,
+            parameters.adopted_trust, adopted,
+        )  # fmt: skip
+        trusted = adopted
+    return trusted

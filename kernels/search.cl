@@ -15,8 +15,28 @@
 #define SEARCH_RADIUS 4   /* px, of the largest window in which flows are compared */
 #define SEARCH_ROW 16     /* columns of a window's row: they are compared eight at a time */
 
+/* Sums of squares of features, and of what is known, over seven pixels of a row. */
+__kernel void search_energy(__global const float4 *feature, /* (grid.y, grid.x) kernels/flow.cl */
+                            int4 grid,                      /* run size */
+                            __global float2 *energy)        /* (grid.y, grid.x) */
+{
+    const int x = get_global_id(0), y = get_global_id(1);
+    if (x >= grid.x || y >= grid.y)
+        return;
+    float2 sum = (float2)(0.0f);
+    for (int i = -3; i <= 3; ++i) {
+        int2 p = (int2)(x + i, y);
+        if (!grid_border(&p, grid))
+            continue;
+        const float4 f = feature[p.y * grid.x + p.x];
+        sum += (float2)(f.w * (f.x * f.x + SEARCH_SLOPE * SEARCH_SLOPE * (f.y * f.y + f.z * f.z)), f.w);
+    }
+    energy[y * grid.x + x] = sum;
+}
+
 /* Features over the root of their mean square in 7 x 7 pixels. */
 __kernel void search_descriptor(__global const float4 *feature, /* (grid.y, grid.x) kernels/flow.cl */
+                                __global const float2 *energy,  /* (grid.y, grid.x) of search_energy */
                                 int4 grid,                      /* run size */
                                 float noise,                    /* amplitude of h that is no texture */
                                 __global float4 *descriptor)    /* (grid.y, grid.x) */
@@ -24,18 +44,14 @@ __kernel void search_descriptor(__global const float4 *feature, /* (grid.y, grid
     const int x = get_global_id(0), y = get_global_id(1);
     if (x >= grid.x || y >= grid.y)
         return;
-    float energy = 0.0f, weight = 0.0f;
-    for (int j = -3; j <= 3; ++j)
-        for (int i = -3; i <= 3; ++i) {
-            int2 p = (int2)(x + i, y + j);
-            if (!grid_border(&p, grid))
-                continue;
-            const float4 f = feature[p.y * grid.x + p.x];
-            energy += f.w * (f.x * f.x + SEARCH_SLOPE * SEARCH_SLOPE * (f.y * f.y + f.z * f.z));
-            weight += f.w;
-        }
+    float2 sum = (float2)(0.0f);
+    for (int j = -3; j <= 3; ++j) {
+        int2 p = (int2)(x, y + j);
+        if (grid_border(&p, grid))
+            sum += energy[p.y * grid.x + p.x];
+    }
     const float4 f = feature[y * grid.x + x];
-    const float scale = 1.0f / (sqrt(energy / fmax(weight, 1.0f)) + noise);
+    const float scale = 1.0f / (sqrt(sum.x / fmax(sum.y, 1.0f)) + noise);
     descriptor[y * grid.x + x] = (float4)(f.x * scale, SEARCH_SLOPE * scale * f.yz, f.w);
 }
 
@@ -370,4 +386,52 @@ __kernel void search_choose(__global const float *a,      /* (grid.y, 4, wide) d
         }
     }
     chosen[at] = best;
+}
+
+/* Where flow is not trusted, that of a trusted pixel `step` px beside it, if that fits, and so much better. */
+__kernel void search_adopt(__global const float *a,        /* (grid.y, 4, wide) descriptors */
+                           __global const float *b,        /* (grid.y, 4, wide) of the other image */
+                           __global const float4 *trusted, /* (grid.y, grid.x) flow, px, trust, brightness */
+                           int4 grid,                      /* run size */
+                           int wide,
+                           int step,                       /* px */
+                           int radius,                     /* px, as for search_choose */
+                           float focus, float2 outside,    /* likewise */
+                           float patience,                 /* by how much another must fit better */
+                           float most,                     /* the misfit from which on nothing fits */
+                           float enough,                   /* trust from which on flow is trusted */
+                           __global float4 *adopted)       /* the same; what is taken over is trusted as much */
+{
+    const int x = get_global_id(0), y = get_global_id(1);
+    if (x >= grid.x || y >= grid.y)
+        return;
+    const int at = y * grid.x + x;
+    const float4 own = trusted[at];
+    float4 best = own;
+    if (own.z < enough && search_place(a, x, y, wide)[3 * wide] > 0.0f) {
+        float weights[(2 * SEARCH_RADIUS + 1) * SEARCH_ROW], total = 0.0f, least = INFINITY;
+        for (int side = 0; side < 4; ++side) { /* left, right, above, below */
+            int2 p = (int2)(x, y) + step * (int2)((side == 1) - (side == 0), (side == 3) - (side == 2));
+            if (!grid_border(&p, grid))
+                continue;
+            const float4 f = trusted[p.y * grid.x + p.x];
+            if (f.z < enough)
+                continue;
+            if (total == 0.0f) {
+                total = search_weights(a, (int2)(x, y), grid, wide, radius, focus, weights);
+                least =
+                    search_window(a, b, (int2)(x, y), own.xy, grid, wide, radius, weights, total, outside.x, INFINITY);
+                least = LEAST(least - patience, most);
+                if (least <= 0.0f)
+                    break; /* nothing fits so much better */
+            }
+            const float cost =
+                search_window(a, b, (int2)(x, y), f.xy, grid, wide, radius, weights, total, outside.y, least);
+            if (cost < least) {
+                least = cost;
+                best = (float4)(f.xy, enough, own.w);
+            }
+        }
+    }
+    adopted[at] = best;
 }

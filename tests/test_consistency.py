@@ -15,6 +15,7 @@ from tolerances import SUM, assert_close
 from hugin_abflow import consistency
 from hugin_abflow.cells import CELL, SingleSource
 from hugin_abflow.chart import Chart
+from hugin_abflow.flow import FlowParameters
 from hugin_abflow.geometry import PairFlow
 from hugin_abflow.opencl import Device
 from hugin_abflow.pyramid import Level
@@ -194,14 +195,18 @@ def mended(
     backward: np.ndarray,
     moved: SingleSource | None = None,
     images: tuple[np.ndarray | None, np.ndarray | None] = (None, None),
+    shows: bool = False,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Both flows mended; images: what the layers show, on the chart; None: nothing."""
+    """Both flows mended; images: what the layers show, on the chart; None: nothing. shows: whether that tells
+    how flow fits.
+    """
     flows = [device.upload(flow.astype(np.float32)) for flow in (forward, backward)]
     pair = PairFlow(0, 1, whole_chart(grid), *flows)
     nothing = np.zeros(forward.shape[:2])
     shown = [device.upload((nothing if one is None else one).astype(np.float32)) for one in images]
-    levels = [Level(one, device.zeros(nothing.shape), pair.chart.wraps) for one in shown]
-    result = consistency.fill(device, consistency.weigh(device, pair, levels, moved))
+    mask = device.upload(np.full(nothing.shape, shows, np.float32))
+    levels = [Level(one, mask, pair.chart.wraps) for one in shown]
+    result = consistency.fill(device, consistency.weigh(device, pair, levels, FlowParameters(), moved))
     assert (result.a, result.b, result.chart) == (0, 1, pair.chart)
     return result.forward.get(), result.backward.get()
 
@@ -249,6 +254,32 @@ def test_consistent_flows_come_out_unchanged(device: Device, name: str) -> None:
     ):
         assert np.abs(flow[inner]).max() > 1.9
         assert np.abs(result - flow)[inner].max() < 0.01
+
+
+@pytest.mark.parametrize(("hidden", "expected"), [(False, 0.0), (True, 6.0)])
+def test_what_lies_still_beside_a_thing_that_went_is_told_by_what_it_shows(
+    device: Device, hidden: bool, expected: float
+) -> None:
+    """A strip as bright as the thing is filled with the thing's flow, over an edge of what lies still, unless
+    it shows the same in both photos: there it lies still as well.
+    """
+    grid, random = plane(97, 61), np.random.default_rng(4)
+    texture = ndimage.gaussian_filter(random.normal(size=(2, 61, 97)), (0, 1, 1))
+    texture *= 0.1 / texture.std()
+    strip, thing = np.s_[:, 40:55], np.s_[:, 55:]
+    a = texture[0] + 1.0
+    a[:, 40:] += 2
+    b = a.copy()
+    b[:, 61:] = a[:, 55:91]
+    b[:, 55:61] = texture[1][:, 55:61] + 3
+    forward, backward = np.zeros((61, 97, 2)), np.zeros((61, 97, 2))
+    forward[thing], backward[:, 61:] = (6, 0), (-6, 0)
+    forward[strip], backward[:, 40:61] = (2, 7), (-9, 3)
+    if hidden:
+        b[strip] = texture[1][strip] + 3
+    result, _ = mended(device, grid, forward, backward, images=(a, b), shows=True)
+    off = np.abs(result[20:40, 43:52] - [expected, 0])
+    assert (np.median(off) < 0.5) if hidden else (off.max() < 0.1)
 
 
 # Wrong flow is 4 to 9 px off; what is left of that after the mending, in px.

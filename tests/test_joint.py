@@ -355,8 +355,8 @@ def test_every_pair_is_mended_with_its_own_images(monkeypatch, looked_for):
         sampled.append((layer, chart, level))
         return level
 
-    def spy_weigh(device, pair, images, whole=None):
-        its = weigh(device, pair, images, whole)
+    def spy_weigh(device, pair, images, parameters, whole=None):
+        its = weigh(device, pair, images, parameters, whole)
         weighed[pair.a, pair.b] = pair, images, whole, its
         return its
 

@@ -52,8 +52,8 @@ def weighed(monkeypatch: pytest.MonkeyPatch) -> list[tuple[Any, ...]]:
     """What `consistency.weigh` is given, and what it gives."""
     given, weigh = list[tuple[Any, ...]](), consistency.weigh
 
-    def spy(device: Any, pair: Any, images: Any, whole: Any) -> Any:
-        given.append((pair, images, whole, weigh(device, pair, images, whole)))
+    def spy(device: Any, pair: Any, images: Any, parameters: Any, whole: Any) -> Any:
+        given.append((pair, images, whole, weigh(device, pair, images, parameters, whole)))
         return given[-1][3]
 
     monkeypatch.setattr(consistency, "weigh", spy)

@@ -70,12 +70,20 @@ def choose(
     return run(device, "search_choose", grid, *both, own, other, grid, both[0].shape[2], *arguments)
 
 
+def descriptor(
+    device: Device, feature: np.ndarray, grid: tuple[int, int, int, int], noise: float
+) -> np.ndarray:
+    """What `search_energy` and `search_descriptor` make of features."""
+    energy = run(device, "search_energy", grid, feature, grid)
+    return run(device, "search_descriptor", grid, feature, energy, grid, noise, channels=4)
+
+
 @pytest.mark.parametrize("name", list(GRIDS))
 def test_descriptor_equals_its_twin(device: Device, name: str) -> None:
     grid = GRIDS[name]
     feature, _ = descriptors(1, grid)
-    found = run(device, "search_descriptor", grid, feature, grid, 0.05, channels=4)
-    assert_close(found, twin.search_descriptor(feature, grid, 0.05), TRIGONOMETRY)
+    expected = twin.search_descriptor(feature, grid, 0.05)
+    assert_close(descriptor(device, feature, grid, 0.05), expected, TRIGONOMETRY)
 
 
 def test_descriptor_is_blind_to_contrast(device: Device) -> None:
@@ -83,7 +91,7 @@ def test_descriptor_is_blind_to_contrast(device: Device) -> None:
     grid = GRIDS["plane"]
     feature, _ = descriptors(3, grid)
     strong = feature * np.float32([5, 5, 5, 1])
-    both = [run(device, "search_descriptor", grid, f, grid, 0.0, channels=4) for f in (feature, strong)]
+    both = [descriptor(device, one, grid, 0.0) for one in (feature, strong)]
     assert_close(both[0], both[1], TRIGONOMETRY)
 
 
@@ -265,6 +273,27 @@ def test_choose_equals_its_twin(device: Device, name: str, step: int, radius: in
     expected = twin.search_choose(*arguments)
     assert 0.2 < (expected != own).any(-1).mean() < 0.95
     assert_close(choose(device, *arguments), expected, 1e-6, 5 * DECISIONS)
+
+
+@pytest.mark.parametrize("name", list(GRIDS))
+@pytest.mark.parametrize(("step", "radius"), [(1, 2), (4, 4), (9, 4)])
+def test_adopt_equals_its_twin(device: Device, name: str, step: int, radius: int) -> None:
+    """Half of what is trusted is right, and stays as it is."""
+    grid = GRIDS[name]
+    a, b = descriptors(125, grid)
+    trusted = np.dstack([np.array([2, -1]) + 3 * noise(129, grid, 2, 2), noise(131, grid, 2, 0)])
+    trusted[..., 2] = np.clip(0.5 + trusted[..., 2], 0, 1)
+    right = noise(133, grid, 1, 0)[..., 0] > 0
+    trusted[right, :2] = 2, -1
+    arguments = (step, radius, 2.0, (0.25, 0.75), 0.1, 0.4, 0.5)
+    both = [planes(device, image, grid) for image in (a, b)]
+    sent = (*both, trusted, grid, both[0].shape[2], *arguments)
+    found = run(device, "search_adopt", grid, *sent, channels=4)
+    expected = twin.search_adopt(a, b, trusted, grid, *arguments)
+    changed = (expected[..., :3] != trusted[..., :3]).any(-1)
+    assert 0.02 < changed.mean() < 0.5
+    assert not (changed & (trusted[..., 2] >= 0.5)).any() and (expected[changed, 2] == 0.5).all()
+    assert_close(found, expected, 1e-6, 5 * DECISIONS)
 
 
 @pytest.mark.parametrize("by", [(0.5, 0.0), (0.0, 0.5), (-0.5, -0.5)])

@@ -131,3 +131,21 @@ def search_choose(
             better = inside & differs & (a[..., 3] > 0) & (cost < least)
             best, least = np.where(better[..., None], there, best), np.where(better, cost, least)
     return best
+
+
+def search_adopt(
+    a: Array, b: Array, trusted: Array, grid: Sequence[int], step: int, radius: int, focus: float,
+    outside: Sequence[float], patience: float, most: float, enough: float,
+) -> Array:  # fmt: skip
+    """Flow, trust and what stays, with the best trusted flow from `step` px beside where none is trusted."""
+    x, y = pixels(grid[0], grid[1])
+    best = trusted.astype(np.float64)
+    least = np.minimum(window_misfit(a, b, best[..., :2], grid, radius, focus, outside[0]) - patience, most)
+    for dx, dy in ((-1, 0), (1, 0), (0, -1), (0, 1)):
+        there, inside = on_grid(trusted, grid, x + step * dx, y + step * dy)
+        cost = window_misfit(a, b, there[..., :2], grid, radius, focus, outside[1])
+        better = inside & (there[..., 2] >= enough) & (trusted[..., 2] < enough)
+        better &= (a[..., 3] > 0) & (cost < least)
+        taken = np.stack([there[..., 0], there[..., 1], np.full(x.shape, enough), trusted[..., 3]], -1)
+        best, least = np.where(better[..., None], taken, best), np.where(better, cost, least)
+    return best
