@@ -14,7 +14,7 @@ from typing import Literal
 from hugin_abflow import tifftags
 from hugin_abflow.errors import ImageReadError, LayersMissingError
 from hugin_abflow.images import read_layers
-from hugin_abflow.project import Plan, PlannedImage
+from hugin_abflow.project import Plan, PlannedImage, file_key
 
 _log = logging.getLogger(__name__)
 
@@ -75,15 +75,15 @@ def layer_path(prefix: str, index: int, ending: str) -> Path:
 def _find_under(plan: Plan, prefix: str) -> Found | None:
     """Layers that begin with `prefix`, if any."""
     endings = (".exr", ".tif", ".tiff") if plan.hdr else (".tif", ".tiff", ".exr")
-    photos = set(plan.photos)  # may be named alike: img0000.tif of img.pto
+    photos = {file_key(photo) for photo in plan.photos}  # may be named alike: img0000.tif of img.pto
     for ending in endings:
         paths = {image.index: layer_path(prefix, image.index, ending) for image in plan.images}
-        files = {index: path for index, path in paths.items() if path.is_file() and path not in photos}
+        files = {i: path for i, path in paths.items() if path.is_file() and file_key(path) not in photos}
         if files:
             return Found(prefix, files)
     for ending in (".tif", ".tiff"):
         pages = Path(prefix + ending).absolute()
-        if _is_multilayer(pages):
+        if file_key(pages) not in photos and _is_multilayer(pages):
             return Found(prefix, {}, pages)
     return None
 

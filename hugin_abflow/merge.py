@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import os
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import closing
@@ -28,7 +27,7 @@ from hugin_abflow.nona import open_layers
 from hugin_abflow.opencl import Device
 from hugin_abflow.pano_trafo import images_of, read_guides
 from hugin_abflow.progress import Progress, silent
-from hugin_abflow.project import Plan, read_plan
+from hugin_abflow.project import Plan, file_key, read_plan
 from hugin_abflow.settings import Settings
 from hugin_abflow.spool import spooled
 
@@ -267,5 +266,5 @@ def _check_early(plan: Plan, settings: Settings, output: Path | str | None, comp
 
 def refuse_input(output: Path, inputs: Iterable[Path]) -> None:
     """Raise `OutputError` for an output that is one of the inputs."""
-    if os.path.realpath(output) in map(os.path.realpath, inputs):
+    if file_key(output) in map(file_key, inputs):
         raise OutputError(f"{output} is an input of this panorama; choose another name with -o")

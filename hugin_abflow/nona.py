@@ -41,7 +41,7 @@ from hugin_abflow.imagewriter import named_in_unicode
 from hugin_abflow.layer import Layer, check_layers, other_canvas
 from hugin_abflow.programs import move_whole, stop
 from hugin_abflow.progress import Progress, silent
-from hugin_abflow.project import Plan, PlannedImage
+from hugin_abflow.project import Plan, PlannedImage, file_key
 from hugin_abflow.scratch import work_folder
 
 log = logging.getLogger("hugin_abflow.nona")
@@ -395,11 +395,11 @@ def _refuse_to_keep(prefix: str) -> None:
 
 def _keep(plan: Plan, prefix: str, made: dict[int, Path]) -> dict[int, Path]:
     """Move layers beside the project, each whole or not at all."""
-    photos = {photo.resolve() for photo in plan.photos}
+    photos = {file_key(photo) for photo in plan.photos}
     kept, advice = {}, "leave out --keep-layers or free the folder"
     for index, path in made.items():
         final = layer_path(prefix, index, path.suffix)
-        if final.resolve() in photos:
+        if file_key(final) in photos:
             raise OutputError(
                 f"{final} is a photo, the layer cannot be kept by that name; rename the project"
             )
