@@ -21,7 +21,8 @@ from hugin_abflow.errors import AbflowError, ExitCode
 from hugin_abflow.found import Remap
 from hugin_abflow.images import COMPRESSIONS
 from hugin_abflow.metadata import PROGRAM, version
-from hugin_abflow.options import ARGUMENTS, Command, Compression, NewFile, Option, Size
+from hugin_abflow.options import ARGUMENTS, Command, Compression, NewFile, OldFile, Option, Size
+from hugin_abflow.scratch import is_folder
 from hugin_abflow.settings import FlowQuality, LargeMotion, MergeMode, Settings
 from hugin_abflow.signals import interruptible
 from hugin_abflow.terminal import complain, print_result, say
@@ -66,7 +67,7 @@ def _print_devices(context: click.Context, parameter: click.Parameter, wanted: b
     context.exit(ExitCode.OK)
 
 
-_file, _new_file, _new_image = click.Path(path_type=Path), NewFile(), NewFile(image=True)
+_file, _new_file, _new_image = OldFile(), NewFile(), NewFile(image=True)
 _layers = partial(click.option, cls=Option, group="Layers")
 _blending = partial(click.option, cls=Option, group="Blending", show_default=True)
 _switch = partial(_blending, type=click.Choice(["auto", "off"]), default="auto")
@@ -292,7 +293,7 @@ def command(projects: tuple[Path, ...], **given: Any) -> ExitCode:
         raise click.UsageError("--dry-run is about projects that are there; leave out --watch")
     # what concerns the run as a whole is said beside what is named first
     place = places[0] if places else Path()
-    first = config or find_config(place / "any" if place.is_dir() else place, places)
+    first = config or find_config(place / "any" if is_folder(place) else place, places)
     recursive, resume, force, how = _run_options(**_chosen(first))
 
     def options(project: Path) -> tuple[Path | None, dict[str, Any]]:
@@ -317,7 +318,7 @@ def command(projects: tuple[Path, ...], **given: Any) -> ExitCode:
     if given["dry_run"]:
         spoken = {project: words(command, values) for project, (_, values) in chosen.items()}
         return show({project: {**tasks[project], "options": spoken[project]} for project in tasks})
-    remember = resume or force or len(found) > 1 or any(place.is_dir() for place in projects)
+    remember = resume or force or len(found) > 1 or any(map(is_folder, projects))
     return run(
         [Task(project, options, remember and not force, remember) for project, options in tasks.items()],
         how,

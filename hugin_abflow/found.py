@@ -15,6 +15,7 @@ from hugin_abflow import tifftags
 from hugin_abflow.errors import ImageReadError, LayersMissingError
 from hugin_abflow.images import read_layers
 from hugin_abflow.project import Plan, PlannedImage, file_key
+from hugin_abflow.scratch import is_file
 
 _log = logging.getLogger(__name__)
 
@@ -78,7 +79,7 @@ def _find_under(plan: Plan, prefix: str) -> Found | None:
     photos = {file_key(photo) for photo in plan.photos}  # may be named alike: img0000.tif of img.pto
     for ending in endings:
         paths = {image.index: layer_path(prefix, image.index, ending) for image in plan.images}
-        files = {i: path for i, path in paths.items() if path.is_file() and file_key(path) not in photos}
+        files = {i: path for i, path in paths.items() if is_file(path) and file_key(path) not in photos}
         if files:
             return Found(prefix, files)
     for ending in (".tif", ".tiff"):
@@ -91,7 +92,7 @@ def _find_under(plan: Plan, prefix: str) -> Found | None:
 def _is_multilayer(path: Path) -> bool:
     """Whether a file is nona's TIFF_multilayer: a finished panorama may have the same name."""
     try:
-        return path.is_file() and any(place.paged for place in tifftags.read_places(path))
+        return is_file(path) and any(place.paged for place in tifftags.read_places(path))
     except ImageReadError:
         return False
 
@@ -161,7 +162,7 @@ def _better_prefix(plan: Plan, prefix: str) -> str:
         shorter = re.sub(pattern, "", prefix)
         if shorter not in ("", prefix) and any(_find_under(plan, p) for p in _places(plan, shorter)):
             return f"the prefix is what comes before the numbers: --prefix {shorter}"
-    if any(Path(place).is_file() for place in _places(plan, prefix)):
+    if any(is_file(Path(place)) for place in _places(plan, prefix)):
         return f"{prefix} is a file: name all layers with --layers"
     return "check --prefix, or leave it out to have nona make the layers"
 
@@ -169,7 +170,7 @@ def _better_prefix(plan: Plan, prefix: str) -> str:
 def named_files(layers: Sequence[str | Path]) -> list[Path]:
     """Layers that the user named; raises `LayersMissingError` if one is not there."""
     for path in map(Path, layers):
-        if not path.is_file():
+        if not is_file(path):
             raise LayersMissingError(f"{path}: no such layer; check --layers")
     return [Path(path) for path in layers]
 

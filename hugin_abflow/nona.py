@@ -42,7 +42,7 @@ from hugin_abflow.layer import Layer, check_layers, other_canvas
 from hugin_abflow.programs import move_whole, stop
 from hugin_abflow.progress import Progress, silent
 from hugin_abflow.project import Plan, PlannedImage, file_key
-from hugin_abflow.scratch import work_folder
+from hugin_abflow.scratch import is_file, work_folder
 
 log = logging.getLogger("hugin_abflow.nona")
 
@@ -164,7 +164,7 @@ def probe() -> str | None:
 
 
 def _can_make(plan: Plan) -> bool:
-    return shutil.which("nona") is not None and all(image.photo.is_file() for image in plan.images)
+    return shutil.which("nona") is not None and all(is_file(image.photo) for image in plan.images)
 
 
 def _make_all(plan: Plan, folder: Path, keep: bool, progress: Progress) -> Found:
@@ -237,10 +237,10 @@ def _require_photo(plan: Plan, image: PlannedImage) -> None:
             f"image {image.index} of {plan.file} names no photo (its i-line has no n), and its layer must be "
             "made from it; the project may be damaged: save it anew in Hugin"
         )
-    if not image.photo.is_file():
+    if not is_file(image.photo):
         raise PhotoMissingError(
-            f"{image.photo} (image {image.index}) is not there, and its layer must be made from it; "
-            "put it back, or name layers that exist with --prefix or --layers"
+            f"{image.photo} (image {image.index}) is not there, or its folder is closed to you, and its "
+            "layer must be made from it; put it back, or name layers that exist with --prefix or --layers"
         )
 
 

@@ -56,6 +56,15 @@ class Compression(click.ParamType):  # type: ignore[type-arg]
         return str(value)
 
 
+class OldFile(click.Path):
+    """A file to be read, or a folder; whether it can be is told where it is: of several projects it stops
+    none but its own.
+    """
+
+    def __init__(self) -> None:
+        super().__init__(readable=False, path_type=Path)
+
+
 class NewFile(click.Path):
     """A file to be written: no project and, unless `image`, no photo, as where its own name was forgotten
     before ``*.pto``.

@@ -11,6 +11,7 @@ from hugin_abflow import pto
 from hugin_abflow.errors import ProjectError
 from hugin_abflow.layer import Box, Canvas
 from hugin_abflow.projection import EQUIRECTANGULAR
+from hugin_abflow.scratch import is_file
 
 SINUSOIDAL = 7
 
@@ -160,7 +161,7 @@ def locate_photo(folder: Path, name: str) -> Path:
     bare = folder / windows.name if windows.name else expected
     moved = bare if windows.is_absolute() or windows.drive else folder.joinpath(*windows.parts)
     for candidate in (expected, moved, bare):
-        if candidate.is_file():
+        if is_file(candidate):
             return candidate
     return expected
 

@@ -53,6 +53,16 @@ def is_special(path: Path) -> bool:
     return not stat.S_ISREG(mode) and not stat.S_ISDIR(mode)
 
 
+def is_file(path: Path) -> bool:
+    """Whether it is a file; false where it must not be looked at, of which `Path.is_file` raises an error."""
+    return os.path.isfile(path)  # noqa: PTH113
+
+
+def is_folder(path: Path) -> bool:
+    """Whether it is a folder; false where it must not be looked at."""
+    return os.path.isdir(path)  # noqa: PTH112
+
+
 @contextmanager
 def part_beside(final: Path, suffix: str | None = None) -> Iterator[Path]:
     """A new, empty file beside `final`, to be written and renamed; nothing else is left of it.

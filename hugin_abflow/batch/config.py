@@ -11,6 +11,7 @@ from typing import Any
 import tomli_w
 
 from hugin_abflow.errors import ConfigError
+from hugin_abflow.scratch import is_file, is_folder
 
 NAME = "abflow.toml"
 
@@ -18,10 +19,10 @@ NAME = "abflow.toml"
 def find_config(project: Path, places: Iterable[Path]) -> Path | None:
     """The settings of a project: in its folder, else in the next one above, up to a folder of `places`."""
     folder = project.absolute().parent
-    tops = {place.absolute() for place in places if place.is_dir()}
+    tops = {place.absolute() for place in places if is_folder(place)}
     above = [folder, *folder.parents]
     top = next((number for number, one in enumerate(above) if one in tops), 0)
-    return next((one / NAME for one in above[: top + 1] if (one / NAME).is_file()), None)
+    return next((one / NAME for one in above[: top + 1] if is_file(one / NAME)), None)
 
 
 def read_config(file: Path, kinds: Mapping[str, str], paths: Iterable[str]) -> dict[str, Any]:
