@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any, get_args
@@ -15,13 +15,13 @@ from hugin_abflow.batch.queue import find_projects, refuse_same_output
 from hugin_abflow.batch.run import Run, default_jobs, run, show
 from hugin_abflow.batch.task import Task
 from hugin_abflow.batch.watch import watch
-from hugin_abflow.choices import OF_THE_RUN, choose, config_text, for_several, words
+from hugin_abflow.choices import OF_THE_RUN, choose, config_texts, for_several, words
 from hugin_abflow.devices import list_devices
 from hugin_abflow.errors import AbflowError, ExitCode
 from hugin_abflow.found import Remap
 from hugin_abflow.images import COMPRESSIONS
 from hugin_abflow.metadata import PROGRAM, version
-from hugin_abflow.options import ARGUMENTS, Command, Compression, NewFile, OldFile, Option, Size
+from hugin_abflow.options import ARGUMENTS, Command, Compression, NewFile, OldFile, Option, Size, Text
 from hugin_abflow.scratch import is_folder
 from hugin_abflow.settings import FlowQuality, LargeMotion, MergeMode, Settings
 from hugin_abflow.signals import interruptible
@@ -108,6 +108,7 @@ _information = partial(click.option, cls=Option, group="Information")
 @_layers(
     "--prefix",
     metavar="PREFIX",
+    type=Text(),
     help="Take the layers PREFIX0000.tif, PREFIX0001.tif ..., as they are; relative to the current or the "
     "project's folder. [default: the project's name, then Hugin's default prefix]",
 )
@@ -192,6 +193,7 @@ _information = partial(click.option, cls=Option, group="Information")
 @_blending(
     "--device",
     metavar="DEVICE",
+    type=Text(),
     show_default=False,
     help="The OpenCL device: its number in --list-devices, or a part of its name. "
     "[default: the fastest GPU, else the CPU]",
@@ -220,6 +222,7 @@ _information = partial(click.option, cls=Option, group="Information")
 @_batch(
     "--scheduler",
     metavar="ADDRESS",
+    type=Text(),
     help="Have the workers of a Dask cluster do the work, over shared storage. ADDRESS: of its scheduler, "
     "such as tcp://host:8786.",
 )
@@ -309,7 +312,9 @@ def command(projects: tuple[Path, ...], **given: Any) -> ExitCode:
     found = find_projects(projects, recursive)
     chosen = {project: options(project) for project in found}
     if given["print_config"]:
-        return _print_configs(chosen or {Path(): (first, _chosen(first))})
+        for text in config_texts(command, chosen or {Path(): (first, _chosen(first))}):
+            print_result(text)
+        return ExitCode.OK
     tasks = {project: _options(**values) for project, (_, values) in chosen.items()}
     if len(found) > 1:
         for its_options in tasks.values():
@@ -342,14 +347,6 @@ def _saved(
             yield Task(project, _options(**options(project)[1]), not force, True) if project else None
         except (AbflowError, click.UsageError) as error:
             complain(f"{project}: {error.format_message() if isinstance(error, click.UsageError) else error}")
-
-
-def _print_configs(chosen: Mapping[Path, tuple[Path | None, dict[str, Any]]]) -> ExitCode:
-    """Answer --print-config, once for each file of settings."""
-    for file in dict.fromkeys(file for file, _ in chosen.values()):
-        projects = [project for project, (its_file, _) in chosen.items() if its_file == file]
-        print_result(config_text(command, file, chosen[projects[0]][1], [p for p in projects if p.name]))
-    return ExitCode.OK
 
 
 def _run_options(

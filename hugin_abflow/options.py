@@ -56,6 +56,27 @@ class Compression(click.ParamType):  # type: ignore[type-arg]
         return str(value)
 
 
+class Text(click.ParamType):  # type: ignore[type-arg]
+    """A text that is not empty, as where a script's variable is not set."""
+
+    name = "text"
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> str:
+        """The text; ends with click's message where there is none."""
+        _refuse_empty(self, value, param, ctx)
+        return str(value)
+
+
+def _refuse_empty(
+    kind: click.ParamType,  # type: ignore[type-arg]
+    value: object,
+    param: click.Parameter | None,
+    ctx: click.Context | None,
+) -> None:
+    if value == "":  # of a path pathlib would make the current folder
+        kind.fail("it is empty; name something, or leave it out (is a variable not set?)", param, ctx)
+
+
 class OldFile(click.Path):
     """A file to be read, or a folder; whether it can be is told where it is: of several projects it stops
     none but its own.
@@ -63,6 +84,11 @@ class OldFile(click.Path):
 
     def __init__(self) -> None:
         super().__init__(readable=False, path_type=Path)
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Path:
+        """Its path; ends with click's message where it has no name."""
+        _refuse_empty(self, value, param, ctx)
+        return Path(os.fsdecode(super().convert(value, param, ctx)))
 
 
 class NewFile(click.Path):
@@ -75,7 +101,8 @@ class NewFile(click.Path):
         self.image = image
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Path:
-        """Its path; ends with click's message for a project or a photo, also behind a link."""
+        """Its path; ends with click's message for none, or a project or a photo, also behind a link."""
+        _refuse_empty(self, value, param, ctx)
         path = Path(os.fsdecode(super().convert(value, param, ctx)))
         for name in (str(path).lower(), os.path.realpath(path).lower()):
             if name.endswith(".pto"):

@@ -94,6 +94,8 @@ def test_files_are_meant_from_the_folder_of_the_settings(calls: Calls, shoot: Pa
         ('softmax-sharpness = "3"', ["a number"]),
         ('layers = "a.tif"', ["a list of texts"]),
         ('seam = "maybe"', ["--seam", "maybe"]),
+        ('prefix = ""', ["prefix is ''", "some text"]),
+        ('layers = ["a.tif", ""]', ["a list of texts"]),
         ("jpeg-quality = 101", ["--jpeg-quality", "101"]),
         ("seam = off", ["no TOML", "line 1"]),
         ("resume = true\nforce = true", ["contradict"]),

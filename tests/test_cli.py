@@ -140,6 +140,12 @@ def test_layers_takes_several_files(calls: Calls, given: str, layers: str, proje
         (["a.pto", "b.pto", "--layers", "x.tif"], "--layers is for one project, but there are 2"),
         (["a.pto", "--prefix", "x", "--layers", "x.tif"], "--prefix and --layers"),
         (["-q", "-v", "a.pto"], "-q and -v"),
+        ([""], "'PROJECT...': it is empty"),  # pathlib's current folder
+        *(
+            ([option, "", "a.pto"], f"'{option}': it is empty")
+            for option in ("--prefix", "--layers", "--device", "--scheduler", "--config", "--report", "--log")
+        ),
+        (["-o", "", "a.pto"], "'--output': it is empty"),
         (["--remap", "sometimes", "a.pto"], "sometimes"),
         (["--jpeg-quality", "101", "a.pto"], "101"),
         (["--softmax-sharpness", "nan", "a.pto"], "nan"),

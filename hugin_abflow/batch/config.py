@@ -78,7 +78,7 @@ _WORDS = {
     "bool": "true or false",
     "int": "a whole number",
     "float": "a number",
-    "str": 'text in quotes ("...")',
+    "str": 'some text in quotes ("...")',
     "list": 'a list of texts (["...", "..."])',
 }
 
@@ -90,8 +90,8 @@ def _check(file: Path, name: str, value: object, kind: str) -> None:
         "bool": isinstance(value, bool),
         "int": number,
         "float": number or isinstance(value, float),
-        "str": isinstance(value, str),
-        "list": isinstance(value, list) and all(isinstance(one, str) for one in value),
+        "str": isinstance(value, str) and value != "",
+        "list": isinstance(value, list) and all(isinstance(one, str) and one for one in value),
     }[kind]
     if not fits:
         raise ConfigError(f"{file}: {name} is {value!r}; give {_WORDS[kind]}")
