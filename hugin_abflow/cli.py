@@ -21,7 +21,7 @@ from hugin_abflow.errors import AbflowError, ExitCode
 from hugin_abflow.found import Remap
 from hugin_abflow.images import COMPRESSIONS
 from hugin_abflow.metadata import PROGRAM, version
-from hugin_abflow.options import ARGUMENTS, Command, Compression, NewFile, OldFile, Option, Size, Text
+from hugin_abflow.options import ARGUMENTS, Command, Compression, NewFile, Number, OldFile, Option, Size, Text
 from hugin_abflow.scratch import is_folder
 from hugin_abflow.settings import FlowQuality, LargeMotion, MergeMode, Settings
 from hugin_abflow.signals import interruptible
@@ -161,7 +161,7 @@ _information = partial(click.option, cls=Option, group="Information")
 @_blending(
     "--softmax-sharpness",
     metavar="NUMBER",
-    type=float,
+    type=Number(),
     default=_DEFAULTS.softmax_sharpness,
     show_default=False,  # click would write 10.0
     help="How suddenly one layer takes over from the next, 0 (average) to 1000 (cut). "
@@ -170,7 +170,7 @@ _information = partial(click.option, cls=Option, group="Information")
 @_blending(
     "--flow-magnitude",
     metavar="NUMBER",
-    type=float,
+    type=Number(),
     default=_DEFAULTS.flow_magnitude,
     show_default=False,
     help="How much a layer in which near things shift is preferred, 0 (not) to 10000. "

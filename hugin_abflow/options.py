@@ -12,7 +12,7 @@ import click
 from hugin_abflow import memory
 from hugin_abflow.errors import SettingsError
 from hugin_abflow.images import COMPRESSIONS, ENDINGS
-from hugin_abflow.settings import MOST_MEMORY
+from hugin_abflow.settings import MOST_MEMORY, Settings
 
 # Where a context keeps the arguments as they were given.
 ARGUMENTS = "hugin_abflow.arguments"
@@ -54,6 +54,21 @@ class Compression(click.ParamType):  # type: ignore[type-arg]
         if str(value).lower() not in known:
             self.fail(f"{value!r} is no compression; choose one of {', '.join(known)}", param, ctx)
         return str(value)
+
+
+class Number(click.types.FloatParamType):
+    """A number that the setting of the option's name may have, by `Settings`' own range."""
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> float:
+        """The number; ends with click's message, which names the option, for one out of range."""
+        number = float(super().convert(value, param, ctx))
+        if param is not None:
+            chosen: dict[str, Any] = {str(param.name): number}
+            try:
+                Settings(**chosen)
+            except SettingsError as error:
+                self.fail(str(error).removeprefix(f"{param.name} is "), param, ctx)
+        return number
 
 
 class Text(click.ParamType):  # type: ignore[type-arg]

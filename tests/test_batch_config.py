@@ -97,6 +97,7 @@ def test_files_are_meant_from_the_folder_of_the_settings(calls: Calls, shoot: Pa
         ('prefix = ""', ["prefix is ''", "some text"]),
         ('layers = ["a.tif", ""]', ["a list of texts"]),
         ("jpeg-quality = 101", ["--jpeg-quality", "101"]),
+        ("softmax-sharpness = nan", ["'--softmax-sharpness': nan; choose a value from 0 to 1000"]),
         ("seam = off", ["no TOML", "line 1"]),
         ("resume = true\nforce = true", ["contradict"]),
     ],
