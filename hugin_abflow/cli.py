@@ -125,8 +125,8 @@ _information = partial(click.option, cls=Option, group="Information")
     type=click.Choice(get_args(Remap)),
     default="auto",
     show_default=True,
-    help="Make the layers with nona. auto: only if they are missing, cannot be opened, or are older than "
-    "the project or its photos.",
+    help="Make the layers with nona. auto: only if they are missing or older than the project or its photos, "
+    "or some cannot be opened, have no alpha or are of another canvas.",
 )
 @_layers("--keep-layers", is_flag=True, help="Keep the layers that nona made, beside the project.")
 @_blending(

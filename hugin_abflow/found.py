@@ -14,6 +14,7 @@ from typing import Literal
 from hugin_abflow import tifftags
 from hugin_abflow.errors import ImageReadError, LayersMissingError
 from hugin_abflow.images import read_layers
+from hugin_abflow.layer import Layer, misfit
 from hugin_abflow.project import Plan, PlannedImage, file_key
 from hugin_abflow.scratch import is_file
 
@@ -49,13 +50,30 @@ class Found:
         return [file for file, time in newest.items() if _time(file) < time - _STALE_SECONDS]
 
     @cached_property
-    def broken(self) -> Path | None:
-        """The first that is no image, or not one that a layer can be; pixels are not looked at."""
+    def _opened(self) -> dict[Path, list[Layer]]:
+        """The layers by their files, up to the first that is no image, or not one that a layer can be: it has
+        none. Pixels are not looked at.
+        """
+        opened: dict[Path, list[Layer]] = {}
         for file in self.in_order():
             try:
-                read_layers(file)
+                opened[file] = read_layers(file)
             except ImageReadError:
-                return file
+                return opened | {file: []}
+        return opened
+
+    @property
+    def broken(self) -> bool:
+        """Whether one is no image, or not one that a layer can be."""
+        return not all(self._opened.values())
+
+    def unusable(self, plan: Plan) -> str | None:
+        """The first that cannot be a layer of the project, and why, in words; None if all can be."""
+        for file, layers in self._opened.items():
+            if not layers:
+                return f"{file} cannot be read"
+            if why := next(filter(None, (misfit(layer, plan.canvas) for layer in layers)), None):
+                return f"{file} {why}"
         return None
 
     def in_order(self) -> list[Path]:
@@ -111,11 +129,11 @@ def candidates(plan: Plan) -> list[Found]:
 
 
 def find(plan: Plan) -> Found | None:
-    """The best of the candidates: whole, complete and fresh ones first."""
+    """The best of the candidates: usable, complete and fresh ones first."""
     found = candidates(plan)
     if len(found) < 2:  # then it need not be looked into
         return found[0] if found else None
-    return min(found, key=lambda f: (bool(f.broken), bool(f.missing(plan)), bool(f.stale(plan))))
+    return min(found, key=lambda f: (bool(f.unusable(plan)), bool(f.missing(plan)), bool(f.stale(plan))))
 
 
 def layers_there(
