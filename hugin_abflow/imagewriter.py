@@ -23,7 +23,7 @@ from hugin_abflow import tiffwriter, trace
 from hugin_abflow.errors import OutputError
 from hugin_abflow.exif import Metadata, embed
 from hugin_abflow.layer import full_scale
-from hugin_abflow.scratch import is_special, part_beside
+from hugin_abflow.scratch import is_special, part_beside, put
 
 Pixels = npt.NDArray[Any]
 
@@ -283,7 +283,7 @@ class ImageWriter:
                 self._tiff = None
             if self.metadata:
                 embed(self._part, self.format, self.metadata)
-            self._part.replace(self._final)
+            put(self._part, self._final)
 
     def _discard(self) -> None:
         """Close and remove what is not finished; nothing is left of it after `_finish`."""

@@ -89,9 +89,17 @@ def write_whole(final: Path, data: bytes) -> None:
     """
     with part_beside(final, ".part") as part:
         part.write_bytes(data)
-        if final.exists():
-            shutil.copymode(final, part)
-        part.replace(final)
+        put(part, final)
+
+
+def put(part: Path, final: Path) -> None:
+    """Give a file that is whole its final name; one that it replaces leaves it its permissions.
+
+    Raises OSError.
+    """
+    with suppress(OSError):  # there is none, or a file system that knows no permissions
+        shutil.copymode(final, part)
+    part.replace(final)
 
 
 def _create(final: Path, suffix: str) -> tuple[Path, int | None]:
