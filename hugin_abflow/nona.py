@@ -366,6 +366,9 @@ def _failure(
 ) -> AbflowError:
     """What to raise for a run of nona over `images` that failed; it does not always say which is to blame."""
     said = "\n  ".join(lines) or "(nothing)"
+    for image in images:
+        if any(f"Unable to open file '{name}'" in said for name in (image.name, image.photo)):
+            return ImageReadError(f"{image.photo} cannot be opened; check its permissions")
     images = [image for image in images if named_in_unicode(image.photo)]  # else they cannot be opened here
     if "did not find a matching file type" in said:
         for image in images:
