@@ -45,11 +45,12 @@ ENDINGS = {
     ".png": "png",
     ".exr": "openexr",
 }
-# What the documentation names; more is understood, since projects and other programs say it.
+# What the documentation names; more is understood, since projects and other programs say it. What is usual.
 COMPRESSIONS = {
     "TIFF": ("none", "packbits", "lzw", "deflate", "zstd", "jpeg"),
     "EXR": ("none", "rle", "zips", "zip", "piz"),
 }
+DEFAULTS, JPEG_QUALITY = {"tiff": "lzw", "openexr": "zip"}, 90
 _TIFF_COMPRESSIONS = {name: name for name in tiffwriter.COMPRESSIONS} | {"zip": "deflate"}
 _EXR_COMPRESSIONS = {"none": "none", "rle": "rle", "zip": "zip", "zips": "zips", "piz": "piz"}
 _PNG_LEVEL = 4  # twice as fast as zlib's usual 6 for 2 % more bytes
@@ -401,30 +402,25 @@ def _stored_dtype(
 
 
 def _jpeg_quality(path: Path, quality: int | None) -> int:
-    quality = 90 if quality is None else quality
+    quality = JPEG_QUALITY if quality is None else quality
     if not 1 <= quality <= 100:
         raise OutputError(f"{path}: JPEG quality {quality}; choose 1 to 100")
     return quality
 
 
 def _compression(
-    path: Path,
-    format_name: str,
-    stored: np.dtype[Any],
-    channels: int,
-    name: str | None,
-    jpeg_quality: int | None,
+    path: Path, kind: str, stored: np.dtype[Any], channels: int, name: str | None, jpeg_quality: int | None
 ) -> tuple[str, str | None]:
     """(what is really used, OpenImageIO's name for it)."""
-    if format_name == "jpeg":
+    if kind == "jpeg":
         quality = f"jpeg:{_jpeg_quality(path, jpeg_quality)}"
         return quality, quality
-    if format_name == "png":
+    if kind == "png":
         return "deflate", None
-    known = _TIFF_COMPRESSIONS if format_name == "tiff" else _EXR_COMPRESSIONS
-    wanted = (name or ("lzw" if format_name == "tiff" else "zip")).lower()
+    known = _TIFF_COMPRESSIONS if kind == "tiff" else _EXR_COMPRESSIONS
+    wanted = (name or DEFAULTS[kind]).lower()
     if wanted not in known:
-        offered = ", ".join(COMPRESSIONS["TIFF" if format_name == "tiff" else "EXR"])
+        offered = ", ".join(COMPRESSIONS["TIFF" if kind == "tiff" else "EXR"])
         raise OutputError(f"{path}: compression {name!r}; choose one of {offered}")
     used = known[wanted]
     if used == "jpeg":
