@@ -128,9 +128,12 @@ def _find_in_jpeg(file: BinaryIO) -> bytes:
     """The EXIF block of a JPEG file."""
     file.seek(2)
     while True:
-        mark, kind, length = struct.unpack(">BBH", file.read(4))
+        mark, kind = struct.unpack(">BB", file.read(2))
+        while mark == kind == 0xFF:  # any number of bytes may fill up what is before a segment
+            (kind,) = struct.unpack(">B", file.read(1))
         if mark != 0xFF or kind == _SCAN:
             return b""
+        (length,) = struct.unpack(">H", file.read(2))
         content = file.read(length - 2)
         if kind == _APP1 and content.startswith(_EXIF_MARK):
             return content[len(_EXIF_MARK) :]

@@ -141,6 +141,15 @@ def test_tiff_of_either_byte_order_and_many_pages(tmp_path: Path, order: str, bi
             np.testing.assert_array_equal(page.asarray(), expected)
 
 
+@pytest.mark.parametrize("count", [1, 2, 7])
+def test_jpeg_may_fill_up_before_a_segment(tmp_path: Path, count: int) -> None:
+    path = tmp_path / "a.jpg"
+    picture(path, metadata=Metadata(TAGS))
+    content = path.read_bytes()
+    path.write_bytes(content.replace(b"\xff\xe1", b"\xff" * count + b"\xff\xe1", 1))
+    assert text_of(read_exif(path)[MAIN][MAKE]) == "Acme"
+
+
 def test_values_that_are_too_long_for_jpeg_are_left_out_and_told(
     exiftool: str, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
