@@ -21,7 +21,7 @@ import OpenImageIO as oiio  # noqa: N813
 
 from hugin_abflow import tiffwriter, trace
 from hugin_abflow.errors import OutputError
-from hugin_abflow.exif import Metadata, embed
+from hugin_abflow.exif import Metadata, embed, place_in_png
 from hugin_abflow.layer import full_scale
 from hugin_abflow.scratch import is_special, part_beside, put
 
@@ -72,7 +72,8 @@ class ImageWriter:
     depth           samples that are stored: one of these; TIFF: float64 too; default: `dtype`.
                     Black and white stay what they are (65535 of uint16 is 1.0 of floats). JPEG is written
                     with 8 bit, PNG with 8 or 16; EXR needs floats.
-    offset          (x, y) on the canvas: TIFF position at 150 dpi as enblend writes it, EXR data window.
+    offset          (x, y) on the canvas: TIFF position at 150 dpi and PNG position as enblend writes them,
+                    EXR data window.
     canvas_size     (width, height) for the EXR display window; default: the data window.
     compression     TIFF: none, lzw (default), packbits, deflate, zstd, jpeg (8-bit RGB, else deflate, with
                     a warning; it blurs alpha, too). EXR: none, rle, zips, zip (default),
@@ -282,6 +283,8 @@ class ImageWriter:
             if self._tiff:
                 self._tiff.close()
                 self._tiff = None
+            if self.format == "png":
+                place_in_png(self._part, *self._offset)
             if self.metadata:
                 embed(self._part, self.format, self.metadata)
             put(self._part, self._final)
