@@ -50,9 +50,12 @@ COMPRESSIONS = {
     "TIFF": ("none", "packbits", "lzw", "deflate", "zstd", "jpeg"),
     "EXR": ("none", "rle", "zips", "zip", "piz"),
 }
-DEFAULTS, JPEG_QUALITY = {"tiff": "lzw", "openexr": "zip"}, 90
-_TIFF_COMPRESSIONS = {name: name for name in tiffwriter.COMPRESSIONS} | {"zip": "deflate"}
-_EXR_COMPRESSIONS = {"none": "none", "rle": "rle", "zip": "zip", "zips": "zips", "piz": "piz"}
+DEFAULTS, JPEG_QUALITY = {"tiff": "lzw", "openexr": "zip", "jpeg": "jpeg", "png": "deflate"}, 90
+_KNOWN = {
+    "tiff": {name: name for name in tiffwriter.COMPRESSIONS} | {"zip": "deflate"},
+    "openexr": {name: name for name in COMPRESSIONS["EXR"]},
+    "jpeg": {"jpeg": "jpeg"}, "png": {"deflate": "deflate", "zip": "deflate"},
+}  # fmt: skip
 _PNG_LEVEL = 4  # twice as fast as zlib's usual 6 for 2 % more bytes
 _JPEG_LIMIT = 65500  # pixels a side, of libjpeg
 _JPEG_WORST, _JPEG_LEAST = 2, 1 << 16  # bytes that noise takes for each sample, and a file beside them
@@ -72,12 +75,11 @@ class ImageWriter:
     depth           samples that are stored: one of these; TIFF: float64 too; default: `dtype`.
                     Black and white stay what they are (65535 of uint16 is 1.0 of floats). JPEG is written
                     with 8 bit, PNG with 8 or 16; EXR needs floats.
-    offset          (x, y) on the canvas: TIFF position at 150 dpi and PNG position as enblend writes them,
-                    EXR data window.
+    offset          (x, y) on the canvas: TIFF's (at 150 dpi) and PNG's as of enblend, EXR's data window.
     canvas_size     (width, height) for the EXR display window; default: the data window.
     compression     TIFF: none, lzw (default), packbits, deflate, zstd, jpeg (8-bit RGB, else deflate, with
                     a warning; it blurs alpha, too). EXR: none, rle, zips, zip (default),
-                    piz. JPEG and PNG: not used.
+                    piz. JPEG and PNG have but their own, jpeg and deflate.
     jpeg_quality    of JPEG, and of jpeg in TIFF; 1..100, default 90.
     threads         cores that encode TIFF; default: all.
     icc             profile, carried as it is; PNG leaves a broken one out, with a warning.
@@ -415,23 +417,21 @@ def _compression(
     path: Path, kind: str, stored: np.dtype[Any], channels: int, name: str | None, jpeg_quality: int | None
 ) -> tuple[str, str | None]:
     """(what is really used, OpenImageIO's name for it)."""
+    known = _KNOWN[kind]
+    wanted = (name or DEFAULTS[kind]).lower()
+    if wanted not in known:
+        offered = ", ".join(COMPRESSIONS.get({"tiff": "TIFF", "openexr": "EXR"}.get(kind, ""), known))
+        raise OutputError(f"{path}: compression {name!r}; choose one of {offered}")
     if kind == "jpeg":
         quality = f"jpeg:{_jpeg_quality(path, jpeg_quality)}"
         return quality, quality
-    if kind == "png":
-        return "deflate", None
-    known = _TIFF_COMPRESSIONS if kind == "tiff" else _EXR_COMPRESSIONS
-    wanted = (name or DEFAULTS[kind]).lower()
-    if wanted not in known:
-        offered = ", ".join(COMPRESSIONS["TIFF" if kind == "tiff" else "EXR"])
-        raise OutputError(f"{path}: compression {name!r}; choose one of {offered}")
     used = known[wanted]
     if used == "jpeg":
         if stored != np.uint8 or channels != 3:  # of grey OpenImageIO misreads the alpha
             log.warning("%s: jpeg in TIFF is for 8-bit RGB; deflate is used", path)
             return "deflate", None
         return f"jpeg:{_jpeg_quality(path, jpeg_quality)}", None
-    return used, used
+    return used, None if kind == "png" else used
 
 
 def _to_depth(rows: Pixels, stored: np.dtype[Any]) -> Pixels:

@@ -21,6 +21,7 @@ from hugin_abflow.merge import (
     guides_of,
     merge_project,
     refuse_input,
+    storable,
     write_panorama,
 )
 from hugin_abflow.metadata import describe
@@ -122,7 +123,7 @@ def show_project(
         f"{canvas.crop.width} x {canvas.crop.height} of {canvas.width} x {canvas.height}",
         shlex.join(["cd", str(plan.folder)]),
     ]
-    stored = _storing(compression, jpeg_quality)
+    stored = _storing(compression if output else storable(plan, compression), jpeg_quality)
     if output or prefix or layers:
         if output:
             target = str(Path(output).absolute())
@@ -161,8 +162,8 @@ def _differing(asked: Output, own: Output) -> list[str]:
     for: a project that makes several panoramas may store them in several ways.
     """
     kind, alike = ENDINGS[asked.ending], ENDINGS[asked.ending] == ENDINGS[own.ending]
-    usual = (own.compression if alike else None) or DEFAULTS.get(kind, "")
-    wanted = asked.compression or DEFAULTS.get(kind, "")
+    usual = (own.compression if alike else None) or DEFAULTS[kind]
+    wanted = asked.compression or DEFAULTS[kind]
     quality = own.jpeg_quality if alike else JPEG_QUALITY
     of_jpeg = "jpeg" in (kind, wanted.lower())
     return _storing(

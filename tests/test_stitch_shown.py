@@ -15,6 +15,7 @@ from pictures import one_device
 from test_hugin import CANVAS, stacked
 from test_stitch import asked, programs
 
+from hugin_abflow.errors import OutputError
 from hugin_abflow.outputs import Kind
 from hugin_abflow.settings import Settings
 from hugin_abflow.stitch import show_project, stitch_project
@@ -78,6 +79,24 @@ def test_what_is_shown_works_for_names_with_a_dash_in_front(
     monkeypatch.setenv("PATH", str(folder), prepend=os.pathsep)
     subprocess.run(["sh", "-e", "-c", script], cwd=tmp_path, check=True, capture_output=True)
     assert {name: compression_of(project.parent / name) for name in made} == made
+
+
+@pytest.mark.parametrize("kind", ["jpg", "png"])
+def test_a_compression_for_other_types_leaves_jpeg_and_png_as_they_are(
+    make_project: ProjectMaker, kind: str
+) -> None:
+    """In a run over several projects they may be of several types; who names the file is told."""
+    extra = asked(Kind.PANORAMA, extra=f"#hugin_outputImageType {kind}\n")
+    project = make_project(panorama=CANVAS, yaws=(0, 60), extra=extra)
+    settings, name = Settings(flow=False), f"pano.{kind}"
+    line = ours(show_project(project, settings, compression="lzw"), name)
+    assert "--compression" not in line
+    (made,) = stitch_project(project, settings, compression="lzw")
+    assert made.name == name
+    own = {"jpg": "jpeg", "png": "deflate"}[kind]
+    with pytest.raises(OutputError, match=rf"pano\.{kind}: compression 'lzw'; choose one of {own}"):
+        stitch_project(project, settings, output=made, compression="lzw")
+    assert stitch_project(project, settings, output=made, compression=own.upper()) == [made]
 
 
 def compression_of(path: Path) -> str:
