@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -82,11 +82,17 @@ def _known(command: click.Command) -> tuple[dict[str, str], list[str]]:
     return {name: kind_of(option) for name, option in names.items()}, paths
 
 
-def config_text(
-    command: click.Command, file: Path | None, values: Mapping[str, Any], projects: Sequence[Path]
-) -> str:
-    """The answer to --print-config: options `values` as a file of settings, from which file and for whom."""
+def config_texts(
+    command: click.Command, chosen: Mapping[Path, tuple[Path | None, Mapping[str, Any]]]
+) -> Iterator[str]:
+    """The answer to --print-config: options as they would be in a file of settings, once for each such file.
+
+    chosen      by project: its file, if it has one, and its options; a path without a name is no project.
+    """
     names = long_names(command)
-    plain = {name: values[str(names[name].name)] for name in _known(command)[0]}
-    origin = [f"# {file or f'no {NAME}'}", *(f"# for {project}" for project in projects)]
-    return "\n".join([*origin, write_config(plain)])
+    for file in dict.fromkeys(file for file, _ in chosen.values()):
+        projects = [project for project, (its_file, _) in chosen.items() if its_file == file]
+        values = chosen[projects[0]][1]
+        plain = {name: values[str(names[name].name)] for name in _known(command)[0]}
+        origin = [f"# {file or f'no {NAME}'}", *(f"# for {one}" for one in projects if one.name)]
+        yield "\n".join([*origin, write_config(plain)])

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any, get_args
@@ -15,13 +15,14 @@ from hugin_abflow.batch.queue import find_projects, refuse_same_output
 from hugin_abflow.batch.run import Run, default_jobs, run, show
 from hugin_abflow.batch.task import Task
 from hugin_abflow.batch.watch import watch
-from hugin_abflow.choices import OF_THE_RUN, choose, config_text, for_several, words
+from hugin_abflow.choices import OF_THE_RUN, choose, config_texts, for_several, words
 from hugin_abflow.devices import list_devices
 from hugin_abflow.errors import AbflowError, ExitCode
 from hugin_abflow.found import Remap
 from hugin_abflow.images import COMPRESSIONS
 from hugin_abflow.metadata import PROGRAM, version
-from hugin_abflow.options import ARGUMENTS, Command, Compression, NewFile, Option, Size
+from hugin_abflow.options import ARGUMENTS, Command, Compression, NewFile, Number, OldFile, Option, Size, Text
+from hugin_abflow.scratch import is_folder
 from hugin_abflow.settings import FlowQuality, LargeMotion, MergeMode, Settings
 from hugin_abflow.signals import interruptible
 from hugin_abflow.terminal import complain, print_result, say
@@ -66,7 +67,7 @@ def _print_devices(context: click.Context, parameter: click.Parameter, wanted: b
     context.exit(ExitCode.OK)
 
 
-_file, _new_file, _new_image = click.Path(path_type=Path), NewFile(), NewFile(image=True)
+_file, _new_file, _new_image = OldFile(), NewFile(), NewFile(image=True)
 _layers = partial(click.option, cls=Option, group="Layers")
 _blending = partial(click.option, cls=Option, group="Blending", show_default=True)
 _switch = partial(_blending, type=click.Choice(["auto", "off"]), default="auto")
@@ -107,6 +108,7 @@ _information = partial(click.option, cls=Option, group="Information")
 @_layers(
     "--prefix",
     metavar="PREFIX",
+    type=Text(),
     help="Take the layers PREFIX0000.tif, PREFIX0001.tif ..., as they are; relative to the current or the "
     "project's folder. [default: the project's name, then Hugin's default prefix]",
 )
@@ -123,8 +125,8 @@ _information = partial(click.option, cls=Option, group="Information")
     type=click.Choice(get_args(Remap)),
     default="auto",
     show_default=True,
-    help="Make the layers with nona. auto: only if they are missing, cannot be opened, or are older than "
-    "the project or its photos.",
+    help="Make the layers with nona. auto: only if they are missing or older than the project or its photos, "
+    "or some cannot be opened, have no alpha or are of another canvas.",
 )
 @_layers("--keep-layers", is_flag=True, help="Keep the layers that nona made, beside the project.")
 @_blending(
@@ -159,7 +161,7 @@ _information = partial(click.option, cls=Option, group="Information")
 @_blending(
     "--softmax-sharpness",
     metavar="NUMBER",
-    type=float,
+    type=Number(),
     default=_DEFAULTS.softmax_sharpness,
     show_default=False,  # click would write 10.0
     help="How suddenly one layer takes over from the next, 0 (average) to 1000 (cut). "
@@ -168,7 +170,7 @@ _information = partial(click.option, cls=Option, group="Information")
 @_blending(
     "--flow-magnitude",
     metavar="NUMBER",
-    type=float,
+    type=Number(),
     default=_DEFAULTS.flow_magnitude,
     show_default=False,
     help="How much a layer in which near things shift is preferred, 0 (not) to 10000. "
@@ -191,6 +193,7 @@ _information = partial(click.option, cls=Option, group="Information")
 @_blending(
     "--device",
     metavar="DEVICE",
+    type=Text(),
     show_default=False,
     help="The OpenCL device: its number in --list-devices, or a part of its name. "
     "[default: the fastest GPU, else the CPU]",
@@ -219,6 +222,7 @@ _information = partial(click.option, cls=Option, group="Information")
 @_batch(
     "--scheduler",
     metavar="ADDRESS",
+    type=Text(),
     help="Have the workers of a Dask cluster do the work, over shared storage. ADDRESS: of its scheduler, "
     "such as tcp://host:8786.",
 )
@@ -292,7 +296,7 @@ def command(projects: tuple[Path, ...], **given: Any) -> ExitCode:
         raise click.UsageError("--dry-run is about projects that are there; leave out --watch")
     # what concerns the run as a whole is said beside what is named first
     place = places[0] if places else Path()
-    first = config or find_config(place / "any" if place.is_dir() else place, places)
+    first = config or find_config(place / "any" if is_folder(place) else place, places)
     recursive, resume, force, how = _run_options(**_chosen(first))
 
     def options(project: Path) -> tuple[Path | None, dict[str, Any]]:
@@ -308,7 +312,9 @@ def command(projects: tuple[Path, ...], **given: Any) -> ExitCode:
     found = find_projects(projects, recursive)
     chosen = {project: options(project) for project in found}
     if given["print_config"]:
-        return _print_configs(chosen or {Path(): (first, _chosen(first))})
+        for text in config_texts(command, chosen or {Path(): (first, _chosen(first))}):
+            print_result(text)
+        return ExitCode.OK
     tasks = {project: _options(**values) for project, (_, values) in chosen.items()}
     if len(found) > 1:
         for its_options in tasks.values():
@@ -317,7 +323,7 @@ def command(projects: tuple[Path, ...], **given: Any) -> ExitCode:
     if given["dry_run"]:
         spoken = {project: words(command, values) for project, (_, values) in chosen.items()}
         return show({project: {**tasks[project], "options": spoken[project]} for project in tasks})
-    remember = resume or force or len(found) > 1 or any(place.is_dir() for place in projects)
+    remember = resume or force or len(found) > 1 or any(map(is_folder, projects))
     return run(
         [Task(project, options, remember and not force, remember) for project, options in tasks.items()],
         how,
@@ -341,14 +347,6 @@ def _saved(
             yield Task(project, _options(**options(project)[1]), not force, True) if project else None
         except (AbflowError, click.UsageError) as error:
             complain(f"{project}: {error.format_message() if isinstance(error, click.UsageError) else error}")
-
-
-def _print_configs(chosen: Mapping[Path, tuple[Path | None, dict[str, Any]]]) -> ExitCode:
-    """Answer --print-config, once for each file of settings."""
-    for file in dict.fromkeys(file for file, _ in chosen.values()):
-        projects = [project for project, (its_file, _) in chosen.items() if its_file == file]
-        print_result(config_text(command, file, chosen[projects[0]][1], [p for p in projects if p.name]))
-    return ExitCode.OK
 
 
 def _run_options(

@@ -48,6 +48,8 @@ def kind_of(device: cl.Device) -> str:
 def _devices(threads: int = 0) -> list[cl.Device]:
     """All devices of all platforms; `DeviceError` where there is none. threads: as of `Device`."""
     pocl.find_cache()
+    if kept := pocl.kernel_folder():
+        pocl.mend(kept)
     found, platforms = [], []
     with pocl.cores(threads), signals.held():  # drivers are loaded
         with suppress(cl.Error):

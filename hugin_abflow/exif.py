@@ -128,20 +128,23 @@ def _find_in_jpeg(file: BinaryIO) -> bytes:
     """The EXIF block of a JPEG file."""
     file.seek(2)
     while True:
-        mark, kind, length = struct.unpack(">BBH", file.read(4))
+        mark, kind = struct.unpack(">BB", file.read(2))
+        while mark == kind == 0xFF:  # any number of bytes may fill up what is before a segment
+            (kind,) = struct.unpack(">B", file.read(1))
         if mark != 0xFF or kind == _SCAN:
             return b""
+        (length,) = struct.unpack(">H", file.read(2))
         content = file.read(length - 2)
         if kind == _APP1 and content.startswith(_EXIF_MARK):
             return content[len(_EXIF_MARK) :]
 
 
-def _find_in_png(file: BinaryIO) -> bytes:
-    """The EXIF block of a PNG file."""
+def _find_in_png(file: BinaryIO, wanted: bytes = b"eXIf") -> bytes:
+    """The content of a PNG file's chunk, EXIF's by default, behind which the file is then."""
     file.seek(len(_PNG))
     while head := file.read(8):
         length, kind = struct.unpack(">I4s", head)
-        if kind == b"eXIf":
+        if kind == wanted:
             return file.read(length)
         file.seek(length + 4, SEEK_CUR)
     return b""
@@ -206,6 +209,20 @@ def _insert_in_png(path: Path, metadata: Metadata) -> None:
         empty = len(_find_in_png(file))
         at = file.tell() - empty - 8 if empty else len(_PNG) + 25
         _insert(file, at, chunks, replaced=empty + 12 if empty else 0)
+
+
+def place_in_png(path: Path, left: int, top: int) -> None:
+    """Have a PNG file say where on the canvas it lies, in pixels, as enblend's do; before the pixels.
+
+    Raises `OSError`.
+    """
+    chunk = _chunk(b"oFFs", struct.pack(">iiB", left, top, 0))
+    with path.open("r+b") as file:
+        if said := _find_in_png(file, b"oFFs"):  # OpenImageIO says 0, 0
+            file.seek(file.tell() - len(said) - 8)
+            file.write(chunk)
+        else:
+            _insert(file, len(_PNG) + 25, chunk)
 
 
 def _chunk(kind: bytes, content: bytes) -> bytes:

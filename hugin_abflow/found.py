@@ -14,7 +14,9 @@ from typing import Literal
 from hugin_abflow import tifftags
 from hugin_abflow.errors import ImageReadError, LayersMissingError
 from hugin_abflow.images import read_layers
-from hugin_abflow.project import Plan, PlannedImage
+from hugin_abflow.layer import Layer, misfit
+from hugin_abflow.project import Plan, PlannedImage, file_key
+from hugin_abflow.scratch import is_file
 
 _log = logging.getLogger(__name__)
 
@@ -48,13 +50,30 @@ class Found:
         return [file for file, time in newest.items() if _time(file) < time - _STALE_SECONDS]
 
     @cached_property
-    def broken(self) -> Path | None:
-        """The first that is no image, or not one that a layer can be; pixels are not looked at."""
+    def _opened(self) -> dict[Path, list[Layer]]:
+        """The layers by their files, up to the first that is no image, or not one that a layer can be: it has
+        none. Pixels are not looked at.
+        """
+        opened: dict[Path, list[Layer]] = {}
         for file in self.in_order():
             try:
-                read_layers(file)
+                opened[file] = read_layers(file)
             except ImageReadError:
-                return file
+                return opened | {file: []}
+        return opened
+
+    @property
+    def broken(self) -> bool:
+        """Whether one is no image, or not one that a layer can be."""
+        return not all(self._opened.values())
+
+    def unusable(self, plan: Plan) -> str | None:
+        """The first that cannot be a layer of the project, and why, in words; None if all can be."""
+        for file, layers in self._opened.items():
+            if not layers:
+                return f"{file} cannot be read"
+            if why := next(filter(None, (misfit(layer, plan.canvas) for layer in layers)), None):
+                return f"{file} {why}"
         return None
 
     def in_order(self) -> list[Path]:
@@ -75,15 +94,15 @@ def layer_path(prefix: str, index: int, ending: str) -> Path:
 def _find_under(plan: Plan, prefix: str) -> Found | None:
     """Layers that begin with `prefix`, if any."""
     endings = (".exr", ".tif", ".tiff") if plan.hdr else (".tif", ".tiff", ".exr")
-    photos = set(plan.photos)  # may be named alike: img0000.tif of img.pto
+    photos = {file_key(photo) for photo in plan.photos}  # may be named alike: img0000.tif of img.pto
     for ending in endings:
         paths = {image.index: layer_path(prefix, image.index, ending) for image in plan.images}
-        files = {index: path for index, path in paths.items() if path.is_file() and path not in photos}
+        files = {i: path for i, path in paths.items() if is_file(path) and file_key(path) not in photos}
         if files:
             return Found(prefix, files)
     for ending in (".tif", ".tiff"):
         pages = Path(prefix + ending).absolute()
-        if _is_multilayer(pages):
+        if file_key(pages) not in photos and _is_multilayer(pages):
             return Found(prefix, {}, pages)
     return None
 
@@ -91,7 +110,7 @@ def _find_under(plan: Plan, prefix: str) -> Found | None:
 def _is_multilayer(path: Path) -> bool:
     """Whether a file is nona's TIFF_multilayer: a finished panorama may have the same name."""
     try:
-        return path.is_file() and any(place.paged for place in tifftags.read_places(path))
+        return is_file(path) and any(place.paged for place in tifftags.read_places(path))
     except ImageReadError:
         return False
 
@@ -110,11 +129,11 @@ def candidates(plan: Plan) -> list[Found]:
 
 
 def find(plan: Plan) -> Found | None:
-    """The best of the candidates: whole, complete and fresh ones first."""
+    """The best of the candidates: usable, complete and fresh ones first."""
     found = candidates(plan)
     if len(found) < 2:  # then it need not be looked into
         return found[0] if found else None
-    return min(found, key=lambda f: (bool(f.broken), bool(f.missing(plan)), bool(f.stale(plan))))
+    return min(found, key=lambda f: (bool(f.unusable(plan)), bool(f.missing(plan)), bool(f.stale(plan))))
 
 
 def layers_there(
@@ -161,7 +180,7 @@ def _better_prefix(plan: Plan, prefix: str) -> str:
         shorter = re.sub(pattern, "", prefix)
         if shorter not in ("", prefix) and any(_find_under(plan, p) for p in _places(plan, shorter)):
             return f"the prefix is what comes before the numbers: --prefix {shorter}"
-    if any(Path(place).is_file() for place in _places(plan, prefix)):
+    if any(is_file(Path(place)) for place in _places(plan, prefix)):
         return f"{prefix} is a file: name all layers with --layers"
     return "check --prefix, or leave it out to have nona make the layers"
 
@@ -169,7 +188,7 @@ def _better_prefix(plan: Plan, prefix: str) -> str:
 def named_files(layers: Sequence[str | Path]) -> list[Path]:
     """Layers that the user named; raises `LayersMissingError` if one is not there."""
     for path in map(Path, layers):
-        if not path.is_file():
+        if not is_file(path):
             raise LayersMissingError(f"{path}: no such layer; check --layers")
     return [Path(path) for path in layers]
 

@@ -20,7 +20,9 @@ from hugin_abflow import tiffreader, tifftags, trace
 from hugin_abflow.errors import ImageReadError
 from hugin_abflow.imagewriter import (
     COMPRESSIONS,
+    DEFAULTS,
     ENDINGS,
+    JPEG_QUALITY,
     ImageWriter,
     check_target,
     named_in_unicode,
@@ -30,7 +32,9 @@ from hugin_abflow.layer import Box, Layer, full_scale
 
 __all__ = [
     "COMPRESSIONS",
+    "DEFAULTS",
     "ENDINGS",
+    "JPEG_QUALITY",
     "ImageWriter",
     "check_target",
     "image_size",

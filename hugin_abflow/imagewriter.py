@@ -21,9 +21,9 @@ import OpenImageIO as oiio  # noqa: N813
 
 from hugin_abflow import tiffwriter, trace
 from hugin_abflow.errors import OutputError
-from hugin_abflow.exif import Metadata, embed
+from hugin_abflow.exif import Metadata, embed, place_in_png
 from hugin_abflow.layer import full_scale
-from hugin_abflow.scratch import is_special, part_beside
+from hugin_abflow.scratch import is_special, part_beside, put
 
 Pixels = npt.NDArray[Any]
 
@@ -45,13 +45,17 @@ ENDINGS = {
     ".png": "png",
     ".exr": "openexr",
 }
-# What the documentation names; more is understood, since projects and other programs say it.
+# What the documentation names; more is understood, since projects and other programs say it. What is usual.
 COMPRESSIONS = {
     "TIFF": ("none", "packbits", "lzw", "deflate", "zstd", "jpeg"),
     "EXR": ("none", "rle", "zips", "zip", "piz"),
 }
-_TIFF_COMPRESSIONS = {name: name for name in tiffwriter.COMPRESSIONS} | {"zip": "deflate"}
-_EXR_COMPRESSIONS = {"none": "none", "rle": "rle", "zip": "zip", "zips": "zips", "piz": "piz"}
+DEFAULTS, JPEG_QUALITY = {"tiff": "lzw", "openexr": "zip", "jpeg": "jpeg", "png": "deflate"}, 90
+_KNOWN = {
+    "tiff": {name: name for name in tiffwriter.COMPRESSIONS} | {"zip": "deflate"},
+    "openexr": {name: name for name in COMPRESSIONS["EXR"]},
+    "jpeg": {"jpeg": "jpeg"}, "png": {"deflate": "deflate", "zip": "deflate"},
+}  # fmt: skip
 _PNG_LEVEL = 4  # twice as fast as zlib's usual 6 for 2 % more bytes
 _JPEG_LIMIT = 65500  # pixels a side, of libjpeg
 _JPEG_WORST, _JPEG_LEAST = 2, 1 << 16  # bytes that noise takes for each sample, and a file beside them
@@ -71,11 +75,11 @@ class ImageWriter:
     depth           samples that are stored: one of these; TIFF: float64 too; default: `dtype`.
                     Black and white stay what they are (65535 of uint16 is 1.0 of floats). JPEG is written
                     with 8 bit, PNG with 8 or 16; EXR needs floats.
-    offset          (x, y) on the canvas: TIFF position at 150 dpi as enblend writes it, EXR data window.
+    offset          (x, y) on the canvas: TIFF's (at 150 dpi) and PNG's as of enblend, EXR's data window.
     canvas_size     (width, height) for the EXR display window; default: the data window.
     compression     TIFF: none, lzw (default), packbits, deflate, zstd, jpeg (8-bit RGB, else deflate, with
                     a warning; it blurs alpha, too). EXR: none, rle, zips, zip (default),
-                    piz. JPEG and PNG: not used.
+                    piz. JPEG and PNG have but their own, jpeg and deflate.
     jpeg_quality    of JPEG, and of jpeg in TIFF; 1..100, default 90.
     threads         cores that encode TIFF; default: all.
     icc             profile, carried as it is; PNG leaves a broken one out, with a warning.
@@ -281,9 +285,11 @@ class ImageWriter:
             if self._tiff:
                 self._tiff.close()
                 self._tiff = None
+            if self.format == "png":
+                place_in_png(self._part, *self._offset)
             if self.metadata:
                 embed(self._part, self.format, self.metadata)
-            self._part.replace(self._final)
+            put(self._part, self._final)
 
     def _discard(self) -> None:
         """Close and remove what is not finished; nothing is left of it after `_finish`."""
@@ -401,38 +407,31 @@ def _stored_dtype(
 
 
 def _jpeg_quality(path: Path, quality: int | None) -> int:
-    quality = 90 if quality is None else quality
+    quality = JPEG_QUALITY if quality is None else quality
     if not 1 <= quality <= 100:
         raise OutputError(f"{path}: JPEG quality {quality}; choose 1 to 100")
     return quality
 
 
 def _compression(
-    path: Path,
-    format_name: str,
-    stored: np.dtype[Any],
-    channels: int,
-    name: str | None,
-    jpeg_quality: int | None,
+    path: Path, kind: str, stored: np.dtype[Any], channels: int, name: str | None, jpeg_quality: int | None
 ) -> tuple[str, str | None]:
     """(what is really used, OpenImageIO's name for it)."""
-    if format_name == "jpeg":
+    known = _KNOWN[kind]
+    wanted = (name or DEFAULTS[kind]).lower()
+    if wanted not in known:
+        offered = ", ".join(COMPRESSIONS.get({"tiff": "TIFF", "openexr": "EXR"}.get(kind, ""), known))
+        raise OutputError(f"{path}: compression {name!r}; choose one of {offered}")
+    if kind == "jpeg":
         quality = f"jpeg:{_jpeg_quality(path, jpeg_quality)}"
         return quality, quality
-    if format_name == "png":
-        return "deflate", None
-    known = _TIFF_COMPRESSIONS if format_name == "tiff" else _EXR_COMPRESSIONS
-    wanted = (name or ("lzw" if format_name == "tiff" else "zip")).lower()
-    if wanted not in known:
-        offered = ", ".join(COMPRESSIONS["TIFF" if format_name == "tiff" else "EXR"])
-        raise OutputError(f"{path}: compression {name!r}; choose one of {offered}")
     used = known[wanted]
     if used == "jpeg":
         if stored != np.uint8 or channels != 3:  # of grey OpenImageIO misreads the alpha
             log.warning("%s: jpeg in TIFF is for 8-bit RGB; deflate is used", path)
             return "deflate", None
         return f"jpeg:{_jpeg_quality(path, jpeg_quality)}", None
-    return used, used
+    return used, None if kind == "png" else used
 
 
 def _to_depth(rows: Pixels, stored: np.dtype[Any]) -> Pixels:

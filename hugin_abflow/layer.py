@@ -195,28 +195,29 @@ def check_canvas(canvas: Canvas) -> None:
         )
 
 
+def misfit(layer: Layer, canvas: Canvas) -> str | None:
+    """Why it cannot be one of the canvas's layers, in words that follow its name; None if it can."""
+    box, size = layer.box, f"{canvas.width}x{canvas.height}"
+    if not layer.has_alpha:
+        return "has no alpha channel, so nothing says where it ends"
+    if made_for := other_canvas(layer, canvas):
+        return f"was made for a canvas of {made_for}, the project's is {size}"
+    if min(box.left, box.top) < 0 or box.right > canvas.width or box.bottom > canvas.height:
+        columns, rows = f"{box.left} to {box.right}", f"{box.top} to {box.bottom}"
+        return f"covers columns {columns} and rows {rows}, outside the canvas of {size}"
+    return None
+
+
 def check_layers(canvas: Canvas, layers: Sequence[Layer]) -> None:
     """Raise `LayersMismatchError` unless the layers fit the canvas and each other.
 
     Alpha, canvas size (where a layer's file tells it), place inside the canvas, depth, number of channels.
     """
-    size = f"{canvas.width}x{canvas.height}"
     again = "make the layers again with nona, or leave the file out"
     for layer in layers:
-        name, box, first = layer.file or layer.name, layer.box, layers[0]
-        if not layer.has_alpha:
-            raise LayersMismatchError(
-                f"{name} has no alpha channel, so nothing says where it ends; have nona write TIFF"
-            )
-        if made_for := other_canvas(layer, canvas):
-            raise LayersMismatchError(
-                f"{name} was made for a canvas of {made_for}, the project's is {size}; {again}"
-            )
-        if min(box.left, box.top) < 0 or box.right > canvas.width or box.bottom > canvas.height:
-            raise LayersMismatchError(
-                f"{name} covers columns {box.left} to {box.right} and rows {box.top} to {box.bottom}, "
-                f"outside the canvas of {size}; {again}"
-            )
+        name, first = layer.file or layer.name, layers[0]
+        if why := misfit(layer, canvas):
+            raise LayersMismatchError(f"{name} {why}; {again}")
         if layer.dtype != first.dtype:
             raise LayersMismatchError(
                 f"{name} has {layer.dtype} samples, {first.name} has {first.dtype}; {again}"

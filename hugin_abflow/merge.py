@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import os
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import closing
@@ -28,7 +27,7 @@ from hugin_abflow.nona import open_layers
 from hugin_abflow.opencl import Device
 from hugin_abflow.pano_trafo import images_of, read_guides
 from hugin_abflow.progress import Progress, silent
-from hugin_abflow.project import Plan, read_plan
+from hugin_abflow.project import Plan, file_key, read_plan
 from hugin_abflow.settings import Settings
 from hugin_abflow.spool import spooled
 
@@ -63,7 +62,7 @@ def merge_project(
     output          format by its ending; default: named and typed as the project says, beside it.
     prefix, layers, remap, keep_layers    where the layers come from, see `nona.open_layers`.
     compression, jpeg_quality    of the file, see `images.ImageWriter`; default: the project's, if the output
-                    has the project's format.
+                    has the project's format. Without `output` a JPEG or PNG has its own whatever is chosen.
     metadata        write EXIF and, for viewers of 360-degree panoramas, GPano; see `metadata.describe`.
     open_device     gives the device that `settings.device` and `.threads` mean; default: `kept_device`.
 
@@ -72,6 +71,8 @@ def merge_project(
     """
     plan = read_plan(path)
     settings = settings or Settings()
+    if output is None:
+        compression = storable(plan, compression)
     _check_early(plan, settings, output, compression)
     with open_layers(
         plan, prefix=prefix, layers=layers, remap=remap, keep_layers=keep_layers, progress=progress
@@ -253,6 +254,16 @@ def default_target(plan: Plan, layers: Iterable[Path] = ()) -> Path:
     return plan.default_output([*layers, *there])
 
 
+def storable(plan: Plan, compression: str | None) -> str | None:
+    """A compression that is chosen for a panorama that nobody names; None where files of the type that the
+    project asks for have but their own: then it is meant for the panoramas of others.
+    """
+    if compression and ENDINGS[plan.output.ending] in ("jpeg", "png"):
+        _log.info("%s asks for %s, which has no other compression", plan.file, plan.output.ending)
+        return None
+    return compression
+
+
 def _check_early(plan: Plan, settings: Settings, output: Path | str | None, compression: str | None) -> None:
     """Raise what would be raised in the end, too, but after minutes in which nona makes the layers."""
     if output is None:
@@ -267,5 +278,5 @@ def _check_early(plan: Plan, settings: Settings, output: Path | str | None, comp
 
 def refuse_input(output: Path, inputs: Iterable[Path]) -> None:
     """Raise `OutputError` for an output that is one of the inputs."""
-    if os.path.realpath(output) in map(os.path.realpath, inputs):
+    if file_key(output) in map(file_key, inputs):
         raise OutputError(f"{output} is an input of this panorama; choose another name with -o")

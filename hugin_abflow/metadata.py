@@ -11,6 +11,7 @@ from hugin_abflow import pto
 from hugin_abflow.exif import Metadata, comment, comment_of, read_exif, text
 from hugin_abflow.layer import Canvas
 from hugin_abflow.project import Plan
+from hugin_abflow.scratch import is_file
 from hugin_abflow.tifftags import EXIF, GPS, LONG, MAIN, RATIONAL, SHORT, UNDEFINED, Value
 
 PROGRAM = "hugin-abflow"
@@ -84,7 +85,7 @@ def describe(plan: Plan) -> Metadata:
     """
     photo = plan.images[0].photo
     found = read_exif(photo)
-    if not found and photo.is_file():
+    if not found and is_file(photo):
         _log.info("%s: no EXIF to copy into the panorama", photo)
     chosen = {
         directory: {tag: found[directory][tag] for tag in tags if tag in found.get(directory, {})}

@@ -41,8 +41,8 @@ from hugin_abflow.imagewriter import named_in_unicode
 from hugin_abflow.layer import Layer, check_layers, other_canvas
 from hugin_abflow.programs import move_whole, stop
 from hugin_abflow.progress import Progress, silent
-from hugin_abflow.project import Plan, PlannedImage
-from hugin_abflow.scratch import work_folder
+from hugin_abflow.project import Plan, PlannedImage, file_key
+from hugin_abflow.scratch import is_file, work_folder
 
 log = logging.getLogger("hugin_abflow.nona")
 
@@ -77,9 +77,9 @@ def open_layers(
     prefix          layers named PREFIX0000.tif ..., as given or relative to the project's folder; taken
                     as they are. Without both, the project's stem and Hugin's default prefix are tried.
     remap           "never": only what is there. "always": nona makes all layers. "auto": nona makes all
-                    that are missing, and all if one cannot be read, or is more than 2 s older than the
-                    project or its photo, and they can be made again (else those are used, with a
-                    warning).
+                    that are missing, and all if one cannot be read, has no alpha, is of another canvas, or is
+                    more than 2 s older than the project or its photo, and they can be made again (else
+                    old ones are used, with a warning).
     keep_layers     layers that nona made are moved beside the project, named as Hugin does.
 
     Layers are made in a folder under TMPDIR that is removed in the end. Raises `LayersMissingError`,
@@ -96,13 +96,19 @@ def open_layers(
             files = layers_by_prefix(plan, prefix).in_order()
         else:
             files = _find_or_make(plan, folder, remap, keep_layers, progress).in_order()
+        found = [str(file) for file in files if file.parent != folder]
         opened = [layer for file in files for layer in read_layers(file)]
-        check_layers(plan.canvas, opened)
+        try:
+            check_layers(plan.canvas, opened)
+        except LayersMismatchError as error:
+            if not found or not _can_make(plan):
+                raise
+            without = ", without --prefix and --layers," if named else ""
+            raise LayersMismatchError(f"{error} (--remap always{without} makes all of them)") from None
         try:
             yield opened
         except ImageReadError as error:  # files are opened before, but not decoded
-            found = [str(file) for file in files if not named and file.parent != folder]
-            if not any(file in str(error) for file in found) or not _can_make(plan):
+            if named or not any(file in str(error) for file in found) or not _can_make(plan):
                 raise
             raise ImageReadError(f"{error} (--remap always makes all of them)") from None
 
@@ -130,14 +136,14 @@ def planned_layers(plan: Plan, remap: Remap) -> tuple[Found | None, Sequence[Pla
         return found, []
     if found is None:
         return None, plan.images
-    broken, stale = found.broken, found.stale(plan)
-    if (broken or stale) and _can_make(plan):
-        if broken:
-            log.warning("%s cannot be read: all layers are made again", broken)
+    unusable, stale = found.unusable(plan), found.stale(plan)
+    if (unusable or stale) and _can_make(plan):
+        if unusable:
+            log.warning("%s: all layers are made again", unusable)
         else:
             log.info("%s is older than the project or its photo: layers are made again", stale[0])
         return None, plan.images
-    if stale and not broken:
+    if stale and not found.broken:
         reason = "nona is not installed" if shutil.which("nona") is None else "photos are missing"
         log.warning("%s is older than the project or its photo; used as it is, since %s", stale[0], reason)
     return found, found.missing(plan)
@@ -164,7 +170,7 @@ def probe() -> str | None:
 
 
 def _can_make(plan: Plan) -> bool:
-    return shutil.which("nona") is not None and all(image.photo.is_file() for image in plan.images)
+    return shutil.which("nona") is not None and all(is_file(image.photo) for image in plan.images)
 
 
 def _make_all(plan: Plan, folder: Path, keep: bool, progress: Progress) -> Found:
@@ -237,10 +243,10 @@ def _require_photo(plan: Plan, image: PlannedImage) -> None:
             f"image {image.index} of {plan.file} names no photo (its i-line has no n), and its layer must be "
             "made from it; the project may be damaged: save it anew in Hugin"
         )
-    if not image.photo.is_file():
+    if not is_file(image.photo):
         raise PhotoMissingError(
-            f"{image.photo} (image {image.index}) is not there, and its layer must be made from it; "
-            "put it back, or name layers that exist with --prefix or --layers"
+            f"{image.photo} (image {image.index}) is not there, or its folder is closed to you, and its "
+            "layer must be made from it; put it back, or name layers that exist with --prefix or --layers"
         )
 
 
@@ -360,6 +366,9 @@ def _failure(
 ) -> AbflowError:
     """What to raise for a run of nona over `images` that failed; it does not always say which is to blame."""
     said = "\n  ".join(lines) or "(nothing)"
+    for image in images:
+        if any(f"Unable to open file '{name}'" in said for name in (image.name, image.photo)):
+            return ImageReadError(f"{image.photo} cannot be opened; check its permissions")
     images = [image for image in images if named_in_unicode(image.photo)]  # else they cannot be opened here
     if "did not find a matching file type" in said:
         for image in images:
@@ -395,16 +404,31 @@ def _refuse_to_keep(prefix: str) -> None:
 
 def _keep(plan: Plan, prefix: str, made: dict[int, Path]) -> dict[int, Path]:
     """Move layers beside the project, each whole or not at all."""
-    photos = {photo.resolve() for photo in plan.photos}
+    photos = {file_key(photo) for photo in plan.photos}
     kept, advice = {}, "leave out --keep-layers or free the folder"
-    for index, path in made.items():
-        final = layer_path(prefix, index, path.suffix)
-        if final.resolve() in photos:
+    finals = {index: layer_path(prefix, index, path.suffix) for index, path in made.items()}
+    for final in finals.values():
+        if file_key(final) in photos:
             raise OutputError(
                 f"{final} is a photo, the layer cannot be kept by that name; rename the project"
             )
+        if is_file(final) and _is_picture(final):
+            raise OutputError(
+                f"{final} has no alpha channel: it is no layer, and none takes its place; move it, or rename "
+                "the project"
+            )
+    for index, path in made.items():
+        final = finals[index]
         weights = path.with_name(f"{path.stem}_gray.pgm")  # hugin_hdrmerge asks for them beside the layers
         for file in (path, weights) if weights.is_file() else (path,):
             move_whole(file, final.with_name(file.name.replace(path.stem, final.stem)), advice)
         kept[index] = final
     return kept
+
+
+def _is_picture(path: Path) -> bool:
+    """Whether a file is an image, and no layer: a photo that was developed, perhaps, and no project names."""
+    try:
+        return not all(layer.has_alpha for layer in read_layers(path))
+    except ImageReadError:
+        return False

@@ -321,7 +321,11 @@ class Device:
         self._programs |= {(one, options): program for one in modules}
         kernels = {kernel.function_name: kernel for kernel in program.all_kernels()}
         if not kernels:  # some drivers call that a success
-            raise DeviceError(f"{file} has no kernels for {self.device.name.strip()}; use another --device")
+            kept = pocl.kernel_folder() if "pocl" in self.device.version.lower() else None
+            remedy = f"remove {kept}, which may be damaged, or " if kept else ""
+            raise DeviceError(
+                f"{file} has no kernels for {self.device.name.strip()}; {remedy}use another --device"
+            )
         return kernels
 
     def largest_group(self, module: str, name: str, options: str = "") -> int:

@@ -12,7 +12,7 @@ import click
 from hugin_abflow import memory
 from hugin_abflow.errors import SettingsError
 from hugin_abflow.images import COMPRESSIONS, ENDINGS
-from hugin_abflow.settings import MOST_MEMORY
+from hugin_abflow.settings import MOST_MEMORY, Settings
 
 # Where a context keeps the arguments as they were given.
 ARGUMENTS = "hugin_abflow.arguments"
@@ -56,6 +56,56 @@ class Compression(click.ParamType):  # type: ignore[type-arg]
         return str(value)
 
 
+class Number(click.types.FloatParamType):
+    """A number that the setting of the option's name may have, by `Settings`' own range."""
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> float:
+        """The number; ends with click's message, which names the option, for one out of range."""
+        number = float(super().convert(value, param, ctx))
+        if param is not None:
+            chosen: dict[str, Any] = {str(param.name): number}
+            try:
+                Settings(**chosen)
+            except SettingsError as error:
+                self.fail(str(error).removeprefix(f"{param.name} is "), param, ctx)
+        return number
+
+
+class Text(click.ParamType):  # type: ignore[type-arg]
+    """A text that is not empty, as where a script's variable is not set."""
+
+    name = "text"
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> str:
+        """The text; ends with click's message where there is none."""
+        _refuse_empty(self, value, param, ctx)
+        return str(value)
+
+
+def _refuse_empty(
+    kind: click.ParamType,  # type: ignore[type-arg]
+    value: object,
+    param: click.Parameter | None,
+    ctx: click.Context | None,
+) -> None:
+    if value == "":  # of a path pathlib would make the current folder
+        kind.fail("it is empty; name something, or leave it out (is a variable not set?)", param, ctx)
+
+
+class OldFile(click.Path):
+    """A file to be read, or a folder; whether it can be is told where it is: of several projects it stops
+    none but its own.
+    """
+
+    def __init__(self) -> None:
+        super().__init__(readable=False, path_type=Path)
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Path:
+        """Its path; ends with click's message where it has no name."""
+        _refuse_empty(self, value, param, ctx)
+        return Path(os.fsdecode(super().convert(value, param, ctx)))
+
+
 class NewFile(click.Path):
     """A file to be written: no project and, unless `image`, no photo, as where its own name was forgotten
     before ``*.pto``.
@@ -66,7 +116,8 @@ class NewFile(click.Path):
         self.image = image
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Path:
-        """Its path; ends with click's message for a project or a photo, also behind a link."""
+        """Its path; ends with click's message for none, or a project or a photo, also behind a link."""
+        _refuse_empty(self, value, param, ctx)
         path = Path(os.fsdecode(super().convert(value, param, ctx)))
         for name in (str(path).lower(), os.path.realpath(path).lower()):
             if name.endswith(".pto"):

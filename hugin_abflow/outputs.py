@@ -70,6 +70,11 @@ _LINEAR = frozenset({Kind.HDR, Kind.HDR_LAYERS, Kind.HDR_STACKS})
 _REMAPPED = frozenset({Kind.LAYERS, Kind.EXPOSURE_REMAPPED, Kind.HDR_LAYERS})
 
 
+def no_option(name: str) -> str:
+    """A name of a file, or what it begins with, as an argument that no program takes for an option."""
+    return f"./{name}" if name.startswith("-") else name
+
+
 @dataclass(frozen=True)
 class Step:
     """One file and what it is made of.
@@ -93,9 +98,10 @@ class Step:
 
     def command(self, project: str, blending: Sequence[str]) -> list[str]:
         """What one would type; blending: options of our own."""
+        result, inputs = no_option(self.result), map(no_option, self.inputs)
         if self.program == BLEND:
-            return [BLEND, *blending, "-o", self.result, project, "--layers", *self.inputs]
-        return [self.program, *self.options, "-o", self.result, "--", *self.inputs]
+            return [BLEND, *blending, "-o", result, no_option(project), "--layers", *inputs]
+        return [self.program, *self.options, "-o", result, "--", *inputs]
 
 
 @dataclass(frozen=True)

@@ -10,6 +10,9 @@ compiler does not end. Either device is given the name of another processor.
 offers no device if it cannot; pyopencl fails as well. On a full disk, or one that no program may be run from,
 it ends the process. They are given a folder among temporary files.
 
+**Empty files among what it compiled**, as a power cut or a full disk leaves them. PoCL takes them for whole:
+each run after that is ended by the system, or finds programs without kernels. They are removed.
+
 **Fewer cores.** PoCL 3.0 says that a part of a processor (a sub-device) has as many as were asked for, and
 calculates on all of them; with TBB, newer ones offer no parts. It is told by variables that it reads once.
 """
@@ -23,8 +26,10 @@ import platform
 import stat
 import struct
 import sys
+import time
 from collections.abc import Iterator, Set
 from contextlib import contextmanager, suppress
+from functools import cache
 from pathlib import Path
 
 _log = logging.getLogger(__name__)
@@ -42,6 +47,9 @@ _PROCESSORS: tuple[tuple[str, str, Set[str]], ...] = (
 
 # Where PoCL and pyopencl keep things, in a folder for caches.
 _CACHES = ("pocl/kcache", "pytools")
+
+# The ends of the names of what PoCL compiled, and seconds after which none is still being written.
+_PROGRAMS, _WRITTEN = (".so", ".bc"), 60.0
 
 # Where temporary files may be, beside where TMPDIR says.
 _PLACES = ("/tmp", "/var/tmp")
@@ -81,6 +89,38 @@ def find_cache() -> None:
         "write, with %d MiB of room, on a disk from which programs may be run",
         _LEAST_ROOM >> 20,
     )
+
+
+def kernel_folder() -> Path | None:
+    """Where PoCL keeps what it compiled; None where that is not known."""
+    if own := os.environ.get("POCL_CACHE_DIR"):
+        return Path(own)
+    try:
+        return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / _CACHES[0]
+    except RuntimeError:  # the system does not know the user
+        return None
+
+
+@cache
+def mend(folder: Path) -> None:
+    """Remove programs without content from PoCL's folder, which compiles them anew; once in a process.
+
+    To be called before OpenCL's drivers are loaded. What is new may still be written by another process. It
+    takes 1 to 2 ms for the files of some panoramas' kinds of pixels.
+    """
+    settled = time.time() - _WRITTEN
+    folders = [os.fspath(folder)]
+    while folders:
+        with suppress(OSError), os.scandir(folders.pop()) as entries:
+            for entry in entries:
+                if entry.is_dir(follow_symlinks=False):
+                    folders.append(entry.path)
+                elif entry.name.endswith(_PROGRAMS):  # others are empty as it is
+                    with suppress(OSError):  # another process was faster
+                        status = entry.stat(follow_symlinks=False)
+                        if not status.st_size and status.st_mtime < settled:
+                            os.unlink(entry.path)  # noqa: PTH108
+                            _log.debug("%s was empty, and is compiled anew", entry.path)
 
 
 @contextmanager

@@ -12,7 +12,7 @@ from contextlib import suppress
 from pathlib import Path
 
 from hugin_abflow.errors import OutputError, ProgramFailedError, ProgramMissingError
-from hugin_abflow.scratch import part_beside
+from hugin_abflow.scratch import part_beside, put
 
 _log = logging.getLogger(__name__)
 
@@ -80,16 +80,17 @@ def stop(process: subprocess.Popen[str]) -> None:
 
 
 def move_whole(path: Path, final: Path, advice: str) -> None:
-    """Move a program's result to its final name, where it appears whole or not at all.
+    """Move a program's result to its final name, where it appears whole or not at all. A file that it
+    replaces leaves it its permissions.
 
     Raises `OutputError`, which ends with `advice`.
     """
     try:
         with suppress(OSError):  # another file system
-            path.replace(final)
+            put(path, final)
             return
         with part_beside(final) as part:
             shutil.copyfile(path, part)
-            part.replace(final)
+            put(part, final)
     except OSError as error:
         raise OutputError(f"{final} cannot be written: {error.strerror}; {advice}") from None

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable
+from collections.abc import Hashable, Iterable
 from dataclasses import dataclass
 from pathlib import Path, PureWindowsPath
 
@@ -11,6 +11,7 @@ from hugin_abflow import pto
 from hugin_abflow.errors import ProjectError
 from hugin_abflow.layer import Box, Canvas
 from hugin_abflow.projection import EQUIRECTANGULAR
+from hugin_abflow.scratch import is_file
 
 SINUSOIDAL = 7
 
@@ -110,9 +111,9 @@ class Plan:
         If that is a photo of the project or one of `taken` (the layers' files), ``pano_abflow.tif``,
         then ``pano_abflow2.tif`` and so on: inputs are never replaced.
         """
-        inputs = {_key(path) for path in [*self.photos, *taken]}
+        inputs = {file_key(path) for path in [*self.photos, *taken]}
         path, attempt = self.folder / f"{self.stem}{self.output.ending}", 0
-        while _key(path) in inputs:
+        while file_key(path) in inputs:
             attempt += 1
             suffix = "_abflow" if attempt == 1 else f"_abflow{attempt}"
             path = self.folder / f"{self.stem}{suffix}{self.output.ending}"
@@ -160,7 +161,7 @@ def locate_photo(folder: Path, name: str) -> Path:
     bare = folder / windows.name if windows.name else expected
     moved = bare if windows.is_absolute() or windows.drive else folder.joinpath(*windows.parts)
     for candidate in (expected, moved, bare):
-        if candidate.is_file():
+        if is_file(candidate):
             return candidate
     return expected
 
@@ -228,6 +229,13 @@ def _stem(name: str) -> str:
     return PureWindowsPath(name).stem
 
 
-def _key(path: Path) -> str:
-    """Equal for names of one file, also where the file system ignores case."""
-    return os.path.realpath(path).casefold()
+def file_key(path: Path) -> Hashable:
+    """Equal for names of one file: by way of links or ``..``, and where the file system ignores case.
+
+    What is not there has nothing but its name, and that may be any file's in which letters differ by case.
+    """
+    try:
+        found = path.stat()
+    except OSError:
+        return os.path.realpath(path).casefold()
+    return found.st_dev, found.st_ino

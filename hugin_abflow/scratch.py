@@ -53,6 +53,16 @@ def is_special(path: Path) -> bool:
     return not stat.S_ISREG(mode) and not stat.S_ISDIR(mode)
 
 
+def is_file(path: Path) -> bool:
+    """Whether it is a file; false where it must not be looked at, of which `Path.is_file` raises an error."""
+    return os.path.isfile(path)  # noqa: PTH113
+
+
+def is_folder(path: Path) -> bool:
+    """Whether it is a folder; false where it must not be looked at."""
+    return os.path.isdir(path)  # noqa: PTH112
+
+
 @contextmanager
 def part_beside(final: Path, suffix: str | None = None) -> Iterator[Path]:
     """A new, empty file beside `final`, to be written and renamed; nothing else is left of it.
@@ -79,9 +89,17 @@ def write_whole(final: Path, data: bytes) -> None:
     """
     with part_beside(final, ".part") as part:
         part.write_bytes(data)
-        if final.exists():
-            shutil.copymode(final, part)
-        part.replace(final)
+        put(part, final)
+
+
+def put(part: Path, final: Path) -> None:
+    """Give a file that is whole its final name; one that it replaces leaves it its permissions.
+
+    Raises OSError.
+    """
+    with suppress(OSError):  # there is none, or a file system that knows no permissions
+        shutil.copymode(final, part)
+    part.replace(final)
 
 
 def _create(final: Path, suffix: str) -> tuple[Path, int | None]:

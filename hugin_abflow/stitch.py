@@ -13,7 +13,7 @@ from pathlib import Path
 from hugin_abflow.errors import LayersMismatchError, ProgramMissingError
 from hugin_abflow.exif import embed
 from hugin_abflow.found import Remap, layers_there
-from hugin_abflow.images import COMPRESSIONS, ENDINGS, read_layer
+from hugin_abflow.images import COMPRESSIONS, DEFAULTS, ENDINGS, JPEG_QUALITY, read_layer
 from hugin_abflow.layer import Layer, check_layers
 from hugin_abflow.merge import (
     OpenDevice,
@@ -21,6 +21,7 @@ from hugin_abflow.merge import (
     guides_of,
     merge_project,
     refuse_input,
+    storable,
     write_panorama,
 )
 from hugin_abflow.metadata import describe
@@ -34,12 +35,13 @@ from hugin_abflow.outputs import (
     branches,
     checked_outputs,
     impossible,
+    no_option,
     possible_outputs,
 )
 from hugin_abflow.pano_trafo import images_of
 from hugin_abflow.programs import move_whole, run
 from hugin_abflow.progress import Progress, silent
-from hugin_abflow.project import Plan, read_plan
+from hugin_abflow.project import Output, Plan, read_plan
 from hugin_abflow.scratch import work_folder
 from hugin_abflow.settings import Settings
 
@@ -115,18 +117,18 @@ def show_project(
     what the project can get wrong.
     """
     plan = read_plan(path)
-    canvas, name = plan.canvas, plan.file.name
+    canvas, name = plan.canvas, no_option(plan.file.name)
     head = [
-        f"# {name}: {len(plan.images)} photos, {plan.projection}, "
+        f"# {plan.file.name}: {len(plan.images)} photos, {plan.projection}, "
         f"{canvas.crop.width} x {canvas.crop.height} of {canvas.width} x {canvas.height}",
         shlex.join(["cd", str(plan.folder)]),
     ]
-    stored = _storing(compression, jpeg_quality)
+    stored = _storing(compression if output else storable(plan, compression), jpeg_quality)
     if output or prefix or layers:
         if output:
             target = str(Path(output).absolute())
         else:
-            target = default_target(plan, layers_there(plan, prefix, layers, remap)).name
+            target = no_option(default_target(plan, layers_there(plan, prefix, layers, remap)).name)
         named = ["--layers", *(str(Path(layer).absolute()) for layer in layers)] if layers else []
         named = ["--prefix", _from_anywhere(plan, prefix)] if prefix else named
         remapped, found = ([], "") if named else _remapping(plan, remap)
@@ -138,13 +140,10 @@ def show_project(
         remapped, found = _remapping(branch.plan, _remap(branch.plan, remap))
         lines += remapped
         if Kind.PANORAMA in branch.kinds:
-            target = default_target(plan).name
+            target = no_option(default_target(plan).name)
             lines.append(shlex.join([BLEND, *options, *stored, "-o", target, name, "--prefix", found]))
-        own, asked = branch.plan.output, _stored(branch.plan, compression, jpeg_quality)
-        differs = _storing(
-            asked.output.compression if asked.output.compression != own.compression else None,
-            asked.output.jpeg_quality if asked.output.jpeg_quality != own.jpeg_quality else None,
-        )
+        asked = _stored(branch.plan, compression, jpeg_quality)
+        differs = _differing(asked.output, plan.output)
         steps = replace(branch, plan=asked).steps([image.index for image in plan.images])
         lines += [
             shlex.join(step.command(name, [*options, *(differs if step.final else [])])) for step in steps
@@ -158,10 +157,25 @@ def _storing(compression: str | None, jpeg_quality: int | None) -> list[str]:
     return [word for name, value in by_name.items() if value for word in (name, str(value))]
 
 
+def _differing(asked: Output, own: Output) -> list[str]:
+    """Options for a panorama that is stored as `asked`, where a command takes `own` for what the project asks
+    for: a project that makes several panoramas may store them in several ways.
+    """
+    kind, alike = ENDINGS[asked.ending], ENDINGS[asked.ending] == ENDINGS[own.ending]
+    usual = (own.compression if alike else None) or DEFAULTS[kind]
+    wanted = asked.compression or DEFAULTS[kind]
+    quality = own.jpeg_quality if alike else JPEG_QUALITY
+    of_jpeg = "jpeg" in (kind, wanted.lower())
+    return _storing(
+        wanted if wanted.lower() != usual.lower() else None,
+        asked.jpeg_quality if of_jpeg and asked.jpeg_quality != quality else None,
+    )
+
+
 def _from_anywhere(plan: Plan, prefix: str | Path) -> str:
     """A prefix of layers that lie in the current folder, in full: the commands run in the project's."""
     here = os.path.join(Path.cwd(), prefix)  # noqa: PTH118 - pathlib drops a slash at the end
-    return here if layers_there(plan, here, None, "auto") else str(prefix)
+    return here if layers_there(plan, here, None, "auto") else no_option(str(prefix))
 
 
 def _branches(plan: Plan) -> list[Branch]:
@@ -181,11 +195,12 @@ def _remap(plan: Plan, remap: Remap) -> Remap:
 def _remapping(plan: Plan, remap: Remap) -> tuple[list[str], str]:
     """nona's commands, if layers have to be made, and what comes before the numbers of all layers."""
     found, missing = planned_layers(plan, remap)
+    name = no_option(plan.file.name)
     if found is None:
-        prefix = plan.layer_prefix(plan.stem)
-        return [shlex.join(remapping(plan, [], prefix, plan.file.name))], prefix
-    prefix = Path(found.prefix).name
-    each = [remapping(plan, ["-i", str(image.index)], prefix, plan.file.name) for image in missing]
+        prefix = no_option(plan.layer_prefix(plan.stem))
+        return [shlex.join(remapping(plan, [], prefix, name))], prefix
+    prefix = no_option(Path(found.prefix).name)
+    each = [remapping(plan, ["-i", str(image.index)], prefix, name) for image in missing]
     return [shlex.join(command) for command in each], prefix
 
 

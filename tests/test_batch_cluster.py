@@ -153,11 +153,22 @@ def test_scheduler_that_does_not_answer(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("hugin_abflow.batch.cluster._TIMEOUT", "0.5s")
-    for address in ("tcp://127.0.0.1:9", "nonsense://x"):
-        code = cli.main([str(write_project(tmp_path / "a.pto")), "--scheduler", address])
-        assert code == ExitCode.CLUSTER
-        said = capsys.readouterr().err
-        assert f"no scheduler answers at {address}" in said and "docs/cluster.md" in said
+    address = "tcp://127.0.0.1:9"
+    code = cli.main([str(write_project(tmp_path / "a.pto")), "--scheduler", address])
+    assert code == ExitCode.CLUSTER
+    said = capsys.readouterr().err
+    assert f"no scheduler answers at {address}" in said and "docs/cluster.md" in said
+
+
+@pytest.mark.parametrize("address", ["host", "tcp://host", "tcp://host:x", "tcp://[::1", "nonsense://x:1"])
+def test_what_is_no_address_is_told_before_a_client_is_made(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, address: str
+) -> None:
+    """One that cannot begin waits for 20 s where it is collected."""
+    monkeypatch.setattr("distributed.Client", lambda *arguments, **keywords: pytest.fail("a client"))
+    assert cli.main([str(tmp_path / "a.pto"), "--scheduler", address]) == ExitCode.CLUSTER
+    said = capsys.readouterr().err
+    assert f"{address} is no scheduler's address (" in said and "tcp://host:8786" in said
 
 
 def test_dask_that_is_not_installed(

@@ -10,7 +10,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -50,8 +50,8 @@ def command(*arguments: object) -> list[str]:
     return [sys.executable, "-m", "hugin_abflow", *map(str, arguments)]
 
 
-def run(*arguments: object) -> tuple[int, str]:
-    done = subprocess.run(command(*arguments), capture_output=True, text=True, timeout=120)
+def run(*arguments: object, before: Sequence[str] = ()) -> tuple[int, str]:
+    done = subprocess.run([*before, *command(*arguments)], capture_output=True, text=True, timeout=120)
     assert "Traceback" not in done.stderr
     return done.returncode, done.stderr
 
@@ -275,3 +275,22 @@ with interruptible(), scratch.part_beside(pathlib.Path({str(tmp_path / "pano.tif
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=60)
     assert (done.returncode, done.stdout.split(), done.stderr) == (1, ["True", "lost"], "")
     assert names_in(tmp_path) == []
+
+
+@linux
+@pytest.mark.parametrize("locked", ["project", "folder"])
+def test_a_project_that_must_not_be_read_stops_no_other(shoot: Path, locked: str) -> None:
+    """Of whoever stitches; to root nothing is forbidden unless that is dropped."""
+    bound = ["setpriv", "--bounding-set=-dac_override,-dac_read_search"] if os.geteuid() == 0 else []
+    (shoot / "day").mkdir()
+    own = write_project(shoot / "day" / "own.pto")
+    forbidden = own if locked == "project" else own.parent
+    forbidden.chmod(0)
+    try:
+        code, said = run(own, before=bound)
+        assert code == ExitCode.PROJECT and f"{own}: cannot be read (Permission denied)" in said
+        code, said = run(own, shoot / "b1.pto", before=bound)
+    finally:
+        forbidden.chmod(0o700)
+    assert code == ExitCode.PARTIAL and f"{own}: cannot be read" in said
+    assert (shoot / "b1.tif").is_file()

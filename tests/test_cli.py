@@ -140,11 +140,17 @@ def test_layers_takes_several_files(calls: Calls, given: str, layers: str, proje
         (["a.pto", "b.pto", "--layers", "x.tif"], "--layers is for one project, but there are 2"),
         (["a.pto", "--prefix", "x", "--layers", "x.tif"], "--prefix and --layers"),
         (["-q", "-v", "a.pto"], "-q and -v"),
+        ([""], "'PROJECT...': it is empty"),  # pathlib's current folder
+        *(
+            ([option, "", "a.pto"], f"'{option}': it is empty")
+            for option in ("--prefix", "--layers", "--device", "--scheduler", "--config", "--report", "--log")
+        ),
+        (["-o", "", "a.pto"], "'--output': it is empty"),
         (["--remap", "sometimes", "a.pto"], "sometimes"),
         (["--jpeg-quality", "101", "a.pto"], "101"),
-        (["--softmax-sharpness", "nan", "a.pto"], "nan"),
+        (["--softmax-sharpness", "nan", "a.pto"], "'--softmax-sharpness': nan; choose a value"),
         (["--softmax-sharpness", "-1", "a.pto"], "-1"),
-        (["--flow-magnitude", "1e9", "a.pto"], "choose a value from 0 to 10000"),
+        (["--flow-magnitude", "1e9", "a.pto"], "'--flow-magnitude': 1000000000.0; choose a value"),
         (["--compression", "jpeg:85", "a.pto"], "'--compression': 'jpeg:85' is no compression; choose"),
         (["--max-memory", "0", "a.pto"], "'--max-memory': 0 is out of range"),
         (["--max-memory", "0.1B", "a.pto"], "'--max-memory': 0.1B is out of range"),

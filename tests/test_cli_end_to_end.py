@@ -187,6 +187,8 @@ def test_layer_that_cannot_be_decoded(folder: Path, capsys: pytest.CaptureFixtur
         (["-o", "folder.tif"], ExitCode.OUTPUT),
         (["-o", "left.png"], ExitCode.OUTPUT),
         (["-o", "out.tif", "--compression", "piz"], ExitCode.OUTPUT),
+        (["-o", "out.jpg", "--compression", "lzw"], ExitCode.OUTPUT),
+        (["-o", "out.png", "--compression", "zstd"], ExitCode.OUTPUT),
         (["--device", "nobody's"], ExitCode.DEVICE),
     ],
 )

@@ -17,7 +17,7 @@ from conftest import ICC, noise
 from hugin_abflow import exif as exif_module
 from hugin_abflow import tifftags
 from hugin_abflow.errors import OutputError
-from hugin_abflow.exif import Metadata, comment, comment_of, embed, read_exif, text, text_of
+from hugin_abflow.exif import Metadata, comment, comment_of, embed, place_in_png, read_exif, text, text_of
 from hugin_abflow.images import ImageWriter, read_layer
 from hugin_abflow.tifftags import ASCII, EXIF, GPS, MAIN, Value
 
@@ -139,6 +139,32 @@ def test_tiff_of_either_byte_order_and_many_pages(tmp_path: Path, order: str, bi
         assert second.tags["Software"].value == "before"
         for page, expected in zip((first, second), pixels, strict=True):
             np.testing.assert_array_equal(page.asarray(), expected)
+
+
+@pytest.mark.parametrize("metadata", [None, Metadata(TAGS, XMP)])
+def test_png_says_where_it_lies(exiftool: str, tmp_path: Path, metadata: Metadata | None) -> None:
+    """Once, and before the pixels."""
+    path = tmp_path / "a.png"
+    pixels = picture(path, metadata=metadata, offset=(656, 49))
+    content = path.read_bytes()
+    assert content.count(b"oFFs" + struct.pack(">iiB", 656, 49, 0)) == content.count(b"oFFs") == 1
+    assert content.index(b"oFFs") < content.index(b"IDAT")
+    assert shown(exiftool, path)["PNG:ImageOffset"] == "656, 49 (pixels)"
+    np.testing.assert_array_equal(read_layer(path).read(0, len(pixels)), pixels)
+    before = content.index(b"oFFs") - 4
+    path.write_bytes(content[:before] + content[before + 21 :])  # none, as other writers leave it
+    place_in_png(path, 656, 49)
+    assert shown(exiftool, path)["PNG:ImageOffset"] == "656, 49 (pixels)"
+    np.testing.assert_array_equal(read_layer(path).read(0, len(pixels)), pixels)
+
+
+@pytest.mark.parametrize("count", [1, 2, 7])
+def test_jpeg_may_fill_up_before_a_segment(tmp_path: Path, count: int) -> None:
+    path = tmp_path / "a.jpg"
+    picture(path, metadata=Metadata(TAGS))
+    content = path.read_bytes()
+    path.write_bytes(content.replace(b"\xff\xe1", b"\xff" * count + b"\xff\xe1", 1))
+    assert text_of(read_exif(path)[MAIN][MAKE]) == "Acme"
 
 
 def test_values_that_are_too_long_for_jpeg_are_left_out_and_told(

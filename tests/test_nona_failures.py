@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+
 import pytest
 import tifffile
 from conftest import remap
@@ -11,11 +13,36 @@ from hugin_abflow.nona import open_layers
 from hugin_abflow.project import read_plan
 
 
+@pytest.fixture
+def as_nobody(nona, tmp_path, monkeypatch):
+    """Have nona read no more than it may: to root nothing is forbidden."""
+    if os.name == "nt":
+        pytest.skip("it has other permissions")
+    if os.geteuid() == 0:
+        folder = tmp_path / "bin"
+        folder.mkdir()
+        drop = "--bounding-set=-dac_override,-dac_read_search"
+        (folder / "nona").write_text(f'#!/bin/sh\nexec setpriv {drop} {nona} "$@"\n')
+        (folder / "nona").chmod(0o755)
+        monkeypatch.setenv("PATH", f"{folder}{os.pathsep}{os.environ['PATH']}")
+
+
 def test_photo_is_none(make_project, nona):
     """Nona does not say which."""
     plan = read_plan(make_project())
     plan.images[2].photo.write_bytes(b"no photo")
     with pytest.raises(ImageReadError, match=f"{plan.images[2].photo.name} is no image"), open_layers(plan):
+        pass
+
+
+def test_photo_that_must_not_be_read(make_project, nona, as_nobody):
+    """Nona names it as the project does."""
+    plan = read_plan(make_project())
+    plan.images[1].photo.chmod(0)
+    with (
+        pytest.raises(ImageReadError, match=rf"{plan.images[1].photo} cannot be opened; check its perm"),
+        open_layers(plan),
+    ):
         pass
 
 

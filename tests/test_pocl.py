@@ -7,10 +7,12 @@ import os
 import platform
 import subprocess
 import sys
+from itertools import chain
 from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
+from conftest import age
 
 from hugin_abflow import pocl
 from hugin_abflow.opencl import Device, choose
@@ -333,3 +335,51 @@ def test_kernels_are_built_without_a_home(nobody: Path) -> None:
     assert done.returncode == 0, done.stderr
     assert "pyramid_" in done.stdout
     assert not done.stderr
+
+
+def test_programs_without_content_are_removed_from_the_kept_ones(tmp_path: Path) -> None:
+    """Not what may be written just now, and not what is empty as it is."""
+    entry = tmp_path / "EG" / "PDHGI"
+    (entry / "kernel" / "256-1-1").mkdir(parents=True)
+    places = {
+        "gone": [entry / "program.bc", entry / "kernel" / "256-1-1" / "kernel.so"],
+        "stays": [entry / "last_accessed", tmp_path / "tempfile_a", entry / "kernel" / "new.so"],
+        "whole": [entry / "kernel" / "whole.so"],
+    }
+    for file in chain(*places.values()):
+        file.write_bytes(b"code" if file in places["whole"] else b"")
+        if file.name != "new.so":
+            age(file, 100)
+    pocl.mend(tmp_path)
+    assert not any(file.exists() for file in places["gone"])
+    assert all(file.exists() for file in places["stays"] + places["whole"])
+    pocl.mend(tmp_path / "none")
+
+
+@only_linux
+def test_kept_kernels_that_a_power_cut_emptied_are_compiled_anew(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    script = """
+import numpy as np
+from hugin_abflow.opencl import Device
+device = Device()
+assert "pocl" in device.device.version.lower(), "no PoCL"
+print(device.zeros((3, 5)).fill(2).get().sum(), len(device.build("pyramid")))
+"""
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    monkeypatch.delenv("POCL_CACHE_DIR", raising=False)
+
+    def build() -> subprocess.CompletedProcess[str]:
+        return subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=300)
+
+    first = build()
+    if "no PoCL" in first.stderr:
+        pytest.skip("the first device is not PoCL's")
+    programs = list((tmp_path / "pocl").rglob("program.bc"))
+    assert first.returncode == 0 and programs
+    for program in programs:
+        program.write_bytes(b"")
+        age(program, 100)
+    second = build()
+    assert (second.returncode, second.stdout) == (0, first.stdout), second.stderr

@@ -7,14 +7,19 @@ import shutil
 import signal
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pytest
 from conftest import age, names_in
 
 from hugin_abflow import scratch
 from hugin_abflow.errors import OutputError
-from hugin_abflow.scratch import part_beside, sweep, work_folder
+from hugin_abflow.images import write_image
+from hugin_abflow.programs import move_whole
+from hugin_abflow.scratch import part_beside, sweep, work_folder, write_whole
 
 # A process that makes both kinds, says so, and waits to be killed.
 HOLDER = """
@@ -267,3 +272,45 @@ def test_file_system_without_locks_keeps_everything(root: Path, monkeypatch: pyt
 
 def test_folder_that_cannot_be_listed_is_no_error(root: Path) -> None:
     sweep(root / "gone")
+
+
+@pytest.mark.skipif(os.name == "nt", reason="it has other permissions")
+@pytest.mark.parametrize("how", ["data", "panorama", "moved", "moved from elsewhere"])
+def test_what_replaces_a_file_takes_its_permissions(
+    root: Path, monkeypatch: pytest.MonkeyPatch, how: str
+) -> None:
+    final, fresh = root / "final.tif", root / "fresh.tif"
+    for file in (final, fresh):
+        if file == final:
+            file.touch()
+            file.chmod(0o600)
+        if how == "data":
+            write_whole(file, b"new")
+        elif how == "panorama":
+            write_image(file, np.zeros((2, 3, 4), np.uint8))
+        else:
+            (made := root / "made.tif").write_bytes(b"new")
+            made.chmod(0o644)
+            if how == "moved from elsewhere":  # a file cannot be renamed into another file system
+                monkeypatch.setattr(Path, "replace", failing_once(Path.replace))
+            move_whole(made, file, "")
+        assert file.stat().st_size
+    assert final.stat().st_mode & 0o777 == 0o600
+    assert fresh.stat().st_mode & 0o777 == (0o666 & ~umask() if how != "moved" else 0o644)
+
+
+def failing_once(function: Callable[..., Any]) -> Callable[..., Any]:
+    calls: list[int] = []
+
+    def call(*arguments: Any) -> Any:
+        calls.append(1)
+        if len(calls) == 1:
+            raise OSError("another file system")
+        return function(*arguments)
+
+    return call
+
+
+def umask() -> int:
+    os.umask(mask := os.umask(0))
+    return mask

@@ -29,6 +29,7 @@ from hugin_abflow.terminal import label, say
 _TIMEOUT = "10s"  # for the scheduler's first answer
 _SILENCE = 10.0  # seconds after which it is asked whether there are workers
 _EVERY = 0.5  # seconds between two messages about how far a phase is
+_WITHOUT_PORTS = ("inproc", "ucx")  # kinds of addresses that Dask does not take apart
 # Loggers that print tracebacks of a lost connection, of which futures tell.
 _CHATTERS = ("distributed", "distributed.client", "tornado.application", "asyncio")
 # Messages, the device and the measure of memory are a process's own: one project at a time in each.
@@ -86,18 +87,27 @@ class Cluster:
 
     level       of the messages that listeners get.
 
-    Raises `ClusterError` if Dask is not installed or no scheduler answers.
+    Raises `ClusterError` if Dask is not installed, `scheduler` is no address, or no scheduler answers.
     """
 
     def __init__(self, scheduler: str, level: int, watcher: Watcher) -> None:
         try:
             from distributed import Client
+            from distributed.comm.addressing import get_address_host_port, parse_address
         except ImportError:
             raise ClusterError(
                 f"--scheduler needs Dask; install it with: pip install '{PROGRAM}[cluster]'"
             ) from None
         for name in _CHATTERS:
             logging.getLogger(name).setLevel(logging.CRITICAL)
+        try:
+            # a client that cannot even begin waits for 20 s when it is collected, and prints a traceback
+            if parse_address(scheduler)[0] not in _WITHOUT_PORTS:
+                get_address_host_port(scheduler)
+        except ValueError as error:
+            raise ClusterError(
+                f"{scheduler} is no scheduler's address ({error}); give one such as tcp://host:8786"
+            ) from None
         try:
             self._client = Client(scheduler, timeout=_TIMEOUT, set_as_default=False)
         except (OSError, TimeoutError, ValueError) as error:

@@ -11,6 +11,7 @@ from typing import Any
 import tomli_w
 
 from hugin_abflow.errors import ConfigError
+from hugin_abflow.scratch import is_file, is_folder
 
 NAME = "abflow.toml"
 
@@ -18,10 +19,10 @@ NAME = "abflow.toml"
 def find_config(project: Path, places: Iterable[Path]) -> Path | None:
     """The settings of a project: in its folder, else in the next one above, up to a folder of `places`."""
     folder = project.absolute().parent
-    tops = {place.absolute() for place in places if place.is_dir()}
+    tops = {place.absolute() for place in places if is_folder(place)}
     above = [folder, *folder.parents]
     top = next((number for number, one in enumerate(above) if one in tops), 0)
-    return next((one / NAME for one in above[: top + 1] if (one / NAME).is_file()), None)
+    return next((one / NAME for one in above[: top + 1] if is_file(one / NAME)), None)
 
 
 def read_config(file: Path, kinds: Mapping[str, str], paths: Iterable[str]) -> dict[str, Any]:
@@ -77,7 +78,7 @@ _WORDS = {
     "bool": "true or false",
     "int": "a whole number",
     "float": "a number",
-    "str": 'text in quotes ("...")',
+    "str": 'some text in quotes ("...")',
     "list": 'a list of texts (["...", "..."])',
 }
 
@@ -89,8 +90,8 @@ def _check(file: Path, name: str, value: object, kind: str) -> None:
         "bool": isinstance(value, bool),
         "int": number,
         "float": number or isinstance(value, float),
-        "str": isinstance(value, str),
-        "list": isinstance(value, list) and all(isinstance(one, str) for one in value),
+        "str": isinstance(value, str) and value != "",
+        "list": isinstance(value, list) and all(isinstance(one, str) and one for one in value),
     }[kind]
     if not fits:
         raise ConfigError(f"{file}: {name} is {value!r}; give {_WORDS[kind]}")

@@ -12,6 +12,7 @@ from pathlib import Path
 from hugin_abflow.errors import ProjectError, SameOutputError
 from hugin_abflow.outputs import panoramas
 from hugin_abflow.project import read_plan
+from hugin_abflow.scratch import is_file, is_folder
 from hugin_abflow.terminal import label, say
 
 
@@ -57,13 +58,13 @@ def refuse_same_output(projects: Mapping[Path, str | None]) -> None:
 
 
 def _projects(place: Path, recursive: bool) -> list[Path]:
-    if place.is_dir():
+    if is_folder(place):
         projects = projects_in(place, recursive, _warn)
         if not projects:
             remedy = "" if recursive else ", or add --recursive to look into its folders"
             raise ProjectError(f"{place}: there is no project (.pto) in this folder; name another{remedy}")
         return projects
-    if glob.has_magic(str(place)) and not place.exists():
+    if glob.has_magic(str(place)) and not is_file(place):
         matches = sorted(_matches(place))
         if not matches:
             raise ProjectError(f"{place}: no project has such a name; check the pattern")

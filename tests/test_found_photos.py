@@ -1,0 +1,136 @@
+"""Files that are named as layers would be, and are none: photos, layers of another canvas."""
+
+from __future__ import annotations
+
+import os
+from contextlib import suppress
+from pathlib import Path
+
+import numpy as np
+import pytest
+import tifffile
+from conftest import photo_pixels, to_make
+from layer_files import write_layer
+
+from hugin_abflow.errors import LayersMismatchError, OutputError
+from hugin_abflow.found import candidates
+from hugin_abflow.merge import refuse_input
+from hugin_abflow.nona import open_layers
+from hugin_abflow.project import file_key, read_plan
+
+pytestmark = pytest.mark.usefixtures("temporary")
+
+
+@pytest.fixture
+def developed(make_project, tmp_path) -> Path:
+    """A project pano.pto of photos pano0000.tif ..., with alpha: nothing tells them from layers."""
+    project = make_project(photo="pano{:04d}.tif")
+    for index in range(3):
+        pixels = photo_pixels(index)
+        opaque = np.concatenate([pixels, np.full_like(pixels[..., :1], 255)], axis=2)
+        file = project.parent / f"pano{index:04d}.tif"
+        tifffile.imwrite(file, opaque, photometric="rgb", extrasamples=["unassalpha"])
+    return project
+
+
+@pytest.mark.skipif(os.name == "nt", reason="links need rights there")
+@pytest.mark.parametrize("way", ["..", "link", "absolute"])
+def test_photos_are_no_layers_whatever_leads_to_them(developed, tmp_path, way):
+    prefix = {"..": "../project/", "link": f"{tmp_path}/linked/", "absolute": f"{tmp_path}/project/"}[way]
+    (tmp_path / "linked").symlink_to("project")
+    developed.write_text(developed.read_text().replace('n"pano0', f'n"{prefix}pano0'))
+    plan = read_plan(tmp_path / "linked" / "pano.pto" if way == "absolute" else developed)
+    assert candidates(plan) == []
+    assert to_make(plan) == (None, [0, 1, 2])
+
+
+def test_a_photo_of_pages_is_no_file_of_layers(developed):
+    """Scanners write such ones."""
+    photo = developed.parent / "pano.tif"
+    tifffile.imwrite(photo, photo_pixels(0), photometric="rgb", subfiletype=2)
+    (developed.parent / "pano0001.tif").unlink()
+    developed.write_text(developed.read_text().replace("pano0001", "pano"))
+    assert candidates(read_plan(developed)) == []
+
+
+@pytest.mark.skipif(os.name == "nt", reason="names ignore case there")
+def test_names_that_differ_by_case_are_one_where_the_file_is(tmp_path):
+    """A disk that ignores case finds one file by both names, as here a second link makes it."""
+    (tmp_path / "photo.jpg").write_bytes(b"photo")
+    with_capitals = tmp_path / "PHOTO.JPG"
+    assert file_key(tmp_path / "none.jpg") == file_key(tmp_path / "NONE.JPG")
+    with suppress(FileExistsError):  # on such a disk
+        os.link(tmp_path / "photo.jpg", with_capitals)
+    with pytest.raises(OutputError, match=r"PHOTO\.JPG is an input"):
+        refuse_input(with_capitals, [tmp_path / "photo.jpg"])
+
+
+def test_a_layer_is_not_kept_in_the_place_of_a_photo(developed, nona, tmp_path):
+    text = developed.read_text()
+    developed.write_text(text.replace('n"pano0', 'n"../project/pano0'))
+    with (
+        pytest.raises(OutputError, match=r"pano0000\.tif is a photo"),
+        open_layers(read_plan(developed), remap="always", keep_layers=True),
+    ):
+        pass
+
+
+# ------------------------------------------------------------------------------------ unusable layers
+
+
+def spoil(plan, how: str) -> None:
+    """Put what cannot be used in the place of the second of three layers; it is as new as the others."""
+    canvas = (600, 300) if how == "canvas" else (plan.canvas.width, plan.canvas.height)
+    left = 700 if how == "outside" else 0
+    for index in range(3):
+        pixels = np.full((100, 200, 4), 255, np.uint8)
+        file = plan.folder / f"pano{index:04d}.tif"
+        fine = index != 1
+        write_layer(file, pixels, 0 if fine else left, 0, None if fine else canvas, fine or how != "alpha")
+
+
+UNUSABLE = [("alpha", "has no alpha"), ("canvas", "made for a canvas of 600x300"), ("outside", "700 to 900")]
+
+
+@pytest.mark.parametrize("how, said", UNUSABLE)
+def test_what_cannot_be_a_layer_is_made_again(make_project, nona, temporary, caplog, how, said):
+    """As developed photos beside those that the project names; or layers of when its canvas was another."""
+    plan = read_plan(make_project())
+    spoil(plan, how)
+    before = (plan.folder / "pano0001.tif").read_bytes()
+    assert to_make(plan) == (None, [0, 1, 2])
+    with open_layers(plan) as layers:
+        assert all(temporary in layer.file.parents for layer in layers)
+    assert "pano0001.tif" in caplog.text and said in caplog.text and "are made again" in caplog.text
+    assert (plan.folder / "pano0001.tif").read_bytes() == before
+
+
+@pytest.mark.parametrize("how, said", UNUSABLE)
+@pytest.mark.parametrize("request_", [{"prefix": "pano"}, {"remap": "never"}])
+def test_what_cannot_be_a_layer_and_was_asked_for_is_told(
+    make_project, nona, how, said, request_, monkeypatch
+):
+    plan = read_plan(make_project())
+    spoil(plan, how)
+    remedy = r"--remap always, without --prefix and --layers," if "prefix" in request_ else "--remap always"
+    with (
+        pytest.raises(LayersMismatchError, match=rf"pano0001\.tif .*{said}.*{remedy} makes all"),
+        open_layers(plan, **request_),
+    ):
+        pass
+    monkeypatch.setenv("PATH", "")  # no nona: nothing to advise
+    with pytest.raises(LayersMismatchError) as error, open_layers(plan, **request_):
+        pass
+    assert "--remap" not in str(error.value)
+
+
+def test_a_picture_is_not_replaced_by_a_layer_that_is_kept(make_project, nona):
+    plan = read_plan(make_project())
+    spoil(plan, "alpha")
+    before = {path.name: path.read_bytes() for path in plan.folder.iterdir()}
+    with (
+        pytest.raises(OutputError, match=r"pano0001\.tif has no alpha channel: it is no layer"),
+        open_layers(plan, keep_layers=True),
+    ):
+        pass
+    assert {path.name: path.read_bytes() for path in plan.folder.iterdir()} == before
