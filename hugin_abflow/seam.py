@@ -30,7 +30,7 @@ from hugin_abflow.content import ALIKE, Unlike
 from hugin_abflow.geometry import Pair
 from hugin_abflow.layer import Box
 from hugin_abflow.opencl import Buffer
-from hugin_abflow.regions import Cells, Choice, Gone, Prices, Residuals, completed, find
+from hugin_abflow.regions import Cells, Choice, Gone, Prices, Residuals, completed, find, seen
 from hugin_abflow.scene import Scene
 from hugin_abflow.working import Grid, any_around, connected, shared_cells
 
@@ -151,7 +151,7 @@ def cut(
     factor = np.full(whole.shape, _WHOLE_FACTOR)
     if single is not None:
         factor = np.where(single, _SINGLE_FACTOR, _WHOLE_FACTOR)
-    choice = _choice(scene, residual, whole, cells, _CUT, factor, clipping_price)
+    choice = _choice(scene, seen(residual), whole, cells, _CUT, factor, clipping_price)
     owner, gone = choose(choice) if choose else (choice.owners()[0], Gone())
     yields = [yielded(whole, owner, k, cells.wraps) for k in range(len(scene.layers))]
     for k, at in gone.items():  # wholly: beside a border the softmax hardly knows another layer

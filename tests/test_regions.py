@@ -100,6 +100,24 @@ def test_no_cut_runs_through_what_is_as_bright_as_the_other() -> None:
         assert np.array_equal(found, np.arange(30) >= first * np.ones((15, 1)))
 
 
+def test_a_short_cut_through_what_differs_much_is_seen_less_than_a_long_one() -> None:
+    """A face is two cells high, and a coat that is nearly as dark as what is behind it twelve: the cut goes
+    where only the face shows it.
+    """
+    rows, columns = (v.ravel() for v in np.mgrid[0:14, 0:30])
+    mean, rms = np.zeros((14, 30)), np.full((14, 30), 0.09)
+    mean[:, :8] = mean[:, 26:] = 0.5
+    rms[:2, 14:], rms[2:, 20:22] = 0.66, 0.05
+    share = np.where(np.arange(30) < 15, 0.95, 0.05) * np.ones((14, 1))
+    shares, everywhere = np.stack([share, 1 - share]), np.ones((2, 14, 30), bool)
+    plain = Residuals(mean, rms)
+    for residual, along in ((plain, False), (regions.seen(plain), True)):
+        found = label(rows, columns, residual, shares, everywhere, False).reshape(14, 30)
+        assert not found[:, :8].any() and found[:, 26:].all()
+        assert (not found[:, :21].any() and found[:, 21:].all()) == along
+    assert np.allclose(regions.seen(alike(np.array([[0.0, 0.15]]))).rms, [[0, 0.15]])
+
+
 def test_a_border_counts_as_a_cut() -> None:
     """A favoured layer that ends where its region does gives way to one that goes on beyond; where both end
     there is no cut to be seen."""
