@@ -79,6 +79,14 @@ def descriptor(
 
 
 @pytest.mark.parametrize("name", list(GRIDS))
+def test_energy_equals_its_twin(device: Device, name: str) -> None:
+    grid = GRIDS[name]
+    feature, _ = descriptors(1, grid)
+    found = run(device, "search_energy", grid, feature, grid)
+    assert_close(found, twin.search_energy(feature, grid), SUM)
+
+
+@pytest.mark.parametrize("name", list(GRIDS))
 def test_descriptor_equals_its_twin(device: Device, name: str) -> None:
     grid = GRIDS[name]
     feature, _ = descriptors(1, grid)

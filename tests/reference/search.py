@@ -23,11 +23,22 @@ def displacements(reach: Sequence[int]) -> list[tuple[int, int]]:
     return [(u, v) for v in range(-reach[1], reach[1] + 1) for u in range(-reach[0], reach[0] + 1)]
 
 
+def _energy(feature: Array) -> Array:
+    """(height, width, 2): each pixel's energy and whether it is known."""
+    scaled = feature[..., :3] * np.array([1, SLOPE, SLOPE])
+    return np.stack([(scaled**2).sum(-1) * feature[..., 3], feature[..., 3]], -1)
+
+
+def search_energy(feature: Array, grid: Sequence[int]) -> Array:
+    """Energy and what is known, over seven pixels of a row."""
+    x, y = pixels(grid[0], grid[1])
+    return sum(on_grid(_energy(feature), grid, x + dx, y)[0] for dx in range(-3, 4))
+
+
 def search_descriptor(feature: Array, grid: Sequence[int], noise: float) -> Array:
     """Feature over the root of its mean energy in 7 x 7 pixels."""
     scaled = feature * np.array([1, SLOPE, SLOPE, 1.0])
-    energy = (scaled[..., :3] ** 2).sum(-1) * feature[..., 3]
-    around = windows(np.stack([energy, feature[..., 3]], -1), grid, 3).sum(0)
+    around = windows(_energy(feature), grid, 3).sum(0)
     strength = np.sqrt(around[..., 0] / np.maximum(around[..., 1], 1)) + noise
     return np.concatenate([scaled[..., :3] / strength[..., None], feature[..., 3:]], -1)
 
