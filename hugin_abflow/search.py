@@ -61,7 +61,7 @@ class SearchParameters:
     refined_patience: float = 0.2  # likewise; with less, outlines of what moves far get ragged
     # Where flow is not trusted: px from which that of trusted pixels is taken over, in turns, by how much it
     # must fit better, the misfit from which on nothing fits, and the trust that is enough.
-    adopted_steps: tuple[int, ...] = (64, 32, 16, 8, 4, 2, 1)
+    adopted_steps: tuple[int, ...] = (64, 16, 4, 1)
     adopted_patience: float = 0.3
     adopted_misfit: float = 0.3
     adopted_trust: float = 0.5
