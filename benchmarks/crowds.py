@@ -11,7 +11,6 @@ shows otherwise: bent paving. With --keep, layers and panoramas are left in that
 from __future__ import annotations
 
 import argparse
-import subprocess
 import sys
 import tempfile
 from dataclasses import dataclass
@@ -24,8 +23,8 @@ import tifffile
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
-from benchmarks.quality import ROOT, abflow
 from benchmarks.rigs import write_layer
+from benchmarks.stereo import blend, write_project
 
 Floats = npt.NDArray[np.float64]
 Numbers = npt.NDArray[np.intp]
@@ -195,9 +194,7 @@ def make_set(folder: Path, scene: Scene) -> None:
             :, columns
         ]
         write_layer(folder / f"layer{index:04d}.tif", pixels, columns.start, 0, _WIDTH, _HEIGHT)
-    images = [f'i w{_WIDTH} h{_HEIGHT} f0 v40 r0 p0 y{yaw} n"photo{yaw}.jpg"' for yaw in (-10, 10)]
-    lines = [f'p f0 w{_WIDTH} h{_HEIGHT} v60 E0 R0 n"TIFF_m c:LZW r:CROP"', "m i0", *images]
-    (folder / "project.pto").write_text("\n".join(lines) + "\n", encoding="utf-8")
+    write_project(folder, (_WIDTH, _HEIGHT), (_WIDTH, _HEIGHT))
 
 
 def judge(scene: Scene, panorama: npt.NDArray[np.uint8]) -> tuple[int, int, int, int, float]:
@@ -249,12 +246,7 @@ def run(seeds: range, options: list[str], keep: Path) -> None:
         folder.mkdir(parents=True, exist_ok=True)
         make_set(folder, scene)
         for name, total in totals.items():
-            out, layers = folder / f"{name}.tif", sorted(folder.glob("layer*.tif"))
-            command = ["enblend", "-o", str(out), *map(str, layers)]
-            if name != "enblend":
-                command = abflow("-q", "--remap", "never", *options)(folder, layers, 0, out)
-            subprocess.run(command, cwd=ROOT, check=True, stdout=subprocess.DEVNULL)
-            total += judge(scene, tifffile.imread(out)[..., :3])
+            total += judge(scene, tifffile.imread(blend(folder, name, options))[..., :3])
         print(f"{folder.name} of {len(seeds)}", file=sys.stderr)
     print("| blender | people | cut | twice | gone | bent % |\n|---|---|---|---|---|---|")
     for name, total in totals.items():

@@ -49,9 +49,13 @@ def make_set(folder: Path, pair: Pair, overlap: float, swapped: bool) -> None:
     for index, (photo, x, y) in enumerate(((first[:, :end], 0, -top), (second, left, down - top))):
         pixels: npt.NDArray[np.uint8] = np.dstack([photo[..., ::-1], np.full(photo.shape[:2], 255, np.uint8)])
         write_layer(folder / f"layer{index:04d}.tif", pixels, x, y, *canvas)
-    size = f"w{canvas[0]} h{canvas[1]}"
-    photos = [f'i w{width} h{height} f0 v40 r0 p0 y{yaw} n"photo{yaw}.jpg"' for yaw in (-10, 10)]
-    lines = [f'p f0 {size} v60 E0 R0 n"TIFF_m c:LZW r:CROP"', "m i0", *photos]
+    write_project(folder, canvas, (width, height))
+
+
+def write_project(folder: Path, canvas: tuple[int, int], photo: tuple[int, int]) -> None:
+    """A project of two flat layers that are there, of whose photos nothing is known but (width, height)."""
+    images = [f'i w{photo[0]} h{photo[1]} f0 v40 r0 p0 y{yaw} n"photo{yaw}.jpg"' for yaw in (-10, 10)]
+    lines = [f'p f0 w{canvas[0]} h{canvas[1]} v60 E0 R0 n"TIFF_m c:LZW r:CROP"', "m i0", *images]
     (folder / "project.pto").write_text("\n".join(lines) + "\n", encoding="utf-8")
 
 

@@ -337,6 +337,11 @@ static inline float search_window(__global const float *a, __global const float 
     return sum / total;
 }
 
+/* 0 to 4: itself, left, right, above, below; Mesa 22 misreads a table of vectors. */
+static inline int2 search_side(int side) {
+    return (int2)((side == 2) - (side == 1), (side == 4) - (side == 3));
+}
+
 /* Each pixel keeps its flow, or takes over the other field's or one from `step` px beside it in either field, if
    it fits better by more than `patience`. */
 __kernel void search_choose(__global const float *a,      /* (grid.y, 4, wide) descriptors */
@@ -362,8 +367,7 @@ __kernel void search_choose(__global const float *a,      /* (grid.y, 4, wide) d
         float weights[(2 * SEARCH_RADIUS + 1) * SEARCH_ROW], total = 0.0f, least = INFINITY;
         const int count = other == flow ? 5 : 10;
         for (int k = 0; k < count; ++k) {
-            const int side = k % 5; /* itself, left, right, above, below; Mesa 22 misreads a table of vectors */
-            int2 p = (int2)(x, y) + step * (int2)((side == 2) - (side == 1), (side == 4) - (side == 3));
+            int2 p = (int2)(x, y) + step * search_side(k % 5);
             if (!grid_border(&p, grid))
                 continue;
             const float2 f = k < 5 ? flow[p.y * grid.x + p.x] : other[p.y * grid.x + p.x];
@@ -410,8 +414,8 @@ __kernel void search_adopt(__global const float *a,        /* (grid.y, 4, wide) 
     float4 best = own;
     if (own.z < enough && search_place(a, x, y, wide)[3 * wide] > 0.0f) {
         float weights[(2 * SEARCH_RADIUS + 1) * SEARCH_ROW], total = 0.0f, least = INFINITY;
-        for (int side = 0; side < 4; ++side) { /* left, right, above, below */
-            int2 p = (int2)(x, y) + step * (int2)((side == 1) - (side == 0), (side == 3) - (side == 2));
+        for (int side = 1; side < 5; ++side) {
+            int2 p = (int2)(x, y) + step * search_side(side);
             if (!grid_border(&p, grid))
                 continue;
             const float4 f = trusted[p.y * grid.x + p.x];

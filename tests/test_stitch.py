@@ -274,6 +274,16 @@ def test_dry_run_does_nothing(make_project: ProjectMaker, temporary: Path, capsy
     ]  # fmt: skip
 
 
+def run_shown(script: str, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Run commands that were shown as a script in a folder, where this checkout is installed."""
+    programs = folder / "bin"
+    programs.mkdir()
+    (programs / "hugin-abflow").write_text(f'#!/bin/sh\nexec "{sys.executable}" -m hugin_abflow "$@"\n')
+    (programs / "hugin-abflow").chmod(0o755)
+    monkeypatch.setenv("PATH", str(programs), prepend=os.pathsep)
+    subprocess.run(["sh", "-e", "-c", script], cwd=folder, check=True, capture_output=True)
+
+
 def test_commands_that_are_shown_make_the_files(
     make_project: ProjectMaker, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -288,12 +298,7 @@ def test_commands_that_are_shown_make_the_files(
     made = {path.name: pixels_of(path) for path in stitch_project(project, settings)}
     for name in made:
         (project.parent / name).unlink()
-    programs = tmp_path / "bin"
-    programs.mkdir()
-    (programs / "hugin-abflow").write_text(f'#!/bin/sh\nexec "{sys.executable}" -m hugin_abflow "$@"\n')
-    (programs / "hugin-abflow").chmod(0o755)
-    monkeypatch.setenv("PATH", str(programs), prepend=":")
-    subprocess.run(["sh", "-e", "-c", script], cwd=tmp_path, check=True, capture_output=True)
+    run_shown(script, tmp_path, monkeypatch)
     for name, pixels in made.items():
         again = pixels_of(project.parent / name)
         assert again.shape == pixels.shape and again.dtype == pixels.dtype

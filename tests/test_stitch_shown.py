@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import os
 import shlex
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
@@ -13,7 +10,7 @@ import tifffile
 from conftest import ProjectMaker
 from pictures import one_device
 from test_hugin import CANVAS, stacked
-from test_stitch import asked, programs
+from test_stitch import asked, programs, run_shown
 
 from hugin_abflow.errors import OutputError
 from hugin_abflow.outputs import Kind
@@ -72,12 +69,7 @@ def test_what_is_shown_works_for_names_with_a_dash_in_front(
     assert made == {"-x.tif": "LZW", "-x_fused.tif": "LZW", "-x_hdr.tif": "ADOBE_DEFLATE"}
     for name in made:
         (project.parent / name).unlink()
-    folder = tmp_path / "bin"
-    folder.mkdir()
-    (folder / "hugin-abflow").write_text(f'#!/bin/sh\nexec "{sys.executable}" -m hugin_abflow "$@"\n')
-    (folder / "hugin-abflow").chmod(0o755)
-    monkeypatch.setenv("PATH", str(folder), prepend=os.pathsep)
-    subprocess.run(["sh", "-e", "-c", script], cwd=tmp_path, check=True, capture_output=True)
+    run_shown(script, tmp_path, monkeypatch)
     assert {name: compression_of(project.parent / name) for name in made} == made
 
 
