@@ -68,6 +68,10 @@ def _built_with(module: str, options: str) -> tuple[str, ...]:
     return tuple(others) if module in others and not options else (module,)
 
 
+# Bytes up to which what is uploaded comes with its buffer: a copy in a queue waits for all before it.
+_SMALL = 1 << 16
+
+
 class DeviceMemoryError(DeviceError):
     """The device's memory is too small for what was asked; smaller pieces may fit."""
 
@@ -96,18 +100,28 @@ def _device_errors(doing: str) -> Iterator[None]:
 class Buffer:
     """An array on the device: shape and dtype with a `cl.Buffer`. Freed with the object.
 
+    host    what is in it from the start, of its shape and dtype; else that is anything.
     lane    where it was used last: what is done there afterwards may have its memory. What several lanes use
             has to live until all but one of them have ended.
     """
 
-    def __init__(self, device: Device, shape: tuple[int, ...], dtype: npt.DTypeLike) -> None:
+    def __init__(
+        self,
+        device: Device,
+        shape: tuple[int, ...],
+        dtype: npt.DTypeLike,
+        host: npt.NDArray[Any] | None = None,
+    ) -> None:
         self.shape, self.dtype = shape, np.dtype(dtype)
         self.nbytes = math.prod(map(int, shape)) * self.dtype.itemsize
         self._device, self.lane = device, device.current
-        self.data = self.lane.spare.take(self.nbytes)
+        self.data = self.lane.spare.take(self.nbytes) if host is None else None
         if self.data is None:
             with _device_errors(f"allocating {self.nbytes} bytes"):
-                self.data = cl.Buffer(device.context, cl.mem_flags.READ_WRITE, max(self.nbytes, 16))
+                flags, size = cl.mem_flags.READ_WRITE, max(self.nbytes, 16)
+                if host is not None:
+                    flags, size = flags | cl.mem_flags.COPY_HOST_PTR, 0  # its own
+                self.data = cl.Buffer(device.context, flags, size, host)
         device.count(self.nbytes)
 
     def __del__(self) -> None:
@@ -269,6 +283,8 @@ class Device:
 
     def upload(self, host: npt.NDArray[Any], dtype: npt.DTypeLike | None = None) -> Buffer:
         """A copy of a host array."""
+        if 0 < host.size * np.dtype(dtype or host.dtype).itemsize <= _SMALL:
+            return Buffer(self, host.shape, dtype or host.dtype, np.ascontiguousarray(host, dtype))
         return self.empty(host.shape, dtype or host.dtype).set(host)
 
     def copy(self, source: Buffer) -> Buffer:
