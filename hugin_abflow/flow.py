@@ -215,7 +215,7 @@ def adopt(
     trust 0..1, and something that stays.
     """
     how, grid = parameters.search, images[0].grid
-    features = (_unstacked(device, finest_features(device, image, parameters))[0] for image in images)
+    features = (finest_features(device, image, parameters) for image in images)
     a, b = (search.descriptor(device, one, grid, how) for one in features)
     return [
         search.adopt(device, here, there, its, grid, how)

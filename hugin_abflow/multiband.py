@@ -18,9 +18,9 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-import cv2
 import numpy as np
 import numpy.typing as npt
+import scipy
 
 from hugin_abflow import content
 from hugin_abflow.chart import widest_gap
@@ -188,8 +188,8 @@ def _depth(mask: npt.NDArray[np.bool_], inside: npt.NDArray[np.bool_], grid: Gri
     first, gap = widest_gap(np.logical_or.reduce(mask, 0)) if wraps and mask.any() else (0, 0)
     by = mask.shape[1] // 2 if wraps and gap < 2 else 0
     around = np.pad(np.roll(inside, gap // 2 - first, 1), ((0, 0), (by, by)), mode="wrap")
-    away = cv2.distanceTransform(around.view(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
-    return np.asarray(np.roll(away[:, by : by + mask.shape[1]], first - gap // 2, 1) * mask)
+    depth = scipy.ndimage.distance_transform_edt(around)[:, by : by + mask.shape[1]]
+    return np.asarray(np.roll(depth, first - gap // 2, 1).astype(np.float32) * mask)
 
 
 def _blend(

@@ -74,7 +74,9 @@ class SearchParameters:
 
 
 def descriptor(device: Device, feature: Buffer, grid: Grid, parameters: SearchParameters) -> Buffer:
-    """Descriptors float32 (height, 4, columns) of features (height, width, 4): see kernels/search.cl."""
+    """Descriptors float32 (height, 4, columns) of one image's features (height, width, 4): see
+    kernels/search.cl.
+    """
     single, wide = device.empty(feature.shape), _pitch(grid) + 2 * _MARGIN
     energy = device.empty((grid[1], grid[0], 2))
     device.run("search", "search_energy", grid[:2], feature, grid, energy)

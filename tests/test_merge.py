@@ -311,12 +311,12 @@ def small_memory(monkeypatch):
         peak, alive = [0], [0]
 
         class Limited(opencl.Buffer):
-            def __init__(self, device, shape, dtype):
+            def __init__(self, device, shape, dtype, host=None):
                 self.counted = 0
                 wanted = int(np.prod(shape, dtype=np.int64)) * np.dtype(dtype).itemsize
                 if alive[0] + wanted > size:
                     raise opencl.DeviceMemoryError(f"no {wanted} bytes left; close other programs")
-                super().__init__(device, shape, dtype)
+                super().__init__(device, shape, dtype, host)
                 self.counted = wanted
                 alive[0] += wanted
                 peak[0] = max(peak[0], alive[0])
