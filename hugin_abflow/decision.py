@@ -110,7 +110,9 @@ def decide(
     remains, before = found.misfit[apart].mean(), plain.misfit[apart].mean()
     if bearings and remains <= parameters.gain_apart * before:
         known = _seen(bearings, plain.flows, common & ~apart & textured(), level)
-        if epipolar.parallax(known, _seen(bearings, found.flows, apart, level)):
+        # one line of two on which it may go says little of what fits by chance: that does not lead back
+        back = bool(trusted[apart].mean() <= parameters.gain_back * before)
+        if epipolar.parallax(known, _seen(bearings, found.flows, apart, level), back):
             return Decision(True)
     return Decision(False, (Refused(level, found.flows),) if remains < before else ())
 

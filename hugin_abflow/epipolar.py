@@ -71,12 +71,12 @@ def known_move(u: Points, v: Points) -> Points | None:
     return direction if _mostly(along(u, v, direction)) else None
 
 
-def parallax(known: tuple[Points, Points], found: tuple[Points, Points]) -> bool:
+def parallax(known: tuple[Points, Points], found: tuple[Points, Points], either_way: bool = True) -> bool:
     """Whether the motion in `found` is that of still things, for the camera's move that `known` tells; not so
     if it tells none. Each is where points are seen from the first and from the second place.
 
-    Layers that were aligned on what is near are turned against each other, so that what is farther goes the
-    other way: if what is known does so, what is found may as well.
+    either_way: layers that were aligned on what is near are turned against each other, so that what is
+    farther goes the other way: if what is known does so, what is found may as well.
     """
     known = _some(*known)
     if len(known[0]) < _LEAST or not len(found[0]):
@@ -85,7 +85,7 @@ def parallax(known: tuple[Points, Points], found: tuple[Points, Points]) -> bool
     its, others = (along(*one, direction) for one in (found, known))
     if _mostly(others):
         return _mostly(its)
-    return _mostly(abs(others)) and _mostly(abs(its))
+    return either_way and _mostly(abs(others)) and _mostly(abs(its))
 
 
 def _some(u: Points, v: Points) -> tuple[Points, Points]:

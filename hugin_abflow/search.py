@@ -51,6 +51,7 @@ class SearchParameters:
     apart: float = 1.5  # px of the level of the last decision, from which on flow leads elsewhere
     wide: float = 0.25  # the share of the overlap that is large
     gain_apart: float = 0.75  # where it leads elsewhere, if motion there is that of what stands still
+    gain_back: float = 0.9  # and if it goes either way, if only what leads back explains anything
     textured: float = 0.02  # gradient of h from which on a pixel tells motion
     gap: float = 2.0  # px of a level between start and return from which on flow is not consistent
     always: bool = False  # keep what is found, whatever becomes of it

@@ -60,19 +60,32 @@ def test_what_is_refused_is_told_if_it_explains_something() -> None:
     assert not decided((SMALL, 6, 0.2)).refused
 
 
+def bearings(places: np.ndarray) -> np.ndarray:
+    lon, lat = (places[:, 0] - WIDTH) / 300, (HEIGHT - places[:, 1]) / 300
+    return np.stack([np.cos(lat) * np.sin(lon), np.cos(lat) * np.cos(lon), np.sin(lat)], 1)
+
+
 def test_small_parts_are_kept_if_they_move_as_what_stands_still() -> None:
     """A camera that moved to the left: all goes to the right, what is near farther."""
-
-    def bearings(places: np.ndarray) -> np.ndarray:
-        lon, lat = (places[:, 0] - WIDTH) / 300, (HEIGHT - places[:, 1]) / 300
-        return np.stack([np.cos(lat) * np.sin(lon), np.cos(lat) * np.cos(lon), np.sin(lat)], 1)
-
     for far, found in ((6, True), (-6, False)):
         plain, searched = candidates((SMALL, far, 0.02))
         for one in (plain, searched):
             one.flows[..., 0] += np.array([3, -3])[:, None, None]
         assert decision.decide(plain, searched, 1, 1, textured, bearings, False, HOW).found == found
         assert not decision.decide(plain, searched, 1, 1, untextured, bearings, False, HOW).found  # unknown
+
+
+@pytest.mark.parametrize("far", [6, -6])
+def test_what_may_move_either_way_has_to_lead_back(far: int) -> None:
+    """Layers that are turned against each other: what is known goes to the right above, to the left below."""
+    place = np.s_[28:34, 20:50]
+    plain, searched = candidates((place, far, 0.02))
+    right = np.where(np.arange(HEIGHT) < HEIGHT // 2, 3, -3)[:, None]
+    for one in (plain, searched):
+        one.flows[..., 0] += np.stack([right, -right])
+    assert decision.decide(plain, searched, 1, 1, textured, bearings, False, HOW).found
+    searched.flows[(1, *place)] = plain.flows[(1, *place)] + np.array([0.5 * far, 0], np.float32)
+    assert not decision.decide(plain, searched, 1, 1, textured, bearings, False, HOW).found
 
 
 @pytest.mark.parametrize("wraps", [False, True])
