@@ -12,7 +12,6 @@ gain is too large for bright things and too small for dark ones beside them, and
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -68,11 +67,8 @@ def colour_grid(grid: Grid, covered: npt.NDArray[np.bool_]) -> Grid:
 
 
 def clipping(layer: WorkingLayer) -> tuple[float, ...]:
-    """The r, g, b above which a layer's samples may be clipped and measure nothing, and an unused 1; floats
-    never are.
-    """
-    share = CLIPPED if layer.layer.dtype.kind == "u" else math.inf
-    return (*(share * white for white in layer.white), 1.0)
+    """The r, g, b above which a layer's samples may be clipped and measure nothing, and an unused 1."""
+    return (*(CLIPPED * white for white in layer.clips_at), 1.0)
 
 
 def measure(

@@ -67,16 +67,16 @@ def highlights_grid(grid: Grid) -> Grid:
 def measure(
     device: Device, layers: Sequence[WorkingLayer], masks: Masks, grid: Grid, settings: Settings
 ) -> Clipped:
-    """What all layers show clipped: of floats nothing, and with `settings.highlights` off."""
+    """What all layers show clipped; nothing with `settings.highlights` off."""
     cells = highlights_grid(grid)
     shares = np.zeros((len(layers), *cells.shape), np.float32)
-    if not settings.highlights or layers[0].layer.dtype.kind != "u":
+    if not settings.highlights or not any(np.isfinite(layer.clips_at).all() for layer in layers):
         return Clipped(shares, shares)
     for layer, share in zip(layers, shares, strict=True):
         found = device.empty(cells.shape)
         device.run(
             "highlights", "highlights_share", cells.border[:2], layer.pixels, layer.box, grid.border,
-            cells.border, (*layer.white, 1.0), _NEARLY, CLIPPED, found,
+            cells.border, (*layer.clips_at, 1.0), _NEARLY, CLIPPED, found,
         )  # fmt: skip
         share[:] = found.get()
     inside = on_cells(masks.host, cells, np.logical_or)

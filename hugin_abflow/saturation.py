@@ -5,11 +5,15 @@ exposures, what is clipped becomes some grey, and nothing in the layer is bright
 tells nothing of exposure, and another photo that shows more of that place is the better one. A flat lamp in a
 dark photo looks the same; but another photo shows it, compared by their exposures, no brighter.
 
+So it is with floats, made from photos that are clipped: their full scale is not known, but is found the same
+way, of whatever is brightest.
+
 Not found is what was clipped in one channel only, or where vignetting was corrected as well.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -38,6 +42,8 @@ _SHARE, _BEYOND = 0.003, 1 / 8
 _NEAR = 2.0
 # Nothing darker is white: exposures are not corrected by so much.
 _LEAST = 64
+# Of what may be full scale of floats, what hardly any values exceed; and what they are taken for at most.
+_TOP, _MOST = 0.95, 1.2
 # What is darker than this, of full scale, is noise.
 _DARK = 0.02
 # By how much another photo has to show brighter what is clipped here, at least, and in how much of it.
@@ -56,16 +62,25 @@ class _Picked:
         top, left = place.top - self.place.top, place.left - self.place.left
         return self.pixels[top : top + place.height, left : left + place.width]
 
+    def scaled(self, unit: float) -> _Picked:
+        """The same, with so much as full scale."""
+        colours = np.clip(self.pixels[..., :3] / np.float32(unit), 0, _MOST)
+        return replace(self, pixels=np.dstack([colours, self.pixels[..., 3]]))
+
 
 def with_whites(device: Device, layers: Sequence[WorkingLayer], pairs: Sequence[Pair]) -> list[WorkingLayer]:
     """The same layers, with what they show white.
 
     pairs       layers that overlap.
     """
-    if not pairs or layers[0].layer.dtype.kind != "u":
+    if not pairs:
         return list(layers)
     picked = [_pick(device, layer) for layer in layers]
-    whites = [_brightest(one.pixels) for one in picked]
+    units, floats = [1.0] * len(layers), layers[0].layer.dtype.kind == "f"
+    if floats:
+        units = [_unit(one.pixels) for one in picked]
+        picked = [one.scaled(unit) for one, unit in zip(picked, units, strict=True)]
+    whites = [_brightest(one.pixels, known=not floats) for one in picked]
     result = list(layers)
     for k, white in enumerate(whites):
         others = [pair.b if pair.a == k else pair.a for pair in pairs if k in (pair.a, pair.b)]
@@ -73,7 +88,8 @@ def with_whites(device: Device, layers: Sequence[WorkingLayer], pairs: Sequence[
             continue
         brighter = np.concatenate([_brighter(*_common(picked[k], picked[j]), white) for j in others])
         if np.count_nonzero(brighter) >= max(_ENOUGH, _PART * brighter.size):
-            result[k] = replace(layers[k], white=white)
+            red, green, blue = (units[k] * channel for channel in white)
+            result[k] = replace(layers[k], white=(red, green, blue))
     return result
 
 
@@ -90,14 +106,24 @@ def _pick(device: Device, layer: WorkingLayer) -> _Picked:
     return _Picked(place, pixels.get())
 
 
-def _brightest(pixels: Values) -> White | None:
-    """The grey of which there is much and nothing beyond, where it is not full white; None: there is none."""
+def _unit(pixels: Values) -> float:
+    """What may be full scale of floats: hardly any values are brighter."""
+    values = pixels[pixels[..., 3] > 0][:, :3]
+    brightest = float(np.quantile(values, 1 - _SHARE / 8)) if values.size else 0.0
+    return brightest / _TOP if 0 < brightest < math.inf else 1.0
+
+
+def _brightest(pixels: Values, known: bool) -> White | None:
+    """The grey of which there is much and nothing beyond, where it is not full white; None: there is none.
+
+    known   whether full scale is, so that what is white there is taken for clipped as it is.
+    """
     seen = pixels[pixels[..., 3] > 0][:, :3]
     if len(seen) < _ENOUGH:
         return None
     red, green, blue = (_spike(channel) for channel in seen.T)
-    if red is None or green is None or blue is None or min(red, green, blue) > CLIPPED:
-        return None  # of full scale: it is taken for clipped as it is
+    if red is None or green is None or blue is None or (known and min(red, green, blue) > CLIPPED):
+        return None
     return red, green, blue
 
 

@@ -38,7 +38,7 @@ _PART_STRIPS = 8
 _LARGEST_PRODUCT = 0.99 * 2**31
 _MOST_ROWS = 32_000
 
-# Integer samples brighter than this, of what a layer shows white, may be clipped.
+# Samples brighter than this, of what a layer shows white, may be clipped.
 CLIPPED = 0.98
 
 # OpenCL type and full-scale value of each depth; half is widened on the host.
@@ -169,14 +169,19 @@ class WorkingLayer:
 
     box         its place on the grid.
     checksum    of the stored pixels: tells layers of one size and place apart.
-    white       r, g, b of what is clipped, of full scale.
+    white       r, g, b of what is clipped, of full scale; None: of integers that, of floats nothing.
     """
 
     layer: Layer
     box: Place
     pixels: Buffer
     checksum: int
-    white: tuple[float, float, float] = (1.0, 1.0, 1.0)
+    white: tuple[float, float, float] | None = None
+
+    @property
+    def clips_at(self) -> tuple[float, float, float]:
+        """r, g, b of what is clipped, infinite where nothing is."""
+        return self.white or (((1.0 if self.layer.dtype.kind == "u" else math.inf),) * 3)
 
 
 def shared_box(a: WorkingLayer, b: WorkingLayer) -> Box:

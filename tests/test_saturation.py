@@ -67,7 +67,7 @@ def whites(
     return [one.white for one in saturation.with_whites(device, layers, pairs)]
 
 
-UNKNOWN = (1.0, 1.0, 1.0)
+UNKNOWN = None
 
 
 def test_what_is_clipped_and_then_darkened_is_white(device: Device) -> None:
@@ -141,7 +141,7 @@ def test_white_is_found_whatever_the_exposures(corrected: float, exposure: float
     """By what sees nothing but the pixels: of one photo clipped and corrected, and a darker one."""
     light = scene()[::8, ::8]
     clipped, darker = photo(light, 1.5, corrected), photo(light, exposure)
-    white = saturation._brightest(clipped)
+    white = saturation._brightest(clipped, known=True)
     assert white == pytest.approx((corrected,) * 3, abs=1 / 255)
     told = saturation._brighter(clipped.reshape(-1, 4)[:, :3], darker.reshape(-1, 4)[:, :3], white)
     assert told.mean() > 0.5
@@ -159,7 +159,7 @@ def test_a_flat_lamp_is_not_white(device: Device) -> None:
         for exposure in (0.5, 1.0, 1.2, 1.6):
             assert whites(device, photo(light, 0.6), photo(light, exposure), shift=3) == [UNKNOWN] * 2
     dark = photo(light, 0.6)
-    assert saturation._brightest(dark) is not None  # alone it looks as if
+    assert saturation._brightest(dark, known=True) is not None  # alone it looks as if
 
 
 def test_what_nobody_shows_brighter_is_not_white(device: Device) -> None:
@@ -177,9 +177,26 @@ def test_smooth_brightness_is_not_white(device: Device) -> None:
     assert whites(device, photo(light), photo(light, 1.5)) == [UNKNOWN] * 2
 
 
-def test_floats_are_never_white(device: Device) -> None:
-    pixels = photo(scene(), 1.5, 0.6), photo(scene(), 0.8)
-    assert whites(device, *pixels, dtype=np.float32) == [UNKNOWN] * 2
+@pytest.mark.parametrize("scale", [0.003, 1, 700])
+@pytest.mark.parametrize("corrected", [0.6, 1])
+def test_floats_are_clipped_wherever_their_scale_ends(device: Device, scale: float, corrected: float) -> None:
+    """Each layer has a scale of its own; a few values beyond are overshoot, of sampling."""
+    times = np.float32([scale] * 3 + [1])
+    clipped, darker = photo(scene(), 1.5, corrected) * times, 5 * photo(scene(), 0.8) * times
+    clipped[::50, ::50, :3] *= 1.05
+    found, other = whites(device, clipped, darker, shift=3, dtype=np.float32)
+    assert found == pytest.approx((corrected * scale,) * 3, rel=1 / 100)
+    assert other == UNKNOWN
+
+
+def test_floats_of_scenes_have_no_white(device: Device) -> None:
+    """What is merged from exposures, with specular highlights; a flat lamp; nothing that is bright."""
+    light = 0.7 * scene() / scene().max()
+    shining = light * np.random.default_rng(3).lognormal(0, 1.5, light.shape)
+    light[100:200, 150:300] = 0.8
+    for seen in (shining, light, np.zeros_like(light), np.full_like(light, -1)):
+        dark, bright = (np.dstack([k * seen, np.ones((HEIGHT, WIDTH))]).astype(np.float32) for k in (0.6, 1))
+        assert whites(device, dark, bright, shift=3, dtype=np.float32) == [UNKNOWN] * 2
 
 
 def test_layers_apart_tell_nothing(device: Device) -> None:

@@ -168,7 +168,7 @@ def test_weights_equal_their_twin(device: Device, place: tuple[int, int, int, in
 
 # Residuals
 
-LAYERS = [SimpleNamespace(layer=SimpleNamespace(dtype=np.dtype(np.uint8)), white=(1.0, 1.0, 1.0))] * 2
+LAYERS = [SimpleNamespace(clips_at=(1.0, 1.0, 1.0))] * 2
 
 
 def scene_of(grid: Grid, pairs: list[Pair]) -> Scene:
