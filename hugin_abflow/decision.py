@@ -112,7 +112,7 @@ def decide(
         known = _seen(bearings, plain.flows, common & ~apart & textured(), level)
         # one line of two on which it may go says little of what fits by chance: that does not lead back
         back = bool(trusted[apart].mean() <= parameters.gain_back * before)
-        if epipolar.parallax(known, _seen(bearings, found.flows, apart, level), back):
+        if epipolar.parallax(known, _seen(bearings, found.flows, apart, level), either_way=back):
             return Decision(True)
     return Decision(False, (Refused(level, found.flows),) if remains < before else ())
 

@@ -71,7 +71,7 @@ def known_move(u: Points, v: Points) -> Points | None:
     return direction if _mostly(along(u, v, direction)) else None
 
 
-def parallax(known: tuple[Points, Points], found: tuple[Points, Points], either_way: bool = True) -> bool:
+def parallax(known: tuple[Points, Points], found: tuple[Points, Points], either_way: bool) -> bool:
     """Whether the motion in `found` is that of still things, for the camera's move that `known` tells; not so
     if it tells none. Each is where points are seen from the first and from the second place.
 

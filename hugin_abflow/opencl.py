@@ -30,6 +30,9 @@ _COMPILED = 0.5
 # Bytes of buffers that are worth giving back after each of many layers or pairs.
 MUCH = 16 << 20
 
+# Bytes up to which what is uploaded comes with its buffer: a copy in a queue waits for all before it.
+_SMALL = 1 << 16
+
 # Work-group: rows suit both a GPU's wavefronts and the vector units of a CPU.
 _GROUP = 256
 
@@ -66,10 +69,6 @@ def _built_with(module: str, options: str) -> tuple[str, ...]:
     parts = {part for one in files for part in _parts(one)}
     others = sorted(files - parts - _OF_PIXELS - {"common"})
     return tuple(others) if module in others and not options else (module,)
-
-
-# Bytes up to which what is uploaded comes with its buffer: a copy in a queue waits for all before it.
-_SMALL = 1 << 16
 
 
 class DeviceMemoryError(DeviceError):
@@ -283,9 +282,10 @@ class Device:
 
     def upload(self, host: npt.NDArray[Any], dtype: npt.DTypeLike | None = None) -> Buffer:
         """A copy of a host array."""
-        if 0 < host.size * np.dtype(dtype or host.dtype).itemsize <= _SMALL:
-            return Buffer(self, host.shape, dtype or host.dtype, np.ascontiguousarray(host, dtype))
-        return self.empty(host.shape, dtype or host.dtype).set(host)
+        host = np.asarray(host, dtype, order="C")
+        if 0 < host.nbytes <= _SMALL:
+            return Buffer(self, host.shape, host.dtype, host)
+        return self.empty(host.shape, host.dtype).set(host)
 
     def copy(self, source: Buffer) -> Buffer:
         """A copy of an array on the device."""

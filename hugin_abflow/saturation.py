@@ -42,7 +42,8 @@ _SHARE, _BEYOND = 0.003, 1 / 8
 _NEAR = 2.0
 # Nothing darker is white: exposures are not corrected by so much.
 _LEAST = 64
-# Of what may be full scale of floats, what hardly any values exceed; and what they are taken for at most.
+# Of what may be full scale of floats, what hardly any values exceed: less than CLIPPED, as nobody knows that
+# they are white; and what values are taken for at most.
 _TOP, _MOST = 0.95, 1.2
 # What is darker than this, of full scale, is noise.
 _DARK = 0.02
@@ -52,20 +53,19 @@ _BRIGHTER, _PART = 1.1, 0.03
 
 @dataclass(frozen=True)
 class _Picked:
-    """Some of a layer's pixels, (height, width, 4), and their place among those of the grid."""
+    """Some of a layer's pixels, (height, width, 4), and their place among those of the grid.
+
+    unit    the layer's value of which each is a multiple.
+    """
 
     place: Box
     pixels: Values
+    unit: float = 1.0
 
     def at(self, place: Box) -> Values:
         """Those of a part of the place."""
         top, left = place.top - self.place.top, place.left - self.place.left
         return self.pixels[top : top + place.height, left : left + place.width]
-
-    def scaled(self, unit: float) -> _Picked:
-        """The same, with so much as full scale."""
-        colours = np.clip(self.pixels[..., :3] / np.float32(unit), 0, _MOST)
-        return replace(self, pixels=np.dstack([colours, self.pixels[..., 3]]))
 
 
 def with_whites(device: Device, layers: Sequence[WorkingLayer], pairs: Sequence[Pair]) -> list[WorkingLayer]:
@@ -76,11 +76,7 @@ def with_whites(device: Device, layers: Sequence[WorkingLayer], pairs: Sequence[
     if not pairs:
         return list(layers)
     picked = [_pick(device, layer) for layer in layers]
-    units, floats = [1.0] * len(layers), layers[0].layer.dtype.kind == "f"
-    if floats:
-        units = [_unit(one.pixels) for one in picked]
-        picked = [one.scaled(unit) for one, unit in zip(picked, units, strict=True)]
-    whites = [_brightest(one.pixels, known=not floats) for one in picked]
+    whites = [_brightest(one.pixels) for one in picked]
     result = list(layers)
     for k, white in enumerate(whites):
         others = [pair.b if pair.a == k else pair.a for pair in pairs if k in (pair.a, pair.b)]
@@ -88,7 +84,7 @@ def with_whites(device: Device, layers: Sequence[WorkingLayer], pairs: Sequence[
             continue
         brighter = np.concatenate([_brighter(*_common(picked[k], picked[j]), white) for j in others])
         if np.count_nonzero(brighter) >= max(_ENOUGH, _PART * brighter.size):
-            red, green, blue = (units[k] * channel for channel in white)
+            red, green, blue = (picked[k].unit * channel for channel in white)
             result[k] = replace(layers[k], white=(red, green, blue))
     return result
 
@@ -103,27 +99,27 @@ def _pick(device: Device, layer: WorkingLayer) -> _Picked:
         "saturation", "saturation_pick", size,
         layer.pixels, layer.box, _EVERY, (place.left, place.top, *size), pixels,
     )  # fmt: skip
-    return _Picked(place, pixels.get())
+    picked = _Picked(place, pixels.get())
+    return picked if layer.layer.dtype.kind == "u" else _to_scale(picked)
 
 
-def _unit(pixels: Values) -> float:
-    """What may be full scale of floats: hardly any values are brighter."""
-    values = pixels[pixels[..., 3] > 0][:, :3]
+def _to_scale(floats: _Picked) -> _Picked:
+    """The same with what may be full scale as 1: hardly any values are brighter."""
+    values = floats.pixels[floats.pixels[..., 3] > 0][:, :3]
     brightest = float(np.quantile(values, 1 - _SHARE / 8)) if values.size else 0.0
-    return brightest / _TOP if 0 < brightest < math.inf else 1.0
+    unit = brightest / _TOP if 0 < brightest < math.inf else 1.0
+    colours = np.clip(floats.pixels[..., :3] / np.float32(unit), 0, _MOST)
+    return _Picked(floats.place, np.dstack([colours, floats.pixels[..., 3]]), unit)
 
 
-def _brightest(pixels: Values, known: bool) -> White | None:
-    """The grey of which there is much and nothing beyond, where it is not full white; None: there is none.
-
-    known   whether full scale is, so that what is white there is taken for clipped as it is.
-    """
+def _brightest(pixels: Values) -> White | None:
+    """The grey of which there is much and nothing beyond, where it is not full white; None: there is none."""
     seen = pixels[pixels[..., 3] > 0][:, :3]
     if len(seen) < _ENOUGH:
         return None
     red, green, blue = (_spike(channel) for channel in seen.T)
-    if red is None or green is None or blue is None or (known and min(red, green, blue) > CLIPPED):
-        return None
+    if red is None or green is None or blue is None or min(red, green, blue) > CLIPPED:
+        return None  # of full scale: it is taken for clipped as it is
     return red, green, blue
 
 

@@ -50,7 +50,7 @@ def test_what_walks_is_no_parallax(direction: tuple[float, float, float], expect
     """The camera moves left; what is found in front of it moves right, left, up, down, farther than all."""
     known = seen(2, 2000, np.array([-0.1, 0, 0]), np.array([0, 1.0, 0]))
     u, _ = seen(3, 300, np.zeros(3), np.array([0, 5.0, 0]))
-    assert epipolar.parallax(known, (u, unit(u + 0.2 * np.array(direction)))) is expected
+    assert epipolar.parallax(known, (u, unit(u + 0.2 * np.array(direction))), either_way=True) is expected
 
 
 @pytest.mark.parametrize(
@@ -70,7 +70,9 @@ def test_layers_aligned_on_what_is_near_move_both_ways(
     assert 0.4 < float((v[:, 0] > u[:, 0]).mean()) < 0.6
     near, _ = seen(3, 300, np.zeros(3), np.array([0, 5.0, 0]))
     assert epipolar.known_move(u, v) is None
-    assert epipolar.parallax((u, v), (near, unit(near + 0.2 * np.array(direction)))) is expected
+    found = near, unit(near + 0.2 * np.array(direction))
+    assert epipolar.parallax((u, v), found, either_way=True) is expected
+    assert not epipolar.parallax((u, v), found, either_way=False)
 
 
 def test_still_points_are_not_led_away() -> None:
@@ -122,10 +124,10 @@ def test_an_unknown_move_proves_nothing() -> None:
     rng = np.random.default_rng(4)
     u, v = seen(5, 2000, np.array([-0.1, 0, 0]), np.array([0, 1.0, 0]))
     found = (u[:300], v[:300])
-    assert epipolar.parallax((u, v), found)
-    assert not epipolar.parallax((u, unit(u + 0.05 * rng.normal(size=u.shape))), found)
-    assert not epipolar.parallax((u[:150], v[:150]), found)
-    assert not epipolar.parallax((u, v), (u[:0], v[:0]))
+    assert epipolar.parallax((u, v), found, either_way=True)
+    assert not epipolar.parallax((u, unit(u + 0.05 * rng.normal(size=u.shape))), found, either_way=True)
+    assert not epipolar.parallax((u[:150], v[:150]), found, either_way=True)
+    assert not epipolar.parallax((u, v), (u[:0], v[:0]), either_way=True)
 
 
 def test_what_stands_still_does_not_leave_its_way_however_near_it_is() -> None:

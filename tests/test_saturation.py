@@ -141,7 +141,7 @@ def test_white_is_found_whatever_the_exposures(corrected: float, exposure: float
     """By what sees nothing but the pixels: of one photo clipped and corrected, and a darker one."""
     light = scene()[::8, ::8]
     clipped, darker = photo(light, 1.5, corrected), photo(light, exposure)
-    white = saturation._brightest(clipped, known=True)
+    white = saturation._brightest(clipped)
     assert white == pytest.approx((corrected,) * 3, abs=1 / 255)
     told = saturation._brighter(clipped.reshape(-1, 4)[:, :3], darker.reshape(-1, 4)[:, :3], white)
     assert told.mean() > 0.5
@@ -159,7 +159,7 @@ def test_a_flat_lamp_is_not_white(device: Device) -> None:
         for exposure in (0.5, 1.0, 1.2, 1.6):
             assert whites(device, photo(light, 0.6), photo(light, exposure), shift=3) == [UNKNOWN] * 2
     dark = photo(light, 0.6)
-    assert saturation._brightest(dark, known=True) is not None  # alone it looks as if
+    assert saturation._brightest(dark) is not None  # alone it looks as if
 
 
 def test_what_nobody_shows_brighter_is_not_white(device: Device) -> None:
