@@ -3,7 +3,8 @@
 Somebody whom one layer shows, in a place that is taken from another, is no difference of exposure: blended
 over wide bands he would leave his colours beside him, as a shade on what is behind. What the layers would
 differ by if both showed that is extrapolated from places around, where they do: from the nearest of them that
-are enough.
+are enough. Where there are few, as where all of a narrow overlap differs, layers differ by what they do:
+nothing else tells what is left of their exposures.
 
 Differences that are completed so need not sum to nothing by their weights, as others do.
 
@@ -27,8 +28,8 @@ ALIKE, _OTHER = 0.06, 0.15
 # Cells of the Gaussians that places around are averaged with, the widest first.
 _SIGMAS = (16.0, 8.0, 4.0, 2.0)
 # Places around are enough if they are this share of what is averaged; if less, the next wider ones count in
-# part.
-_ENOUGH = 0.05
+# part. The share from which on, in any width, what they tell is sure; if less, what is there counts in part.
+_ENOUGH, _SURE = 0.05, 0.1
 # Sigmas to the end of a Gaussian.
 _REACH = 3
 
@@ -100,10 +101,10 @@ def complete(
 
 
 def _from_beside(sums: Values, wraps: bool) -> Values:
-    """What layers would differ by, (height, width, 4), everywhere, by what is measured beside: from sums of
-    `content_gather`.
+    """What layers would differ by everywhere, and how sure that is, 0..1, (height, width, 4), by what is
+    measured beside: from sums of `content_gather`.
     """
-    result = np.zeros_like(sums)
+    values, sure = np.zeros_like(sums[..., :3]), np.zeros_like(sums[..., 3:])
     for sigma in _SIGMAS:
         by = int(_REACH * sigma)
         columns = np.pad(sums, ((0, 0), (by, by), (0, 0)), mode="wrap" if wraps else "constant")
@@ -111,8 +112,8 @@ def _from_beside(sums: Values, wraps: bool) -> Values:
         around = cv2.GaussianBlur(columns, (size, size), sigma, borderType=cv2.BORDER_CONSTANT)
         around = around[:, by : around.shape[1] - by]
         weight = around[..., 3:]
-        some = weight > 0
-        nearer = np.where(some, around / np.where(some, weight, 1), 0)
-        enough = np.clip(weight / _ENOUGH, 0, 1)
-        result = np.where(some, enough * nearer + (1 - enough) * result, result)
-    return np.ascontiguousarray(result, np.float32)
+        nearer = around[..., :3] / np.where(weight > 0, weight, 1)
+        enough = np.where(sure > 0, np.clip(weight / _ENOUGH, 0, 1), 1)  # the widest known is all there is
+        values = enough * nearer + (1 - enough) * values
+        sure = np.maximum(sure, np.clip(weight / _SURE, 0, 1))
+    return np.ascontiguousarray(np.dstack([values, sure]), np.float32)

@@ -52,11 +52,12 @@ __kernel void content_gather(__global const float4 *difference,  /* (box.w, box.
     sums[cy * cells.x + cx] = sum / GREATEST(n, 1);
 }
 
-/* In place of a difference where layers show different things, that which the cells tell: e of the fit. */
+/* In place of a difference where layers show different things, that which the cells tell: e of the fit, as far as that
+   is sure. */
 __kernel void content_complete(__global float4 *difference, __global const float *share, /* (box.w, box.z) */
                                int4 box, int4 grid, /* place, run size; its grid */
                                __global const float4 *mean, __global const float *moved, __global const float *other,
-                               __global const float4 *expected, /* (cells.y, cells.x): e, unused */
+                               __global const float4 *expected, /* (cells.y, cells.x): e, and how sure, 0..1 */
                                int4 cells, float shoulder)
 {
     const int x = get_global_id(0), y = get_global_id(1), at = y * box.z + x;
@@ -65,9 +66,8 @@ __kernel void content_complete(__global float4 *difference, __global const float
     const float2 place = grid_place(x + box.x, y + box.y, grid, cells);
     const float3 d = difference[at].xyz, m = mean[(y + box.y) * grid.x + x + box.x].xyz;
     const float rest = 1.0f - share[at];
-    const float same = content_same(d, m, rest, place, moved, other, cells, shoulder);
-    if (same == 1.0f)
-        return;
     const float4 e = bilinear_colour(expected, place, cells);
-    difference[at].xyz = same * d + (1.0f - same) * rest * e.xyz;
+    const float part = e.w * (1.0f - content_same(d, m, rest, place, moved, other, cells, shoulder));
+    if (part > 0.0f)
+        difference[at].xyz = (1.0f - part) * d + part * rest * e.xyz;
 }

@@ -52,6 +52,7 @@ def test_kernels_equal_their_twins(device: Device, name: str, part: int, shoulde
     difference, share, mean = shown(grid, box)
     unlike = unlike_of(grid)
     cells, told = unlike.grid, np.random.default_rng(8).normal(size=(7, 10, 4)).astype(np.float32)
+    told[..., 3] = np.random.default_rng(9).random((7, 10)) * patches(10, 10, 7, 0.8)
     out, its_share, its_mean = device.upload(difference), device.upload(share), device.upload(mean)
     moved, other = device.upload(unlike.moved), device.upload(unlike.other)
     sums = device.empty((7, 10, 4))
@@ -72,7 +73,7 @@ def test_kernels_equal_their_twins(device: Device, name: str, part: int, shoulde
     expected = twin.content_complete(difference, share, same, box, grid.border, told, cells.border)
     assert_close(out.get(), expected, 10 * SUM)
     left = (out.get() == difference).all(-1)[difference[..., 3] > 0]
-    assert 0.02 < left.mean() < 0.9  # where nothing is unlike, exactly
+    assert 0.02 < left.mean() < 0.95  # where nothing is unlike, exactly
 
 
 # What is told
@@ -199,11 +200,22 @@ def test_across_the_border_as_elsewhere(device: Device) -> None:
     assert_close(np.roll(second, WIDTH // 2, 1), first, 10 * SUM)
 
 
-def test_where_nothing_tells_layers_do_not_differ(device: Device) -> None:
+def test_where_nothing_tells_layers_are_left(device: Device) -> None:
     everything = np.ones((HEIGHT, WIDTH), bool)
-    seen, share = np.full(everything.shape, 0.3), np.zeros(everything.shape)
-    found = completed(device, seen, share, 0.5, other=everything)
-    assert not found.any()
+    seen, share = np.full(everything.shape, 0.3, np.float32), np.zeros(everything.shape)
+    assert np.array_equal(completed(device, seen, share, 0.5, other=everything), seen)
+
+
+def test_little_tells_little(device: Device) -> None:
+    """Of a narrow overlap all differs, but for a bit at its end, which says nothing of the other one."""
+    own, thing = ~block(72, 84, 0, HEIGHT), block(72, 84, 8, HEIGHT)
+    seen = np.where(own, 0, np.where(core(thing), 0.3, 0.05))
+    found = completed(device, seen, own * 1.0, 0.5, other=thing)
+    assert np.abs(found[-20:, 76:80] - 0.3).max() < 0.12
+    own[:] = False  # of a wide one all that is beside tells as much as anything could
+    seen = np.where(core(thing), 0.3, 0.05)
+    found = completed(device, seen, own * 1.0, 0.5, other=thing)
+    assert np.abs(found[-20:, 76:80] - 0.05).max() < 0.01
 
 
 # The panorama

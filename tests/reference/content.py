@@ -72,9 +72,11 @@ def content_complete(
     told: Array,
     cells: Sequence[int],
 ) -> Array:
-    """What the cells tell, in place of a difference, where layers do not show the same (`content_same`)."""
+    """What the cells tell, as far as that is sure, in place of a difference where layers do not show the
+    same (`content_same`).
+    """
     value, weight = bilinear(told, cells, *place(box, grid, cells))
-    e = (value / weight[..., None])[..., :3]
-    result, same = difference.astype(np.float64), same[..., None]
-    result[..., :3] = same * result[..., :3] + (1 - same) * (1 - share[..., None]) * e
+    told = value / weight[..., None]
+    result, part = difference.astype(np.float64), told[..., 3:] * (1 - same[..., None])
+    result[..., :3] = (1 - part) * result[..., :3] + part * (1 - share[..., None]) * told[..., :3]
     return np.where(difference[..., 3:] > 0, result, difference)
