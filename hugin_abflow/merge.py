@@ -14,6 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from hugin_abflow import joint, sequential
+from hugin_abflow.brackets import of_one_exposure
 from hugin_abflow.devices import choose
 from hugin_abflow.errors import LayersMissingError, OutputError
 from hugin_abflow.exif import Metadata
@@ -60,7 +61,8 @@ def merge_project(
     """Turn a Hugin project into a panorama; returns its file.
 
     output          format by its ending; default: named and typed as the project says, beside it.
-    prefix, layers, remap, keep_layers    where the layers come from, see `nona.open_layers`.
+    prefix, layers, remap, keep_layers    where the layers come from, see `nona.open_layers`. Of those that
+                    nobody named one by one, a view in several exposures is shown in one (`brackets.py`).
     compression, jpeg_quality    of the file, see `images.ImageWriter`; default: the project's, if the output
                     has the project's format. Without `output` a JPEG or PNG has its own whatever is chosen.
     metadata        write EXIF and, for viewers of 360-degree panoramas, GPano; see `metadata.describe`.
@@ -78,12 +80,13 @@ def merge_project(
         plan, prefix=prefix, layers=layers, remap=remap, keep_layers=keep_layers, progress=progress
     ) as opened:
         target = _target(plan, opened, output)
+        shown = opened if layers else of_one_exposure(plan, opened)
         if ENDINGS.get(target.suffix.lower()) == ENDINGS[plan.output.ending]:
             compression = plan.output.compression if compression is None else compression
             jpeg_quality = plan.output.jpeg_quality if jpeg_quality is None else jpeg_quality
         write_panorama(
-            target, opened, plan.canvas, settings, projection=plan.projection,
-            guides=partial(guides_between, plan, opened, settings),
+            target, shown, plan.canvas, settings, projection=plan.projection,
+            guides=partial(guides_between, plan, shown, settings),
             compression=compression, jpeg_quality=jpeg_quality,
             metadata=describe(plan) if metadata else None, progress=progress, open_device=open_device,
         )  # fmt: skip

@@ -112,7 +112,7 @@ def test_blends_are_those_of_their_layers(make_project: ProjectMaker, exiftool: 
     stitch_project(project)
     folder, stem = project.parent, project.stem
     for name, layers in {
-        f"{stem}.tif": [f"{stem}{index:04d}.tif" for index in range(6)],
+        f"{stem}.tif": [f"{stem}{index:04d}.tif" for index in (0, 2, 4)],  # of each view one exposure
         f"{stem}_exposure_0000.tif": [f"{stem}_exposure_layers_{index:04d}.tif" for index in (0, 2, 4)],
         f"{stem}_exposure_0001.tif": [f"{stem}_exposure_layers_{index:04d}.tif" for index in (1, 3, 5)],
         f"{stem}_fused.tif": [f"{stem}_stack_ldr_{index:04d}.tif" for index in range(3)],

@@ -1,0 +1,112 @@
+"""Of a view in several exposures one is shown."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import tifffile
+from conftest import ProjectMaker
+from layer_files import write_layer
+
+from hugin_abflow import brackets
+from hugin_abflow.layer import Layer
+from hugin_abflow.merge import merge_project
+from hugin_abflow.project import read_plan
+
+VIEWS = (0, 0, 0, 60, 60, 60, 170)  # the last one was not taken in several exposures
+CANVAS = 'f2 w802 h401 v360 E{} n"TIFF_m c:LZW r:CROP"'
+
+
+def bracketed(
+    make_project: ProjectMaker,
+    exposures: tuple[float, ...] = (0, -2, 2, 0.1, -1.9, 2.1, 5),
+    wanted: float = 0.0,
+    extra: str = "",
+) -> Path:
+    """A project of photos that look at VIEWS and have exposures; the panorama has the `wanted` one."""
+    project = make_project(yaws=VIEWS[: len(exposures)], panorama=CANVAS.format(wanted), extra=extra)
+    values = iter(exposures)
+    text = re.sub(r" p\d+ ", " p0 ", project.read_text())
+    project.write_text(re.sub(r" Eev0 ", lambda _: f" Eev{next(values)} ", text))
+    return project
+
+
+def shown(project: Path, *names: str) -> list[str]:
+    """The names of the layers of one exposure, of those with some names."""
+    plan = read_plan(project)
+    layer = Layer.from_array("layer", np.zeros((3, 5, 4), np.uint8))
+    layers = [replace(layer, file=plan.folder / name, name=name) for name in names]
+    return [one.name for one in brackets.of_one_exposure(plan, layers)]
+
+
+def names(*numbers: int) -> list[str]:
+    return [f"pano{number:04d}.tif" for number in numbers]
+
+
+@pytest.mark.parametrize(
+    ("wanted", "kept"),
+    [(0, (0, 3, 6)), (-1.9, (1, 4, 6)), (-30, (1, 4, 6)), (1.3, (2, 5, 6)), (1.0, (2, 3, 6)), (9, (2, 5, 6))],
+)
+def test_the_nearest_exposure_is_shown(make_project: ProjectMaker, wanted: float, kept: tuple) -> None:
+    """Of two as near (views 1 and 0 at E1: stops -1 and 1) that with less light."""
+    assert shown(bracketed(make_project, wanted=wanted), *names(*range(7))) == names(*kept)
+
+
+def test_what_is_not_there_is_not_shown_instead(make_project: ProjectMaker) -> None:
+    assert shown(bracketed(make_project), *names(1, 2, 4, 6)) == names(2, 4, 6)
+
+
+def test_all_of_one_exposure_are_shown(make_project: ProjectMaker) -> None:
+    """Less than half a stop is none."""
+    project = bracketed(make_project, (0, 0.4, -0.4, 0, 0, 0, 0))
+    assert shown(project, *names(*range(7))) == names(*range(7))
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        (" y0 ", " y0.5 "),  # handheld: each covers something else
+        (" v80 ", " v81 "),
+        (" TrX0 ", " TrX0.1 "),
+        ("\n\n", '\nk i0 t0 p"1 1 99 1 99 99"\n'),
+        ("\n\n", "\n#hugin_outputHDRBlended true\n#hugin_outputLDRBlended false\n"),
+    ],
+)
+def test_what_does_not_cover_the_same_is_shown(make_project: ProjectMaker, change: tuple[str, str]) -> None:
+    """And all of HDR."""
+    project = bracketed(make_project, (0, 2), extra="\n")
+    assert shown(project, *names(0, 1)) == names(0)
+    text = project.read_text()
+    assert change[0] in text
+    project.write_text(text.replace(*change, 1))
+    assert shown(project, *names(0, 1)) == names(0, 1)
+
+
+def test_masks_that_are_alike_cover_the_same(make_project: ProjectMaker) -> None:
+    masks = "".join(f'k i{image} t0 p"1 1 99 1 99 99"\n' for image in (0, 1))
+    assert shown(bracketed(make_project, (0, 2), extra=masks), *names(0, 1)) == names(0)
+
+
+def test_layers_of_which_nobody_knows_the_photo_are_shown(make_project: ProjectMaker) -> None:
+    project = bracketed(make_project, (0, 2))
+    assert shown(project, "pages", "pages", "pages") == ["pages"] * 3
+    assert shown(project, "one", "two") == ["one"]  # as many as there are photos: in their order
+
+
+def test_the_panorama_is_that_exposure(make_project: ProjectMaker) -> None:
+    """Unless somebody names the layers."""
+    project, folder = bracketed(make_project, (0, -2, 2)), make_project(folder="layers").parent
+    rng = np.random.default_rng(1)
+    for number, level in enumerate((100, 60, 200)):
+        pixels = rng.integers(level, level + 40, (401, 802, 4)).astype(np.uint8)
+        pixels[..., 3] = 255
+        write_layer(folder / f"a{number:04d}.tif", pixels, canvas=(802, 401))
+    merge_project(project, prefix=folder / "a", output=folder / "panorama.tif")
+    first = tifffile.imread(folder / "a0000.tif")
+    assert np.array_equal(tifffile.imread(folder / "panorama.tif"), first)
+    merge_project(project, layers=[folder / "a0001.tif"], output=folder / "other.tif")
+    assert not np.array_equal(tifffile.imread(folder / "other.tif"), first)
