@@ -13,7 +13,8 @@ one without which the energy is less is taken from the other layer, unless he re
 part of him would stay. What stands still and repeats, such as windows, is found as far away again.
 
 Where one layer was taken for all of a region, which is dearer than a cut, lest somebody is there twice, a cut
-that shows him once is better: what else the region has is taken from whichever layer suits it.
+that shows him once is better, if his places are beside each other: what else the region has is taken from
+whichever layer suits it.
 """
 
 from __future__ import annotations
@@ -49,6 +50,8 @@ _TOLD, _LEAST = 0.5, 8.0
 _MOSTLY, _ALIKE = 0.6, 0.6
 # The share of a look that may be found as far away again: what repeats stands still.
 _REPEATS = 0.6
+# The share of one of his places that may be in the other for a cut between them, lest that goes through him.
+_UPON = 0.1
 # How much more he has to differ from what is around him than what is behind him does.
 _OUTLINED = 1.2
 # Displacements of a pair of layers that are looked at.
@@ -138,9 +141,10 @@ def _twice(clone: Clone, owner: npt.NDArray[np.intp], differs: npt.NDArray[np.fl
 
 def _cut(choice: Choice, clone: Clone, look: Callable[[int], Look]) -> Choice | None:
     """The same, but with cuts, whatever one layer costs, in regions in which little differs but him; None:
-    there are none.
+    there are none, or he is not beside his other place.
     """
-    if choice.whole_factor is None:
+    beside = (clone.first & clone.second).sum() <= _UPON * min(clone.first.sum(), clone.second.sum())
+    if choice.whole_factor is None or not beside:
         return None
     at, both = clone.first | clone.second, choice.cover[clone.a] & choice.cover[clone.b]
     off = both & (_apart(look(clone.a)[..., :3], look(clone.b)[..., :3]) > _DIFFERS)

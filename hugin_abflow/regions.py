@@ -14,6 +14,7 @@ shows in t alone.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -85,7 +86,8 @@ class Choice:
     shares      (layers, height, width): s_k, of the softmax.
     cover       (layers, height, width): the cells that each layer covers.
     wraps       whether columns are periodic.
-    cut_price   c: of a cut, in cells.
+    cut_price   c: of a cut, in cells. cut_share: the share of a region's size, the root of its cells, that c
+                is at least: what one layer favours grows with the area, a cut through somebody with the size.
     whole_factor    (height, width): how many times as much as a cut it may cost to take a region from one
                     layer, the largest of its cells; None: it is cut wherever that is cheapest.
     clipping    h e_k: what each layer costs in a cell besides, for what it clips; None: nothing.
@@ -99,6 +101,7 @@ class Choice:
     cut_price: float
     whole_factor: npt.NDArray[np.float64] | None = None
     clipping: Prices | None = None
+    cut_share: float = 0.0
 
     def owners(self, unwanted: Prices | None = None) -> tuple[npt.NDArray[np.intp], float]:
         """The layer of each cell, (height, width): in the regions the one it is taken from, elsewhere the one
@@ -140,6 +143,7 @@ class Choice:
     ) -> Graph:
         """The energy of a region's cells, taken from the layers `candidates`."""
         weight, rough = self.residual.mean[rows, columns], self.residual.rms[rows, columns]
+        cut_price = max(self.cut_price, self.cut_share * math.sqrt(rows.size))
         present = self.cover[candidates][:, rows, columns]
         price = np.where(present, weight * (1 - self.shares[candidates][:, rows, columns]), _FORBIDDEN)
         if self.clipping is not None:
@@ -151,12 +155,12 @@ class Choice:
             inside, there = neighbours(rows + down, columns + right, self.residual.mean.shape, self.wraps)
             # a layer's own border is a cut as well, where the union goes on
             ends = inside & self.cover[:, *there].any(0) & ~self.cover[candidates][:, *there]
-            price += self.cut_price * rough * ends
+            price += cut_price * rough * ends
             if down + right > 0:
                 linked = np.flatnonzero(inside & (number[there] >= 0))
                 links.append(np.stack([linked, number[there][linked]]))
         first, second = np.concatenate(links, 1)
-        cuts = self.cut_price * (rough[first] + rough[second]) / 2
+        cuts = cut_price * (rough[first] + rough[second]) / 2
         return Graph(rows, columns, price, present, first, second, cuts)
 
 

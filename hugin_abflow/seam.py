@@ -40,8 +40,9 @@ _CELL = 8
 _FINE_CELL = 4
 # Cells over which differences are averaged: texture that is a little off is no reason to cut; and how far.
 _SIGMA, _REACH = 1.0, 3
-# Price of a cut, in cells: what is cut off must be favoured by the softmax over this depth, times t / r.
-_CUT = 10.0
+# Price of a cut, in cells: what is cut off must be favoured by the softmax over this depth, times t / r; of
+# large regions over this share of their size.
+_CUT, _CUT_SHARE = 10.0, 0.25
 # The same without flow, where the softmax has little to say: overlaps are some hundred cells wide.
 _FINE_CUT = 120.0
 # Layers show unrelated things: what they differ by in all frequencies, at least, its square's share of the
@@ -152,6 +153,7 @@ def cut(
     if single is not None:
         factor = np.where(single, _SINGLE_FACTOR, _WHOLE_FACTOR)
     choice = _choice(scene, seen(residual), whole, cells, _CUT, factor, clipping_price)
+    choice = replace(choice, cut_share=_CUT_SHARE)
     owner, gone = choose(choice) if choose else (choice.owners()[0], Gone())
     yields = [yielded(whole, owner, k, cells.wraps) for k in range(len(scene.layers))]
     for k, at in gone.items():  # wholly: beside a border the softmax hardly knows another layer

@@ -14,6 +14,7 @@ from scipy import ndimage
 from tolerances import POSITION, assert_close
 
 from hugin_abflow import clones
+from hugin_abflow.clones import Clone
 from hugin_abflow.geometry import Pair
 from hugin_abflow.layer import Canvas
 from hugin_abflow.opencl import Device
@@ -230,6 +231,19 @@ def test_one_layer_is_not_taken_where_a_cut_shows_him_once(
     assert (before[8:19, 19 : 42 + beside] == 0).all()
     assert (once[8:19, 20:25] == 0).all() and (once[8:19, 33:38] == 0).all()
     assert (once[8:19, 41 : 41 + beside] == theirs).all()
+
+
+@pytest.mark.parametrize(("step", "cut"), [(6, True), (4, False), (2, False)])
+def test_who_stands_upon_his_other_place_is_not_cut(step: int, cut: bool) -> None:
+    """A cut between his places would go through him: he is shown by the one layer that has most of it."""
+    first, second = np.zeros((2, HEIGHT, WIDTH), bool)
+    first[8:19, 20:25], second[8:19, 20 + step : 25 + step] = True, True
+    a, b = (np.where(at[..., None], 0.9, 0.2) * np.ones(4, np.float32) for at in (first, second))
+    cover, half = np.ones((2, HEIGHT, WIDTH), bool), np.full((2, HEIGHT, WIDTH), 0.5)
+    whole = first | second
+    choice = Choice(whole, Residuals(half[0], half[0]), half, cover, False, 10.0, 1.65 * whole)
+    found = clones._cut(choice, Clone(0, 1, first, second, 1.0), [a, b].__getitem__)
+    assert (found is not None) == cut
 
 
 def test_layers_are_not_looked_at_where_regions_are_small(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -14,7 +14,7 @@ from hugin_abflow import coefficient, labelling, regions, seam
 from hugin_abflow.colour import Correction
 from hugin_abflow.geometry import Pair
 from hugin_abflow.opencl import Device
-from hugin_abflow.regions import Residuals
+from hugin_abflow.regions import Choice, Residuals
 from hugin_abflow.scene import Scene
 
 WRAPS = [False, True]
@@ -56,6 +56,32 @@ def test_a_cut_that_is_much_better_is_kept() -> None:
     least, *alone = energies(np.stack([cut, 0 * cut, 0 * cut + 1]), *problem)
     assert min(alone) > seam._SINGLE_FACTOR * least
     assert np.array_equal(once, cut) and 0 < cut.mean() < 1
+
+
+@pytest.mark.parametrize("times", [2, 3])
+def test_cuts_are_as_dear_for_large_people(times: int) -> None:
+    """Seen by cells twice as fine he is cut no sooner: what a layer favours grows with the area, and so does
+    a share of the region's size for every cell of a cut.
+    """
+    rng = np.random.default_rng(3)
+    residual = Residuals(rng.random((12, 14)), np.full((12, 14), 0.02))
+    share = rng.random((12, 14))
+
+    def owners(by: int, cut_share: float, cut_price: float) -> np.ndarray:
+        mean, rms, whole, first = (
+            np.repeat(np.repeat(one, by, 0), by, 1)
+            for one in (residual.mean, residual.rms, np.ones((12, 14), bool), share)
+        )
+        cover = np.ones((2, *whole.shape), bool)
+        shares = np.stack([first, 1 - first])
+        choice = Choice(whole, Residuals(mean, rms), shares, cover, False, cut_price, cut_share=cut_share)
+        return choice.owners()[0][::by, ::by]
+
+    coarse = owners(1, 0.5, 0)
+    assert 0.1 < coarse.mean() < 0.9
+    assert np.array_equal(owners(times, 0.5, 0), coarse)
+    assert np.array_equal(owners(1, 0.5, 20), owners(1, 0, 20))  # of two prices the higher one
+    assert not np.array_equal(owners(times, 0, 0.5 * np.sqrt(coarse.size)), coarse)
 
 
 @many

@@ -426,3 +426,22 @@ def test_without_flow_what_differs_all_over_is_exposure(wide: int, light: float,
         layers.append(masked(picture, mask))
     seen = ndimage.gaussian_filter1d(merged(layers, canvas, flow=False)[..., 1].mean(0), 4)
     assert np.abs(np.diff(seen)).max() < steepest
+
+
+@pytest.mark.usefixtures(one_device.__name__)
+def test_a_large_person_who_moved_on_by_less_than_his_width_is_there_once() -> None:
+    """In layers that show nearly the same, and each of them all of him: half of him would be cheaper to cut
+    off than to show what the softmax does not favour.
+    """
+    y, x = pixel_places(800, 1040)
+    plain, rng, layers, photos = texture(y, x, np.uint8), np.random.default_rng(0), [], []
+    for place, mask in ((380, x < 1000), (540, x >= 40)):
+        picture = plain // 2 + np.uint8(96)
+        him = (np.abs(x - place) < 110) & (y > 250) | (np.hypot(x - place, y - 190) < 80)
+        coat = rng.integers(0, 120, (70, 40, 3))  # he turned as well
+        picture[him, :3] = coat[y[him].astype(int) // 12, (x[him].astype(int) - place + 110) // 12]
+        layers.append(masked(picture, mask))
+        photos.append((picture, him))
+    result = merged(layers, Canvas.plane(1040, 800))
+    first, second = sorted((off(result, picture)[him] < 30).mean() for picture, him in photos)
+    assert first < 0.1 and second > 0.99
