@@ -20,12 +20,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
-import scipy
 
 from hugin_abflow import content
-from hugin_abflow.chart import widest_gap
 from hugin_abflow.colour import NEGLIGIBLE, Correction
 from hugin_abflow.content import Unlike
+from hugin_abflow.feather import feathers
 from hugin_abflow.opencl import MUCH, Buffer, Device
 from hugin_abflow.working import Grid, Place, WorkingLayer
 
@@ -142,8 +141,7 @@ def _differ(
     """Have each entry be how it differs from a mean of all in which none ends suddenly."""
     grid = finest[0].grid
     mean = device.zeros((*grid.shape, 4))
-    shown = [level.colours.get()[..., 3] > 0 for level in finest]
-    shares = [device.upload(one) for one in feathers(shown, [level.box for level in finest], grid)]
+    shares = feathers(device, [(level.box, level.colours) for level in finest], grid)
     for level, share in zip(finest, shares, strict=True):
         _add(device, replace(level, share=share), None, mean)
     _join(device, mean, grid, None, None)
@@ -156,40 +154,6 @@ def _differ(
         finest[k] = _spread(device, level, widths)
         del level
         device.give_back(MUCH)
-
-
-def feathers(
-    shown: Sequence[npt.NDArray[np.bool_]], boxes: Sequence[Place], grid: Grid
-) -> list[npt.NDArray[np.float32]]:
-    """Shares of layers that sum to 1, each by the distance in px to where it ends and another one goes on.
-
-    shown       where each layer shows something, (height, width) on its box of `grid`, as the shares.
-    """
-    union, total = np.zeros(grid.shape, bool), np.zeros(grid.shape, np.float32)
-    parts = [np.s_[top : top + height, left : left + width] for left, top, width, height in boxes]
-    for part, mask in zip(parts, shown, strict=True):
-        union[part] |= mask
-    depths = []
-    for part, mask in zip(parts, shown, strict=True):
-        depths.append(_depth(mask, ~union[part] | mask, grid))
-        total[part] += depths[-1]
-    total[total == 0] = 1
-    for part, depth in zip(parts, depths, strict=True):
-        depth /= total[part]
-    return depths
-
-
-def _depth(mask: npt.NDArray[np.bool_], inside: npt.NDArray[np.bool_], grid: Grid) -> npt.NDArray[np.float32]:
-    """The distance in px of each pixel of a mask on `grid` from what is not inside, both (height, width)."""
-    if inside.all():
-        return np.asarray(mask * np.float32(grid.width + grid.height))
-    wraps = grid.wraps and mask.shape[1] == grid.width
-    # what goes once around, and has a gap, is cut open there; without one it is continued
-    first, gap = widest_gap(np.logical_or.reduce(mask, 0)) if wraps and mask.any() else (0, 0)
-    by = mask.shape[1] // 2 if wraps and gap < 2 else 0
-    around = np.pad(np.roll(inside, gap // 2 - first, 1), ((0, 0), (by, by)), mode="wrap")
-    depth = scipy.ndimage.distance_transform_edt(around)[:, by : by + mask.shape[1]]
-    return np.asarray(np.roll(depth, first - gap // 2, 1).astype(np.float32) * mask)
 
 
 def _blend(

@@ -292,38 +292,6 @@ def test_a_layer_that_is_seen_up_to_its_border_ends_without_a_step(
     assert result[64, 48] > 0.57 and result[64, 208] < 0.53
 
 
-@pytest.mark.parametrize("name", list(GRIDS))
-def test_feathers_sum_to_one_and_fade_to_borders(name: str) -> None:
-    """Of random masks; beside another layer each counts for less than where it is alone."""
-    grid = GRIDS[name]
-    places = boxes(grid)
-    masks = [patches(k, width, height, 0.6) > 0 for k, (_, _, width, height) in enumerate(places)]
-    found = multiband.feathers(masks, places, grid)
-    total, count = np.zeros(grid.shape), np.zeros(grid.shape, int)
-    for one, mask, (left, top, width, height) in zip(found, masks, places, strict=True):
-        assert one.dtype == np.float32 and one.shape == mask.shape
-        assert (one[mask] > 0).all() and not one[~mask].any()
-        total[top : top + height, left : left + width] += one
-        count[top : top + height, left : left + width] += mask
-    assert np.allclose(total, count > 0, atol=1e-6)
-    assert (count > 1).any()
-
-
-def test_a_feather_is_as_wide_as_the_overlap() -> None:
-    """It falls evenly; across the border of a canvas that wraps as well. What covers all has no border."""
-    grid = plane(60, 20, wraps=True)
-    columns = np.broadcast_to(np.arange(60), grid.shape)
-    box = (0, 0, 60, 20)
-    for turn in (0, 35):
-        masks = [np.roll(mask, turn, 1) for mask in ((columns >= 30), (columns < 40) | (columns >= 52))]
-        first, second = (np.roll(one, -turn, 1) for one in multiband.feathers(masks, [box, box], grid))
-        assert np.allclose(first[:, 30:40], (np.arange(10) + 1) / 11, atol=0.02)
-        assert np.allclose(second[:, 52:60], (np.arange(8) + 1) / 9, atol=0.02)
-        assert (first[:, 41:51] == 1).all() and (second[:, 2:28] == 1).all()
-    everywhere = np.ones(grid.shape, bool)
-    assert np.allclose(multiband.feathers([everywhere] * 2, [box, box], grid), 0.5)
-
-
 @pytest.mark.parametrize("turned", [0, 96])
 @pytest.mark.parametrize("flow_tells", [True, False])
 def test_a_thing_leaves_no_shade_beside_it(device: Device, turned: int, flow_tells: bool) -> None:

@@ -1,0 +1,42 @@
+"""Shares of layers that fade towards where each of them ends and another one goes on (kernels/feather.cl)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from hugin_abflow.opencl import Buffer, Device
+from hugin_abflow.working import Grid, Place
+
+# Columns and rows to a work-group: few, that all cores have some.
+_GROUP = 16
+
+
+def feathers(device: Device, layers: Sequence[tuple[Place, Buffer]], grid: Grid) -> list[Buffer]:
+    """Shares of layers that sum to 1 where any is, each by the distance in px to where it ends and another
+    one goes on: float32 (height, width) on the layer's box, 0 where it shows nothing.
+
+    layers      each one's place on `grid`, and float32 (height, width, 4) on it: colour, valid.
+    """
+    count, total = device.zeros(grid.shape, np.int32), device.zeros(grid.shape)
+    for box, layer in layers:
+        device.run("feather", "feather_count", box[2:], layer, box, grid.border, count)
+    shares = []
+    for box, layer in layers:
+        width, height = box[2:]
+        around = width // 2 if grid.wraps and width == grid.width else 0
+        rows, share = device.empty((height, width), np.int32), device.empty((height, width))
+        lowest = device.empty((height, width + 2 * around, 2), np.int32)
+        device.run(
+            "feather", "feather_columns", (width,),
+            layer, box, grid.border, count, grid.width + grid.height, rows, group=_GROUP,
+        )  # fmt: skip
+        device.run(
+            "feather", "feather_distance", (height,),
+            layer, box, grid.border, rows, around, lowest, share, total, group=_GROUP,
+        )  # fmt: skip
+        shares.append(share)
+    for (box, _), share in zip(layers, shares, strict=True):
+        device.run("feather", "feather_share", box[2:], share, box, grid.border, total)
+    return shares
