@@ -85,7 +85,8 @@ def measure(
     cells = colour_grid(grid, covered)
     overlaps = [_Overlap(device, layers, fields, pair, grid, cells) for pair in pairs]
     shoulder = _shoulder(overlaps) if layers[0].layer.dtype.kind == "u" else 0.0
-    differences = tuple(overlap.difference(shoulder) for overlap in overlaps)
+    started = [overlap.start_difference(shoulder) for overlap in overlaps]  # all before the first is fetched
+    differences = tuple(overlap.difference(*its) for overlap, its in zip(overlaps, started, strict=True))
     return Measured(cells, on_cells(covered, cells, np.logical_or), shoulder, differences)
 
 
@@ -163,8 +164,8 @@ class _Overlap:
         """The cells that both layers' boxes reach into."""
         return shared_cells(self.layers[self.pair.a], self.layers[self.pair.b], self.grid, self.cells)
 
-    def difference(self, shoulder: float) -> Difference:
-        """The difference on the exposure scale of a shoulder."""
+    def start_difference(self, shoulder: float) -> tuple[Buffer, Buffer, Buffer]:
+        """Have the device find the difference on the exposure scale of a shoulder."""
         width, height = self._part.width, self._part.height
         values, beyond = (self.device.empty((height, width, 4)) for _ in range(2))
         mixing = self.device.empty((height, width))
@@ -172,25 +173,32 @@ class _Overlap:
             "colour", "colour_difference", (width, height),
             *self._sides, shoulder, *self._clipping, _SPREAD, values, beyond, mixing,
         )  # fmt: skip
+        return values, beyond, mixing
+
+    def difference(self, values: Buffer, beyond: Buffer, mixing: Buffer) -> Difference:
+        """What `start_difference` started."""
         one, other, seen = (v.get().astype(np.float64) for v in (values, beyond, mixing))
         return Difference(self.pair.a, self.pair.b, one, other, seen, self._part.slices)
 
-    def misfit(self) -> npt.NDArray[np.float64]:
-        """What is left of the difference on the scale of each of _SHOULDERS: (cells, shoulders)."""
+    def start_misfit(self) -> Buffer:
+        """Have the device find what is left of the difference on the scale of each of _SHOULDERS: (height,
+        width, shoulders).
+        """
         width, height = self._part.width, self._part.height
-        misfit = self.device.empty((height, width, 4))
+        misfit = self.device.empty((height, width, len(_SHOULDERS)))
         self.device.run(
             "colour", "colour_misfit", (width, height),
             *self._sides, _SHOULDERS, *self._clipping, misfit,
         )  # fmt: skip
-        return misfit.get().astype(np.float64).reshape(-1, len(_SHOULDERS))
+        return misfit
 
 
 def _shoulder(overlaps: Sequence[_Overlap]) -> float:
     """The shoulder that explains the layers' differences best; the first, where none is clearly better."""
     if not overlaps:
         return _SHOULDERS[0]
-    misfit = np.concatenate([overlap.misfit() for overlap in overlaps])
+    started = [overlap.start_misfit() for overlap in overlaps]
+    misfit = np.concatenate([one.get().astype(np.float64).reshape(-1, len(_SHOULDERS)) for one in started])
     # what no scale explains is no exposure, and counts for as little as it tells
     total = (misfit / (1 + misfit.min(1, keepdims=True) / _MISFIT**2)).sum(0)
     best = int(np.argmin(total))

@@ -222,10 +222,10 @@ def test_each_layer_is_compared_up_to_its_own_white(device: Device, clipped: int
     still = [device.zeros((*grid.shape, 4)) for _ in layers]
     cells = grid.resized(7, 3)
     overlap = colour._Overlap(device, layers, still, Pair(0, 1), grid, cells)
-    found = overlap.difference(1.0)
+    found = overlap.difference(*overlap.start_difference(1.0))
     assert (found.values[..., 3] > 0).all() == (clipped is None)
     assert (np.sign(found.beyond[..., 3]) == {0: 1, 1: -1, None: 0}[clipped]).all()
-    assert (overlap.misfit().max() > 0) == (clipped is None)
+    assert (overlap.start_misfit().get().max() > 0) == (clipped is None)
     none = colour.Correction(cells, 1.0, (None, None))
     residual = seam.residuals(Scene(device, layers, [Pair(0, 1)], still, None, grid), none)
     assert residual.measured.all() == (clipped is None) == residual.measured.any()
