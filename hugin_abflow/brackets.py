@@ -6,46 +6,69 @@ import logging
 from collections import defaultdict
 from collections.abc import Hashable, Sequence
 
+import numpy as np
+
 from hugin_abflow import pto
-from hugin_abflow.layer import Layer
+from hugin_abflow.layer import Layer, full_scale
 from hugin_abflow.pano_trafo import images_of
 from hugin_abflow.project import Plan
 
 _log = logging.getLogger(__name__)
 
-# What photos of one view have in common, besides their size: their layers cover the same.
+# What photos of one view have in common, besides their size.
 _VIEW = ("y", "p", "r", "TrX", "TrY", "TrZ", "Tpy", "Tpp", "v", "a", "b", "c", "d", "e", "g", "t")
 # Stops from which on two exposures differ: Hugin's own for layers of one exposure.
 _APART = 0.5
+# Rows of layers that are looked at together.
+_ROWS = 64
 
 
 def of_one_exposure(plan: Plan, layers: Sequence[Layer]) -> list[Layer]:
     """The layers without those that show a view in another exposure than the one nearest to the panorama's.
 
     Brought to its exposure, the others have nothing to show beside that one but noise, or what they clip.
-    All are kept of HDR, where the project does not tell whose layers they are, and where masks differ. Raises
-    `pto.PtoError` as `pto.load` does.
+    What shows a pixel that it does not is kept, and all of HDR, and all where the project does not tell whose
+    layers they are. Raises `pto.PtoError` as `pto.load` does, `ImageReadError` as the layers' readers do.
     """
-    project, images = pto.load(plan.file), images_of(plan, layers)
-    views = defaultdict[Hashable, dict[int, float]](dict)
-    for index in images:
-        if index is None or plan.hdr:
-            return list(layers)
-        image = project.images[index]
-        views[_view(image)][index] = image.variable("Eev") - project.panorama.exposure
+    images = images_of(plan, layers)
+    numbers = [number for number in images if number is not None]
+    if plan.hdr or len(numbers) < len(layers):
+        return list(layers)
+    project = pto.load(plan.file)
+    views = defaultdict[Hashable, dict[int, float]](dict)  # of each the layers, and their stops from E
+    for k, number in enumerate(numbers):
+        image = project.images[number]
+        views[_view(image)][k] = image.variable("Eev") - project.panorama.exposure
     kept = set[int]()
     for off in views.values():
-        # of two as near the one with less light, which clips less
-        nearest = min(off.values(), key=lambda stops: (round(abs(stops), 3), -stops))
-        kept |= {index for index, stops in off.items() if abs(stops - nearest) < _APART}
-    for index, layer in zip(images, layers, strict=True):
-        if index not in kept:
+        nearest = min(off.values(), key=abs)
+        if abs(nearest) >= _APART:
+            # of two about as near that with less light, which clips less: of all views the same one
+            nearest = max(stops for stops in off.values() if abs(stops) <= abs(nearest) + _APART)
+        its = [k for k, stops in off.items() if abs(stops - nearest) < _APART]
+        kept |= set(its)
+        kept |= {k for k in off if k not in its and not _covered(layers[k], [layers[j] for j in its])}
+    for k, layer in enumerate(layers):
+        if k not in kept:
             _log.info("%s shows a view in another exposure; it is left out", layer.name)
-    return [layer for index, layer in zip(images, layers, strict=True) if index in kept]
+    return [layers[k] for k in sorted(kept)]
+
+
+def _covered(layer: Layer, others: Sequence[Layer]) -> bool:
+    """Whether some of the others show every pixel that a layer shows."""
+    others = [other for other in others if other.box == layer.box]
+    step = max(layer.strip, _ROWS)
+    for top in range(0, layer.box.height if others else 0, step):
+        bottom = min(top + step, layer.box.height)
+        shown, *theirs = (
+            one.read(top, bottom)[..., -1] >= full_scale(one.dtype) / 2 for one in (layer, *others)
+        )
+        if (shown & ~np.logical_or.reduce(theirs)).any():
+            return False
+    return bool(others)
 
 
 def _view(image: pto.Image) -> Hashable:
-    """What images have in common whose layers cover the same."""
-    masks = tuple(sorted((mask.type, tuple(mask.points)) for mask in image.masks))
+    """What images have in common that look at the same."""
     frame = image.width, image.height, image.projection, image.crop
-    return *frame, masks, *(image.variable(name) for name in _VIEW)
+    return *frame, *(image.variable(name) for name in _VIEW)

@@ -35,11 +35,18 @@ def bracketed(
     return project
 
 
+def layer_of(left: int = 0, **hidden: slice) -> Layer:
+    """All of it shows something, but for some rows, of some columns."""
+    pixels = np.full((131, 5, 4), 255, np.uint8)
+    if hidden:
+        pixels[hidden["rows"], hidden["columns"], 3] = 127
+    return Layer.from_array("layer", pixels, left)
+
+
 def shown(project: Path, *names: str) -> list[str]:
     """The names of the layers of one exposure, of those with some names."""
     plan = read_plan(project)
-    layer = Layer.from_array("layer", np.zeros((3, 5, 4), np.uint8))
-    layers = [replace(layer, file=plan.folder / name, name=name) for name in names]
+    layers = [replace(layer_of(), file=plan.folder / name, name=name) for name in names]
     return [one.name for one in brackets.of_one_exposure(plan, layers)]
 
 
@@ -49,10 +56,10 @@ def names(*numbers: int) -> list[str]:
 
 @pytest.mark.parametrize(
     ("wanted", "kept"),
-    [(0, (0, 3, 6)), (-1.9, (1, 4, 6)), (-30, (1, 4, 6)), (1.3, (2, 5, 6)), (1.0, (2, 3, 6)), (9, (2, 5, 6))],
+    [(0, (0, 3, 6)), (-1.9, (1, 4, 6)), (-30, (1, 4, 6)), (1.3, (2, 5, 6)), (1.0, (2, 5, 6)), (9, (2, 5, 6))],
 )
 def test_the_nearest_exposure_is_shown(make_project: ProjectMaker, wanted: float, kept: tuple) -> None:
-    """Of two as near (views 1 and 0 at E1: stops -1 and 1) that with less light."""
+    """Of two about as near (at E1: stops -1 and 1; -.9 and 1.1) that with less light, of all views."""
     assert shown(bracketed(make_project, wanted=wanted), *names(*range(7))) == names(*kept)
 
 
@@ -72,11 +79,10 @@ def test_all_of_one_exposure_are_shown(make_project: ProjectMaker) -> None:
         (" y0 ", " y0.5 "),  # handheld: each covers something else
         (" v80 ", " v81 "),
         (" TrX0 ", " TrX0.1 "),
-        ("\n\n", '\nk i0 t0 p"1 1 99 1 99 99"\n'),
         ("\n\n", "\n#hugin_outputHDRBlended true\n#hugin_outputLDRBlended false\n"),
     ],
 )
-def test_what_does_not_cover_the_same_is_shown(make_project: ProjectMaker, change: tuple[str, str]) -> None:
+def test_what_does_not_look_at_the_same_is_shown(make_project: ProjectMaker, change: tuple[str, str]) -> None:
     """And all of HDR."""
     project = bracketed(make_project, (0, 2), extra="\n")
     assert shown(project, *names(0, 1)) == names(0)
@@ -86,9 +92,28 @@ def test_what_does_not_cover_the_same_is_shown(make_project: ProjectMaker, chang
     assert shown(project, *names(0, 1)) == names(0, 1)
 
 
-def test_masks_that_are_alike_cover_the_same(make_project: ProjectMaker) -> None:
-    masks = "".join(f'k i{image} t0 p"1 1 99 1 99 99"\n' for image in (0, 1))
-    assert shown(bracketed(make_project, (0, 2), extra=masks), *names(0, 1)) == names(0)
+SOME = {"rows": slice(100, 131), "columns": slice(2, 5)}
+LESS = {"rows": slice(101, 130), "columns": slice(3, 4)}
+
+
+@pytest.mark.parametrize(
+    ("kept", "other", "covers"),
+    [
+        (layer_of(), layer_of(**SOME), True),
+        (layer_of(**SOME), layer_of(), False),  # a mask, or a transparent photo
+        (layer_of(**SOME), layer_of(**SOME), True),
+        (layer_of(**SOME), layer_of(**LESS), False),
+        (layer_of(), layer_of(1), False),  # another view's, as of photos that were fused
+    ],
+)
+def test_only_what_is_covered_is_left_out(
+    make_project: ProjectMaker, kept: Layer, other: Layer, covers: bool
+) -> None:
+    plan = read_plan(bracketed(make_project, (0, 2)))
+    layers = [
+        replace(one, file=plan.folder / name) for one, name in zip((kept, other), names(0, 1), strict=True)
+    ]
+    assert len(brackets.of_one_exposure(plan, layers)) == (1 if covers else 2)
 
 
 def test_layers_of_which_nobody_knows_the_photo_are_shown(make_project: ProjectMaker) -> None:
