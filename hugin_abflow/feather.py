@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from hugin_abflow.opencl import Buffer, Device
+from hugin_abflow.opencl import MUCH, Buffer, Device
 from hugin_abflow.working import Grid, Place
 
 # Columns and rows to a work-group: few, that all cores have some.
@@ -19,24 +19,26 @@ def feathers(device: Device, layers: Sequence[tuple[Place, Buffer]], grid: Grid)
 
     layers      each one's place on `grid`, and float32 (height, width, 4) on it: colour, valid.
     """
-    count, total = device.zeros(grid.shape, np.int32), device.zeros(grid.shape)
+    shown, total = device.zeros(grid.shape, np.uint8), device.zeros(grid.shape)
     for box, layer in layers:
-        device.run("feather", "feather_count", box[2:], layer, box, grid.border, count)
+        device.run("feather", "feather_mark", box[2:], layer, box, grid.border, shown)
     shares = []
     for box, layer in layers:
         width, height = box[2:]
         around = width // 2 if grid.wraps and width == grid.width else 0
-        rows, share = device.empty((height, width), np.int32), device.empty((height, width))
-        lowest = device.empty((height, width + 2 * around, 2), np.int32)
+        rows, share = device.empty((height, width), np.uint16), device.empty((height, width))
+        lowest = device.empty((height, width + 2 * around, 2), np.uint16)
         device.run(
             "feather", "feather_columns", (width,),
-            layer, box, grid.border, count, grid.width + grid.height, rows, group=_GROUP,
+            layer, box, grid.border, shown, grid.width + grid.height, rows, group=_GROUP,
         )  # fmt: skip
         device.run(
             "feather", "feather_distance", (height,),
             layer, box, grid.border, rows, around, lowest, share, total, group=_GROUP,
         )  # fmt: skip
         shares.append(share)
+        del rows, lowest
+        device.give_back(MUCH)  # layers are of different sizes
     for (box, _), share in zip(layers, shares, strict=True):
         device.run("feather", "feather_share", box[2:], share, box, grid.border, total)
     return shares

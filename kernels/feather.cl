@@ -12,28 +12,28 @@ static inline int feather_squared(int x, int at, int rows) {
     return (x - at) * (x - at) + rows * rows;
 }
 
-/* How many layers show each pixel of the grid. */
-__kernel void feather_count(__global const float4 *layer, /* (box.w, box.z): colour, valid */
-                            int4 box, int4 grid,          /* place, run size; its grid */
-                            __global int *count)          /* (grid.y, grid.x) */
+/* Mark the pixels of the grid that a layer shows. */
+__kernel void feather_mark(__global const float4 *layer, /* (box.w, box.z): colour, valid */
+                           int4 box, int4 grid,          /* place, run size; its grid */
+                           __global uchar *shown)        /* (grid.y, grid.x): 1 where any layer shows something */
 {
     const int x = get_global_id(0), y = get_global_id(1);
     if (x < box.z && y < box.w && layer[y * box.z + x].w > 0.0f)
-        ++count[(y + box.y) * grid.x + x + box.x];
+        shown[(y + box.y) * grid.x + x + box.x] = 1;
 }
 
 /* In each column of the box, the rows to the nearest pixel that another layer shows and this one does not. */
 __kernel void feather_columns(__global const float4 *layer, int4 box, int4 grid, /* as above; run size: box.z */
-                              __global const int *count, /* (grid.y, grid.x) */
-                              int far,                   /* more than any distance: where there is none */
-                              __global int *rows)        /* (box.w, box.z) */
+                              __global const uchar *shown, /* (grid.y, grid.x) */
+                              int far,                     /* more than any distance: where there is none */
+                              __global ushort *rows)       /* (box.w, box.z) */
 {
     const int x = get_global_id(0);
     if (x >= box.z)
         return;
     int off = far;
     for (int y = 0; y < box.w; ++y) {
-        const bool border = layer[y * box.z + x].w <= 0.0f && count[(y + box.y) * grid.x + x + box.x] > 0;
+        const bool border = layer[y * box.z + x].w <= 0.0f && shown[(y + box.y) * grid.x + x + box.x];
         off = border ? 0 : LEAST(off + 1, far);
         rows[y * box.z + x] = off;
     }
@@ -46,9 +46,9 @@ __kernel void feather_columns(__global const float4 *layer, int4 box, int4 grid,
 /* The distance to the nearest such pixel, 0 where the layer shows nothing; added to those of all. A box that goes once
    around is continued beyond its ends. */
 __kernel void feather_distance(__global const float4 *layer, int4 box, int4 grid, /* as above; run size: box.w */
-                               __global const int *rows,     /* (box.w, box.z), of feather_columns */
+                               __global const ushort *rows,  /* (box.w, box.z), of feather_columns */
                                int beyond,                   /* columns that it is continued by, up to box.z */
-                               __global int2 *lowest,        /* (box.w, box.z + 2 beyond): a column, and the first
+                               __global ushort2 *lowest,     /* (box.w, box.z + 2 beyond): a column, and the first
                                                                 place in whose reach it is the nearest */
                                __global float *distance,     /* (box.w, box.z) */
                                __global float *total)        /* (grid.y, grid.x) */
@@ -56,21 +56,22 @@ __kernel void feather_distance(__global const float4 *layer, int4 box, int4 grid
     const int y = get_global_id(0), places = box.z + 2 * beyond;
     if (y >= box.w)
         return;
-    __global const int *row = rows + y * box.z;
-    __global int2 *envelope = lowest + y * places;
+    __global const ushort *row = rows + y * box.z;
+    __global ushort2 *envelope = lowest + y * places;
     int last = -1, high = 0; /* rows of the last column's */
     int2 top = (int2)(0, 0);
     for (int u = 0; u < places; ++u) {
         const int its = row[feather_column(u - beyond, box)];
         while (last >= 0 && feather_squared(top.y, top.x, high) > feather_squared(top.y, u, its))
             if (--last >= 0) {
-                top = envelope[last];
+                top = convert_int2(envelope[last]);
                 high = row[feather_column(top.x - beyond, box)];
             }
         const int from =
             last < 0 ? 0 : 1 + (u * u - top.x * top.x + its * its - high * high) / (2 * (u - top.x));
         if (from < places) {
-            envelope[++last] = top = (int2)(u, from);
+            top = (int2)(u, from);
+            envelope[++last] = convert_ushort2(top);
             high = its;
         }
     }
@@ -83,7 +84,7 @@ __kernel void feather_distance(__global const float4 *layer, int4 box, int4 grid
             total[(y + box.y) * grid.x + x + box.x] += d;
         }
         if (u == top.y && --last >= 0) {
-            top = envelope[last];
+            top = convert_int2(envelope[last]);
             high = row[feather_column(top.x - beyond, box)];
         }
     }
