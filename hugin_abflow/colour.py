@@ -19,7 +19,9 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+import scipy
 
+from hugin_abflow.cells import grown
 from hugin_abflow.coefficient import on_cells
 from hugin_abflow.gains import Difference, Measured, solve
 from hugin_abflow.geometry import Pair
@@ -100,7 +102,7 @@ def correction(
     """Solve for the gains of all layers.
 
     ignored: (height, width) on any grid over the same region: pixels whose differences are not used; a colour
-    cell with any of them counts for nothing.
+    cell with any of them counts for nothing, but where an overlap is no wider than two.
     strict: reject outliers earlier, so that what moved stays visible in the residual.
     With `settings.exposure` off there is no correction.
     """
@@ -111,7 +113,7 @@ def correction(
     differences = measured.differences
     unknown = None if ignored is None else on_cells(ignored[None], cells, np.logical_or)[0]
     if unknown is not None:
-        differences = tuple(_weighted(d, ~unknown[d.cells]) for d in differences)
+        differences = tuple(_weighted(d, _counts(d, unknown)) for d in differences)
     if settings.flow:  # without, layers are not mixed but cut, somewhere
         differences = tuple(_weighted(d, d.mixing + _UNSEEN) for d in differences)
     if not any(np.any(v[..., :3] * v[..., 3:]) for d in differences for v in (d.values, d.beyond)):
@@ -129,6 +131,15 @@ def correction(
         packed[..., :3] = _extend(gain, mask, cells.wraps)
         result.append(device.upload(packed))
     return replace(none, gains=tuple(result))
+
+
+def _counts(difference: Difference, unknown: npt.NDArray[np.bool_]) -> npt.NDArray[np.bool_]:
+    """Whether what is measured in each cell counts: not in `unknown` ones, (height, width) on the colour
+    grid, but where the overlap is narrow. That is rather exposure, which nothing beside tells there, than
+    somebody.
+    """
+    wide = scipy.ndimage.binary_opening(difference.values[..., 3] > 0, np.ones((3, 3)))
+    return ~(unknown[difference.cells] & grown(wide, 1, wraps=False))
 
 
 def _weighted(difference: Difference, weight: npt.NDArray[Any]) -> Difference:

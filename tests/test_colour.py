@@ -291,3 +291,22 @@ def test_a_difference_goes_on_where_nothing_tells_of_it(device: Device, strict: 
     off = np.abs(other - one - wanted)[:, 17:23].max((1, 2))
     assert off[somebody[:, 0]].max() < 0.05 and off[~somebody[:, 0]].max() < 0.005
     assert np.abs(one[:, 0]).max() < 0.5 * np.abs(one[:, 20]).max()
+
+
+@pytest.mark.parametrize(("columns", "counts"), [(1, True), (2, True), (3, False), (6, False)])
+def test_what_is_ignored_counts_in_narrow_overlaps(device: Device, columns: int, counts: bool) -> None:
+    """Part of which differs by more: that is exposure, not somebody, of whom there would be more beside."""
+    cells, inside = plane(640, 480).resized(40, 30), np.zeros((2, 30, 40), bool)
+    inside[0, :, : 20 + columns], inside[1, :, 20:] = True, True
+    values = np.full((30, 40, 4), 0.2)
+    unknown = np.zeros((30, 40), bool)
+    unknown[10:20] = True
+    values[unknown, :3] = 0.8
+    values[..., 3] = inside.all(0)
+    measured = Measured(
+        cells, inside, 1.0, (Difference(0, 1, values, np.zeros_like(values), np.ones((30, 40))),)
+    )
+    found = colour.correction(device, measured, Settings(), unknown).gains
+    one, other = (gain.get()[..., 0] for gain in found)
+    at = (other - one)[13:17, 20 : 20 + columns]
+    assert (at > 0.75).all() if counts else (at < 0.3).all()
