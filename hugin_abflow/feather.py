@@ -11,6 +11,8 @@ from hugin_abflow.working import Grid, Place
 
 # Columns and rows to a work-group: few, that all cores have some.
 _GROUP = 16
+# Columns and distances are kept in 16 bits: those of working grids are some thousand.
+_MOST = 65_535
 
 
 def feathers(device: Device, layers: Sequence[tuple[Place, Buffer]], grid: Grid) -> list[Buffer]:
@@ -25,12 +27,12 @@ def feathers(device: Device, layers: Sequence[tuple[Place, Buffer]], grid: Grid)
     shares = []
     for box, layer in layers:
         width, height = box[2:]
-        around = width // 2 if grid.wraps and width == grid.width else 0
+        around = min(width // 2, (_MOST - width) // 2) if grid.wraps and width == grid.width else 0
         rows, share = device.empty((height, width), np.uint16), device.empty((height, width))
         lowest = device.empty((height, width + 2 * around, 2), np.uint16)
         device.run(
             "feather", "feather_columns", (width,),
-            layer, box, grid.border, shown, grid.width + grid.height, rows, group=_GROUP,
+            layer, box, grid.border, shown, min(grid.width + grid.height, _MOST), rows, group=_GROUP,
         )  # fmt: skip
         device.run(
             "feather", "feather_distance", (height,),

@@ -8,7 +8,7 @@ static inline int feather_column(int place, int4 box) {
 }
 
 /* Squared distance of place x of a row from the nearest border in column `at`, which is `rows` away there. */
-static inline int feather_squared(int x, int at, int rows) {
+static inline long feather_squared(long x, int at, long rows) {
     return (x - at) * (x - at) + rows * rows;
 }
 
@@ -67,10 +67,13 @@ __kernel void feather_distance(__global const float4 *layer, int4 box, int4 grid
                 top = convert_int2(envelope[last]);
                 high = row[feather_column(top.x - beyond, box)];
             }
-        const int from =
-            last < 0 ? 0 : 1 + (u * u - top.x * top.x + its * its - high * high) / (2 * (u - top.x));
+        long from = 0;
+        if (last >= 0) {
+            const long more = feather_squared(u, 0, its) - feather_squared(top.x, 0, high);
+            from = 1 + more / (2 * (u - top.x));
+        }
         if (from < places) {
-            top = (int2)(u, from);
+            top = (int2)(u, (int)from);
             envelope[++last] = convert_ushort2(top);
             high = its;
         }
