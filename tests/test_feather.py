@@ -21,18 +21,53 @@ from hugin_abflow.working import Grid, Place
 __all__ = ["one_device"]
 
 
+def layer_of(mask: np.ndarray) -> np.ndarray:
+    return np.dstack([np.zeros((*mask.shape, 3)), mask]).astype(np.float32)
+
+
 def shares(
     device: Device, masks: Sequence[np.ndarray], places: Sequence[Place], grid: Grid
 ) -> list[np.ndarray]:
-    layers = [np.dstack([np.zeros((*mask.shape, 3)), mask]).astype(np.float32) for mask in masks]
-    layers = [(box, device.upload(layer)) for box, layer in zip(places, layers, strict=True)]
+    layers = [(box, device.upload(layer_of(mask))) for box, mask in zip(places, masks, strict=True)]
     return [one.get() for one in feathers(device, layers, grid)]
 
 
 @pytest.mark.parametrize("name", list(GRIDS))
+@pytest.mark.parametrize("part", [0, 1, 2])
+@pytest.mark.parametrize("share", [0.05, 0.6, 0.95])
+def test_kernels_equal_their_twins(device: Device, name: str, part: int, share: float) -> None:
+    """Of masks in patches, of which some have borders in few columns."""
+    grid, box = GRIDS[name], boxes(GRIDS[name])[part]
+    width, height = box[2:]
+    mask, before = patches(1, width, height, share) > 0, patches(2, grid.width, grid.height, 0.5) > 0
+    layer, shown = device.upload(layer_of(mask)), device.upload(before, np.uint8)
+    device.run("feather", "feather_mark", box[2:], layer, box, grid.border, shown)
+    marked = twin.feather_mark(mask, box, before)
+    assert np.array_equal(shown.get(), marked)
+    far, beyond = grid.width + grid.height, width // 2 * (part == 0)
+    rows = device.empty((height, width), np.uint16)
+    device.run("feather", "feather_columns", (width,), layer, box, grid.border, shown, far, rows, group=16)
+    expected = twin.feather_columns(mask, box, marked, far)
+    assert np.array_equal(rows.get(), expected)
+    lowest = device.empty((height, width + 2 * beyond, 2), np.uint16)
+    distance, total = device.empty((height, width)), device.upload(before, np.float32)
+    device.run(
+        "feather", "feather_distance", (height,),
+        layer, box, grid.border, rows, beyond, lowest, distance, total, group=16,
+    )  # fmt: skip
+    expected = twin.feather_distance(mask, expected, beyond)
+    assert_close(distance.get(), expected, SUM)
+    sums = before.astype(float)
+    sums[twin.part(box)] += expected
+    assert_close(total.get(), sums, SUM)
+    device.run("feather", "feather_share", box[2:], distance, box, grid.border, total)
+    assert_close(distance.get(), twin.feather_share(expected, box, sums), SUM)
+
+
+@pytest.mark.parametrize("name", list(GRIDS))
 @pytest.mark.parametrize("share", [0.05, 0.6, 0.97, 1.0])
-def test_kernels_equal_their_twins(device: Device, name: str, share: float) -> None:
-    """Of masks in patches, of which some have borders in few columns, and some none."""
+def test_shares_are_by_distance(device: Device, name: str, share: float) -> None:
+    """As SciPy measures it; also where some have no border."""
     grid = GRIDS[name]
     places = boxes(grid)
     masks = [patches(k, width, height, share) > 0 for k, (_, _, width, height) in enumerate(places)]

@@ -1,4 +1,4 @@
-"""Twin of kernels/feather.cl."""
+"""Twins of kernels/feather.cl, and what they are for by SciPy's distances."""
 
 from __future__ import annotations
 
@@ -10,20 +10,53 @@ from scipy import ndimage
 from reference.common import Array
 
 
+def part(box: Sequence[int]) -> tuple[slice, slice]:
+    """Rows and columns of a box (left, top, width, height)."""
+    return slice(box[1], box[1] + box[3]), slice(box[0], box[0] + box[2])
+
+
+def feather_mark(mask: Array, box: Sequence[int], shown: Array) -> Array:
+    """What any layer shows, with what one that shows `mask` on a box does."""
+    shown = shown.copy()
+    shown[part(box)] |= mask
+    return shown
+
+
+def feather_columns(mask: Array, box: Sequence[int], shown: Array, far: int) -> Array:
+    """In each column the rows to the nearest pixel that is shown, but not by the layer."""
+    rows, columns = np.nonzero(shown[part(box)] & ~mask)
+    result = np.full(mask.shape, far)
+    for row, column in zip(rows, columns, strict=True):
+        off = np.abs(np.arange(mask.shape[0]) - row)
+        result[:, column] = np.minimum(result[:, column], off)
+    return result
+
+
+def feather_distance(mask: Array, rows: Array, beyond: int) -> Array:
+    """The least distance of any column's, also of those that a box is continued by; 0 beside the mask."""
+    around = np.pad(rows, ((0, 0), (beyond, beyond)), "wrap")
+    across = np.arange(around.shape[1]) - (np.arange(rows.shape[1]) + beyond)[:, None]
+    squared = (across**2 + around[:, None] ** 2).min(-1)
+    return np.sqrt(squared) * mask
+
+
+def feather_share(distance: Array, box: Sequence[int], total: Array) -> Array:
+    """Distances as shares of the sum of all."""
+    its = total[part(box)]
+    return distance / np.where(its > 0, its, 1)
+
+
 def feathers(masks: Sequence[Array], boxes: Sequence[Sequence[int]], grid: Sequence[int]) -> list[Array]:
     """Shares of layers that show `masks` on boxes of a grid (width, height, wraps, poles)."""
-    union, total = np.zeros((grid[1], grid[0]), bool), np.zeros((grid[1], grid[0]), np.float32)
-    parts = [np.s_[top : top + height, left : left + width] for left, top, width, height in boxes]
-    for part, mask in zip(parts, masks, strict=True):
-        union[part] |= mask
+    union, total = np.zeros((grid[1], grid[0]), bool), np.zeros((grid[1], grid[0]))
+    for box, mask in zip(boxes, masks, strict=True):
+        union[part(box)] |= mask
     distances = []
-    for part, mask in zip(parts, masks, strict=True):
-        border = union[part] & ~mask
+    for box, mask in zip(boxes, masks, strict=True):
+        border = union[part(box)] & ~mask
         by = mask.shape[1] // 2 if grid[2] and mask.shape[1] == grid[0] else 0
         off = ndimage.distance_transform_edt(np.pad(~border, ((0, 0), (by, by)), "wrap"))
         off = off[:, by : by + mask.shape[1]] if border.any() else np.full(mask.shape, grid[0] + grid[1])
-        distances.append((off * mask).astype(np.float32))
-        total[part] += distances[-1]
-    return [
-        one / np.where(total[part] > 0, total[part], 1) for one, part in zip(distances, parts, strict=True)
-    ]
+        distances.append(off * mask)
+        total[part(box)] += distances[-1]
+    return [feather_share(one, box, total) for one, box in zip(distances, boxes, strict=True)]
