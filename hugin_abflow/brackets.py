@@ -17,8 +17,8 @@ _log = logging.getLogger(__name__)
 
 # What photos of one view have in common, besides their size.
 _VIEW = ("y", "p", "r", "TrX", "TrY", "TrZ", "Tpy", "Tpp", "v", "a", "b", "c", "d", "e", "g", "t")
-# Stops from which on two exposures differ: Hugin's own for layers of one exposure.
-_APART = 0.5
+# Stops from which on two exposures differ: Hugin's default for layers of one exposure.
+EXPOSURE_DIFFERENCE = 0.5
 # Rows of layers that are looked at together.
 _ROWS = 64
 
@@ -42,10 +42,10 @@ def of_one_exposure(plan: Plan, layers: Sequence[Layer]) -> list[Layer]:
     kept = set[int]()
     for off in views.values():
         nearest = min(off.values(), key=abs)
-        if abs(nearest) >= _APART:
+        if abs(nearest) >= EXPOSURE_DIFFERENCE:
             # of two about as near that with less light, which clips less: of all views the same one
-            nearest = max(stops for stops in off.values() if abs(stops) <= abs(nearest) + _APART)
-        its = [k for k, stops in off.items() if abs(stops - nearest) < _APART]
+            nearest = max(stops for stops in off.values() if abs(stops) <= abs(nearest) + EXPOSURE_DIFFERENCE)
+        its = [k for k, stops in off.items() if abs(stops - nearest) < EXPOSURE_DIFFERENCE]
         kept |= set(its)
         kept |= {k for k in off if k not in its and not _covered(layers[k], [layers[j] for j in its])}
     for k, layer in enumerate(layers):

@@ -16,7 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from hugin_abflow.opencl import Buffer, Device
-from hugin_abflow.working import Grid, WorkingLayer
+from hugin_abflow.working import Grid, Place, WorkingLayer
 
 # Distances are smooth: a mask grid of this many pixels is fine enough, and four times faster.
 _FINE_PIXELS = 600_000
@@ -152,6 +152,15 @@ def coefficients(
             layer.pixels, layer.box, grid.border, blend, total,
         )  # fmt: skip
         result.append(blend)
-    for layer, blend in zip(layers, result, strict=True):
-        device.run("coefficient", "coefficient_ratio", layer.box[2:], blend, layer.box, grid.border, total)
+    divide(device, [(layer.box, blend) for layer, blend in zip(layers, result, strict=True)], total, grid)
     return result
+
+
+def divide(device: Device, values: Sequence[tuple[Place, Buffer]], total: Buffer, grid: Grid) -> None:
+    """Divide what layers have, in place, by the sum of all: it sums to 1 then, where there is any.
+
+    values      each layer's place on `grid`, and float32 (height, width) on it, 0 or more.
+    total       float32 (height, width) on all of the grid.
+    """
+    for box, one in values:
+        device.run("coefficient", "coefficient_ratio", box[2:], one, box, grid.border, total)

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from hugin_abflow.coefficient import divide
 from hugin_abflow.opencl import MUCH, Buffer, Device
 from hugin_abflow.working import Grid, Place
 
@@ -41,6 +42,5 @@ def feathers(device: Device, layers: Sequence[tuple[Place, Buffer]], grid: Grid)
         shares.append(share)
         del rows, lowest
         device.give_back(MUCH)  # layers are of different sizes
-    for (box, _), share in zip(layers, shares, strict=True):
-        device.run("feather", "feather_share", box[2:], share, box, grid.border, total)
+    divide(device, [(box, share) for (box, _), share in zip(layers, shares, strict=True)], total, grid)
     return shares

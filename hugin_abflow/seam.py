@@ -152,8 +152,10 @@ def cut(
     factor = np.full(whole.shape, _WHOLE_FACTOR)
     if single is not None:
         factor = np.where(single, _SINGLE_FACTOR, _WHOLE_FACTOR)
-    choice = _choice(scene, seen(residual), whole, cells, _CUT, factor, clipping_price)
-    choice = replace(choice, cut_share=_CUT_SHARE)
+    choice = replace(
+        _choice(scene, seen(residual), whole, cells, _CUT),
+        cut_share=_CUT_SHARE, whole_factor=factor, clipping=clipping_price,
+    )  # fmt: skip
     owner, gone = choose(choice) if choose else (choice.owners()[0], Gone())
     yields = [yielded(whole, owner, k, cells.wraps) for k in range(len(scene.layers))]
     for k, at in gone.items():  # wholly: beside a border the softmax hardly knows another layer
@@ -222,15 +224,13 @@ def _choice(
     whole: Cells,
     cells: Grid,
     cut_price: float,
-    whole_factor: npt.NDArray[np.float64] | None = None,
-    clipping_price: Prices | None = None,
 ) -> Choice:
     """The choice of the layer that each cell of the regions `whole` is taken from."""
     cover = on_cells(scene.masks.host, cells, np.logical_and)
     shares = _weights(scene, cells)
     shares /= np.maximum(shares.sum(0), 1e-12)
     residual = completed(residual, cover, cells.wraps)
-    return Choice(whole, residual, shares, cover, cells.wraps, cut_price, whole_factor, clipping_price)
+    return Choice(whole, residual, shares, cover, cells.wraps, cut_price)
 
 
 def _weights(scene: Scene, cells: Grid) -> npt.NDArray[np.float64]:

@@ -7,12 +7,13 @@ from collections import Counter
 from collections.abc import Callable, Sequence
 
 from hugin_abflow import pto
+from hugin_abflow.brackets import EXPOSURE_DIFFERENCE
 from hugin_abflow.pano_trafo import map_places
 from hugin_abflow.project import Plan
 
 _STEPS = 10  # places along each side of a photo; as Hugin
 _CIRCULAR = (2, 8, 20)  # projections of photos whose crop is a circle: circular fisheyes
-_MIN_OVERLAP, _EXPOSURE_DIFFERENCE = 0.7, 0.5  # Hugin's defaults
+_MIN_OVERLAP = 0.7  # Hugin's default
 
 
 def stacks(plan: Plan, images: Sequence[int]) -> list[list[int]]:
@@ -55,7 +56,7 @@ def exposure_layers(plan: Plan, images: Sequence[int]) -> list[list[int]]:
     The project may say another difference (outputLayersExposureDiff); Hugin's `getExposureLayers`.
     """
     project = pto.load(plan.file)
-    most = _number(project.option("outputLayersExposureDiff", ""), _EXPOSURE_DIFFERENCE)
+    most = _number(project.option("outputLayersExposureDiff", ""), EXPOSURE_DIFFERENCE)
     values = {index: project.images[index].variable("Eev") for index in images}
     return _grouped(images, lambda first, other: abs(values[first] - values[other]) < most)
 

@@ -34,7 +34,7 @@ import numpy.typing as npt
 import scipy
 
 from hugin_abflow.cells import Mask
-from hugin_abflow.coefficient import Masks, on_cells
+from hugin_abflow.coefficient import Masks, divide, on_cells
 from hugin_abflow.geometry import PairFlow
 from hugin_abflow.layer import Box
 from hugin_abflow.opencl import Buffer, Device
@@ -261,5 +261,4 @@ def _expand(
             "transition", "transition_expand", layer.box[2:], one, layer.box, grid.border,
             shares.share, shares.first, shares.owner, shares.cells.border, index, total,
         )  # fmt: skip
-    for layer, one in zip(layers, coefficients, strict=True):
-        device.run("transition", "transition_ratio", layer.box[2:], one, layer.box, grid.border, total)
+    divide(device, [(layer.box, one) for layer, one in zip(layers, coefficients, strict=True)], total, grid)

@@ -126,16 +126,15 @@ __kernel void coefficient_expand(__global const float *distance, /* (grid.y, gri
     total[(y + box.y) * working.x + x + box.x] += d;
 }
 
-/* w_k = D_k / sum_j D_j, in place. */
-__kernel void coefficient_ratio(__global float *distance,     /* (box.w, box.z) D_k, becomes w_k */
-                                int4 box,                     /* place on the working grid; run size */
-                                int4 working,                 /* working grid */
-                                __global const float *total)  /* (working.y, working.x) */
+/* What layers have at a place as parts of the sum of all, in place: w_k = D_k / sum_j D_j. */
+__kernel void coefficient_ratio(__global float *value,        /* (box.w, box.z), 0 or more; stays where the sum is 0 */
+                                int4 box, int4 grid,          /* place, run size; its grid */
+                                __global const float *total)  /* (grid.y, grid.x) */
 {
     const int x = get_global_id(0), y = get_global_id(1);
     if (x >= box.z || y >= box.w)
         return;
-    const int at = y * box.z + x;
-    const float d = distance[at];
-    distance[at] = d > 0.0f ? d / total[(y + box.y) * working.x + x + box.x] : 0.0f;
+    const float sum = total[(y + box.y) * grid.x + x + box.x];
+    if (sum > 0.0f)
+        value[y * box.z + x] /= sum;
 }

@@ -92,16 +92,3 @@ __kernel void feather_distance(__global const float4 *layer, int4 box, int4 grid
         }
     }
 }
-
-/* A layer's share: its distance, of the sum of all, in place. */
-__kernel void feather_share(__global float *distance,    /* (box.w, box.z) */
-                            int4 box, int4 grid,         /* place, run size; its grid */
-                            __global const float *total) /* (grid.y, grid.x) */
-{
-    const int x = get_global_id(0), y = get_global_id(1);
-    if (x >= box.z || y >= box.w)
-        return;
-    const float all = total[(y + box.y) * grid.x + x + box.x];
-    if (all > 0.0f)
-        distance[y * box.z + x] /= all;
-}

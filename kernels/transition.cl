@@ -260,16 +260,3 @@ __kernel void transition_expand(__global float *blend,            /* (box.w, box
     blend[at] = w;
     total[(y + box.y) * border.x + x + box.x] += w;
 }
-
-/* Coefficients that sum to 1, in place. */
-__kernel void transition_ratio(__global float *blend,          /* (box.w, box.z) */
-                               int4 box, int4 border,          /* place on the working grid, run size; the grid */
-                               __global const float *total)    /* (border.y, border.x) */
-{
-    const int x = get_global_id(0), y = get_global_id(1);
-    if (x >= box.z || y >= box.w)
-        return;
-    const float sum = total[(y + box.y) * border.x + x + box.x];
-    if (sum > 0.0f)
-        blend[y * box.z + x] /= sum;
-}

@@ -60,8 +60,6 @@ def test_kernels_equal_their_twins(device: Device, name: str, part: int, share: 
     sums = before.astype(float)
     sums[twin.part(box)] += expected
     assert_close(total.get(), sums, SUM)
-    device.run("feather", "feather_share", box[2:], distance, box, grid.border, total)
-    assert_close(distance.get(), twin.feather_share(expected, box, sums), SUM)
 
 
 @pytest.mark.parametrize("name", list(GRIDS))

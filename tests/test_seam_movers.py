@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -179,8 +180,8 @@ def owners(device: Device, told: np.ndarray, residual: np.ndarray, turn: int = 0
             [device.upload(field, np.float32) for field in fields], SimpleNamespace(host=covers), grid,
         ),
         Residuals(residual, residual, told), region, seam.seam_grid(grid), seam._CUT,
-        seam._SINGLE_FACTOR * region,
     )  # fmt: skip
+    choice = replace(choice, whole_factor=seam._SINGLE_FACTOR * region)
     return np.roll(choice.owners()[0], -turn, 1)
 
 

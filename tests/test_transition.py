@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from grids import GRIDS, on_device, patches, plane, random_layer, sphere, whole_chart
 from reference import transition as twin
+from reference.coefficient import coefficient_ratio
 from scipy import ndimage
 from tolerances import POSITION, SUM, TRIGONOMETRY, assert_close
 
@@ -203,8 +204,8 @@ def test_expanding_equals_its_twins(device: Device, name: str) -> None:
     expected_sums = total.astype(np.float64)
     expected_sums[box[1] : box[1] + box[3], box[0] : box[0] + box[2]] += expected
     assert_close(sums.get(), expected_sums, 10 * SUM)
-    device.run("transition", "transition_ratio", box[2:], expanded, box, grid.border, sums)
-    assert_close(expanded.get(), twin.transition_ratio(expected, box, expected_sums), TRIGONOMETRY)
+    device.run("coefficient", "coefficient_ratio", box[2:], expanded, box, grid.border, sums)
+    assert_close(expanded.get(), coefficient_ratio(expected, box, expected_sums), TRIGONOMETRY)
 
 
 def test_shares_are_listed_by_cell_and_layer(device: Device) -> None:

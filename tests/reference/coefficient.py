@@ -84,8 +84,8 @@ def coefficient_expand(
     return expanded, total
 
 
-def coefficient_ratio(distance: Array, box: Sequence[int], total: Array) -> Array:
-    """w_k on the layer's box."""
-    summed = total[box[1] : box[1] + box[3], box[0] : box[0] + box[2]]
-    outside = distance <= 0
-    return np.where(outside, 0.0, distance / np.where(outside, 1, summed))
+def coefficient_ratio(value: Array, box: Sequence[int], total: Array) -> Array:
+    """What a layer has on its box, over the total, (height, width) of the grid; as it is where that is 0."""
+    left, top, width, height = box
+    total = total[top : top + height, left : left + width].astype(np.float64)
+    return np.where(total > 0, value / np.where(total > 0, total, 1), value)

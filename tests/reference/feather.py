@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from scipy import ndimage
 
+from reference.coefficient import coefficient_ratio
 from reference.common import Array
 
 
@@ -40,12 +41,6 @@ def feather_distance(mask: Array, rows: Array, beyond: int) -> Array:
     return np.sqrt(squared) * mask
 
 
-def feather_share(distance: Array, box: Sequence[int], total: Array) -> Array:
-    """Distances as shares of the sum of all."""
-    its = total[part(box)]
-    return distance / np.where(its > 0, its, 1)
-
-
 def feathers(masks: Sequence[Array], boxes: Sequence[Sequence[int]], grid: Sequence[int]) -> list[Array]:
     """Shares of layers that show `masks` on boxes of a grid (width, height, wraps, poles)."""
     union, total = np.zeros((grid[1], grid[0]), bool), np.zeros((grid[1], grid[0]))
@@ -59,4 +54,4 @@ def feathers(masks: Sequence[Array], boxes: Sequence[Sequence[int]], grid: Seque
         off = off[:, by : by + mask.shape[1]] if border.any() else np.full(mask.shape, grid[0] + grid[1])
         distances.append(off * mask)
         total[part(box)] += distances[-1]
-    return [feather_share(one, box, total) for one, box in zip(distances, boxes, strict=True)]
+    return [coefficient_ratio(one, box, total) for one, box in zip(distances, boxes, strict=True)]

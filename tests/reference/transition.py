@@ -193,10 +193,3 @@ def transition_expand(
     x, y = (columns + 0.5) * cells[0] / border[0], (rows + 0.5) * cells[1] / border[1]
     w = np.maximum(bilinear(share, cells, x, y)[0], TRACE)
     return np.where((blend > 0) & (blend < 1), w, blend.astype(np.float64))
-
-
-def transition_ratio(blend: Array, box: Sequence[int], total: Array) -> Array:
-    """Coefficients over their total, a (height, width) array of the working grid."""
-    left, top, width, height = box
-    total = total[top : top + height, left : left + width].astype(np.float64)
-    return np.where(total > 0, blend / np.where(total > 0, total, 1), blend)
