@@ -32,9 +32,9 @@ from hugin_abflow.working import Grid
 _ROUNDS = ((0.1, 4.0), (1.0, 3.0), (100.0, 2.5))
 # The same, slower and stricter: what lies far from it is no exposure but something that only one layer shows.
 _STRICT = ((0.01, 4.0), (0.03, 2.5), (0.3, 1.6), (3.0, 1.2), (100.0, 1.0))
-# Where differences weigh no more than smoothness, gains are smooth, and blocks of so many cells across share
-# one: nearly all of a round's time goes into eliminating unknowns.
-_ROUGH, _BLOCK = 1.0, 2
+# Where differences weigh hardly more than smoothness, gains are smooth, and blocks of so many cells across
+# share one: nearly all of a round's time goes into eliminating unknowns.
+_ROUGH, _BLOCK = 3.0, 2
 # Weight of a clipped cell against smoothness: what it tells is a bound, of a brightness that nobody knows.
 _BOUND = 0.1
 # Weight of the smoothness of the difference of two layers' gains, for steps into and within cells that tell

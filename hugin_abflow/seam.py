@@ -19,9 +19,9 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from typing import Any
 
+import cv2
 import numpy as np
 import numpy.typing as npt
-import scipy
 
 from hugin_abflow.cells import averaged, grown
 from hugin_abflow.coefficient import on_cells
@@ -309,10 +309,11 @@ def _unrelated(found: npt.NDArray[np.float64], cells: Grid) -> Cells:
     """Where layers show things that have nothing in common, though they may be as bright. found: of
     `_differences`, averaged over the cells around, on some of the grid's columns.
     """
-    square, variances = found[_SQUARE], found[_VARIANCES]
-    apart = (square > _UNRELATED**2) & (square > _OF_VARIANCES * variances.sum(-1))
-    apart &= variances.max(-1) > _VARIANCE_RATIO * variances.min(-1)
-    smoother = np.take_along_axis(found[_COARSE], variances.argmin(-1)[..., None], -1)[..., 0]
+    # layer by layer: along an axis of two NumPy takes ten times as long
+    square, (first, second) = found[_SQUARE], np.moveaxis(found[_VARIANCES], -1, 0)
+    apart = (square > _UNRELATED**2) & (square > _OF_VARIANCES * (first + second))
+    apart &= np.maximum(first, second) > _VARIANCE_RATIO * np.minimum(first, second)
+    smoother = np.where(first <= second, *np.moveaxis(found[_COARSE], -1, 0))
     number = connected(apart, cells.wraps and apart.shape[1] == cells.width)
     common, own, count = (
         np.bincount(number.flat, (apart * one).flat) for one in (found[_COVARIANCE], smoother, 1.0)
@@ -327,10 +328,12 @@ def _smooth(values: npt.NDArray[np.float64], cells: Grid) -> npt.NDArray[np.floa
     """A Gaussian of _SIGMA cells, not normalised at the borders, of some of a grid's columns side by side."""
     columns = values.shape[1]
     gap = min(_REACH, cells.width - columns)  # what is between its ends if columns wrap, and matters
+    by = _REACH if cells.wraps else 0
     values = np.pad(values, ((0, 0), (0, gap), (0, 0)))
-    modes = ("constant", "wrap" if cells.wraps else "constant", "constant")
-    smooth = scipy.ndimage.gaussian_filter(values, (_SIGMA, _SIGMA, 0), mode=modes, radius=_REACH)
-    return np.asarray(smooth[:, :columns])
+    values = np.pad(values, ((0, 0), (by, by), (0, 0)), "wrap")
+    size = 2 * _REACH + 1
+    smooth = cv2.GaussianBlur(values, (size, size), _SIGMA, borderType=cv2.BORDER_CONSTANT)
+    return np.asarray(smooth[:, by : by + columns])
 
 
 def _centres(cells: Grid, shape: Sequence[int]) -> tuple[npt.NDArray[np.intp], npt.NDArray[np.intp]]:
