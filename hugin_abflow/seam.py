@@ -19,9 +19,9 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from typing import Any
 
-import cv2
 import numpy as np
 import numpy.typing as npt
+import scipy
 
 from hugin_abflow.cells import averaged, grown
 from hugin_abflow.coefficient import on_cells
@@ -328,12 +328,10 @@ def _smooth(values: npt.NDArray[np.float64], cells: Grid) -> npt.NDArray[np.floa
     """A Gaussian of _SIGMA cells, not normalised at the borders, of some of a grid's columns side by side."""
     columns = values.shape[1]
     gap = min(_REACH, cells.width - columns)  # what is between its ends if columns wrap, and matters
-    by = _REACH if cells.wraps else 0
     values = np.pad(values, ((0, 0), (0, gap), (0, 0)))
-    values = np.pad(values, ((0, 0), (by, by), (0, 0)), "wrap")
-    size = 2 * _REACH + 1
-    smooth = cv2.GaussianBlur(values, (size, size), _SIGMA, borderType=cv2.BORDER_CONSTANT)
-    return np.asarray(smooth[:, by : by + columns])
+    modes = ("constant", "wrap" if cells.wraps else "constant", "constant")
+    smooth = scipy.ndimage.gaussian_filter(values, (_SIGMA, _SIGMA, 0), mode=modes, radius=_REACH)
+    return np.asarray(smooth[:, :columns])
 
 
 def _centres(cells: Grid, shape: Sequence[int]) -> tuple[npt.NDArray[np.intp], npt.NDArray[np.intp]]:
