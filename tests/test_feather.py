@@ -11,6 +11,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from pictures import one_device
 from reference import feather as twin
+from reference.coefficient import coefficient_ratio
+from reference.common import on_box
 from tolerances import SUM, assert_close
 
 from hugin_abflow.feather import feathers
@@ -58,8 +60,10 @@ def test_kernels_equal_their_twins(device: Device, name: str, part: int, share: 
     expected = twin.feather_distance(mask, expected, beyond)
     assert_close(distance.get(), expected, SUM)
     sums = before.astype(float)
-    sums[twin.part(box)] += expected
+    sums[on_box(box)] += expected
     assert_close(total.get(), sums, SUM)
+    device.run("coefficient", "coefficient_ratio", box[2:], distance, box, grid.border, total)
+    assert_close(distance.get(), coefficient_ratio(expected, box, sums), SUM)
 
 
 @pytest.mark.parametrize("name", list(GRIDS))

@@ -48,7 +48,7 @@ def dense_gains(measured: Measured, strict: bool, unknown: np.ndarray) -> np.nda
         blocks[index[k, y, x], index[k, y // 2, x // 2]] = 1
     rounds = gains._STRICT if strict else gains._ROUNDS
     for data, limit in rounds:
-        slack, onto = (0.5, blocks) if data <= 3 else (1.0, np.eye(inside.size))
+        slack, onto = (0.5, blocks) if data <= gains._ROUGH else (1.0, np.eye(inside.size))
         last = not strict or (data, limit) == rounds[-1]
         fade = max(1.0, (gains._FADE if last else gains._TREND_FADE) * circle)
         rows, targets = [], []

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from reference.common import Array, Numbers, bilinear, canvas_point, grid_border, pixels
+from reference.common import Array, Numbers, bilinear, canvas_point, grid_border, on_box, pixels
 
 
 def _touches(count: int, of: int) -> Array:
@@ -18,7 +18,7 @@ def _touches(count: int, of: int) -> Array:
 def coefficient_mask(layer: Array, box: Sequence[int], working: Sequence[int], grid: Sequence[int]) -> Array:
     """uint8 (height, width) of the mask grid: 1 where no working pixel under it lacks the layer."""
     missing = np.ones((working[1], working[0]), int)
-    missing[box[1] : box[1] + box[3], box[0] : box[0] + box[2]] = layer[..., 3] == 0
+    missing[on_box(box)] = layer[..., 3] == 0
     across, down = _touches(grid[0], working[0]), _touches(grid[1], working[1])
     return (down.astype(int) @ missing @ across.T.astype(int) == 0).astype(np.uint8)
 
@@ -80,12 +80,11 @@ def coefficient_expand(
     summed, share = bilinear(distance, grid, (x + 0.5) * ratio[0], (y + 0.5) * ratio[1])
     expanded = np.where(layer[..., 3] != 0, np.maximum(summed / share, 1e-3), 0.0)
     total = total.astype(np.float64)
-    total[box[1] : box[1] + box[3], box[0] : box[0] + box[2]] += expanded
+    total[on_box(box)] += expanded
     return expanded, total
 
 
 def coefficient_ratio(value: Array, box: Sequence[int], total: Array) -> Array:
     """What a layer has on its box, over the total, (height, width) of the grid; as it is where that is 0."""
-    left, top, width, height = box
-    total = total[top : top + height, left : left + width].astype(np.float64)
+    total = total[on_box(box)].astype(np.float64)
     return np.where(total > 0, value / np.where(total > 0, total, 1), value)

@@ -182,6 +182,12 @@ def cell_parts(
         yield (j, i), np.s_[top:bottom:every, left:right:every]
 
 
+def on_box(box: Sequence[int]) -> tuple[slice, slice]:
+    """Rows and columns of a box (left, top, width, height)."""
+    left, top, width, height = box
+    return np.s_[top : top + height, left : left + width]
+
+
 def pixels(width: int, height: int, left: int = 0, top: int = 0) -> tuple[Array, Array]:
     """Columns and rows of all pixels of a box, each (height, width)."""
     rows, columns = np.mgrid[top : top + height, left : left + width]

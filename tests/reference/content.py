@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from reference.common import Array, bilinear, cell_parts
+from reference.common import Array, bilinear, cell_parts, on_box
 from reference.multiband import place
 
 # The brightest channel of what may be anything, as dark as it is, and of what surely is something.
@@ -27,8 +27,7 @@ def content_same(
     shoulder: float,
 ) -> Array:
     """How surely a layer on a box, with its share of the mean, shows the same as others, (height, width)."""
-    left, top, width, height = box
-    there = mean[top : top + height, left : left + width, :3].astype(np.float64)
+    there = mean[on_box(box)][..., :3].astype(np.float64)
     own = there + difference[..., :3]
     others = own - difference[..., :3] / np.maximum(1 - share.astype(np.float64), LITTLE)[..., None]
     darker = np.minimum(others.max(-1), own.max(-1))
@@ -55,7 +54,7 @@ def content_gather(
     rest = 1 - share.astype(np.float64)
     part = np.concatenate([difference[..., :3], rest[..., None]], -1) * (same * rest)[..., None]
     sums = np.zeros((grid[1], grid[0], 4))
-    sums[box[1] : box[1] + box[3], box[0] : box[0] + box[2]] = part * (difference[..., 3:] > 0)
+    sums[on_box(box)] = part * (difference[..., 3:] > 0)
     result = np.zeros((cells[1], cells[0], 4))
     for its, pixels in cell_parts(grid, cells):
         if sums[pixels].size:

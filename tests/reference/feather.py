@@ -8,24 +8,19 @@ import numpy as np
 from scipy import ndimage
 
 from reference.coefficient import coefficient_ratio
-from reference.common import Array
-
-
-def part(box: Sequence[int]) -> tuple[slice, slice]:
-    """Rows and columns of a box (left, top, width, height)."""
-    return slice(box[1], box[1] + box[3]), slice(box[0], box[0] + box[2])
+from reference.common import Array, on_box
 
 
 def feather_mark(mask: Array, box: Sequence[int], shown: Array) -> Array:
     """What any layer shows, with what one that shows `mask` on a box does."""
     shown = shown.copy()
-    shown[part(box)] |= mask
+    shown[on_box(box)] |= mask
     return shown
 
 
 def feather_columns(mask: Array, box: Sequence[int], shown: Array, far: int) -> Array:
     """In each column the rows to the nearest pixel that is shown, but not by the layer."""
-    rows, columns = np.nonzero(shown[part(box)] & ~mask)
+    rows, columns = np.nonzero(shown[on_box(box)] & ~mask)
     result = np.full(mask.shape, far)
     for row, column in zip(rows, columns, strict=True):
         off = np.abs(np.arange(mask.shape[0]) - row)
@@ -45,13 +40,13 @@ def feathers(masks: Sequence[Array], boxes: Sequence[Sequence[int]], grid: Seque
     """Shares of layers that show `masks` on boxes of a grid (width, height, wraps, poles)."""
     union, total = np.zeros((grid[1], grid[0]), bool), np.zeros((grid[1], grid[0]))
     for box, mask in zip(boxes, masks, strict=True):
-        union[part(box)] |= mask
+        union[on_box(box)] |= mask
     distances = []
     for box, mask in zip(boxes, masks, strict=True):
-        border = union[part(box)] & ~mask
+        border = union[on_box(box)] & ~mask
         by = mask.shape[1] // 2 if grid[2] and mask.shape[1] == grid[0] else 0
         off = ndimage.distance_transform_edt(np.pad(~border, ((0, 0), (by, by)), "wrap"))
         off = off[:, by : by + mask.shape[1]] if border.any() else np.full(mask.shape, grid[0] + grid[1])
         distances.append(off * mask)
-        total[part(box)] += distances[-1]
+        total[on_box(box)] += distances[-1]
     return [coefficient_ratio(one, box, total) for one, box in zip(distances, boxes, strict=True)]

@@ -14,6 +14,7 @@ from reference.common import (
     canvas_position,
     chart_point,
     chart_position,
+    on_box,
     pixels,
     take,
 )
@@ -94,15 +95,15 @@ def geometry_activation(
     long = np.minimum(np.linalg.norm(field[..., :3], axis=-1) / shared, furthest)
     a = sharpness * blend * (1 + magnitude * long / width)
     result[..., 3] = np.where(blend != 0, a, result[..., 3])
-    part = np.s_[box[1] : box[1] + box[3], box[0] : box[0] + box[2]]
-    highest[part] = np.where(blend != 0, np.maximum(highest[part], a), highest[part])
+    its = highest[on_box(box)]
+    highest[on_box(box)] = np.where(blend != 0, np.maximum(its, a), its)
     return result, highest
 
 
 def geometry_softmax(field: Array, blend: Array, box: Sequence[int], highest: Array) -> Array:
     """s_k, not normalised, in the field's last channel."""
     result = field.astype(np.float64)
-    top = highest[box[1] : box[1] + box[3], box[0] : box[0] + box[2]]
+    top = highest[on_box(box)]
     result[..., 3] = np.where(blend > 0, np.exp(np.minimum(field[..., 3] - top, 0)), 0.0)
     return result
 

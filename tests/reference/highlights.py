@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from reference.common import Array, bilinear, cell_parts, pixels
+from reference.common import Array, bilinear, cell_parts, on_box, pixels
 
 
 def highlights_share(
@@ -20,7 +20,7 @@ def highlights_share(
 ) -> Array:
     """Mean over each cell's valid pixels of how surely they are clipped; 0 where none is valid."""
     whole = np.zeros((border[1], border[0], 4))
-    whole[box[1] : box[1] + box[3], box[0] : box[0] + box[2]] = layer
+    whole[on_box(box)] = layer
     sure = np.clip(((whole / white)[..., :3].max(-1) - nearly) / (surely - nearly), 0, 1)
     result = np.zeros((cells[1], cells[0]))
     for place, part in cell_parts(border, cells):

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from reference.common import Array, bilinear, cell_parts, pixels
+from reference.common import Array, bilinear, cell_parts, on_box, pixels
 
 
 def membrane_mean(
@@ -14,9 +14,8 @@ def membrane_mean(
 ) -> Array:
     """Mean displacement of the valid pixels of each cell, and 1; zeros where there are none."""
     valid = np.zeros((border[1], border[0], 4))
-    part = np.s_[box[1] : box[1] + box[3], box[0] : box[0] + box[2]]
     known = layer[..., 3:] > 0
-    valid[part] = np.concatenate([field[..., :3], np.ones(known.shape)], -1) * known
+    valid[on_box(box)] = np.concatenate([field[..., :3], np.ones(known.shape)], -1) * known
     result = np.zeros((cells[1], cells[0], 4))
     for place, part in cell_parts(border, cells):
         total = valid[part].sum((0, 1))

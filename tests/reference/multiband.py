@@ -16,6 +16,7 @@ from reference.common import (
     exposure_shift,
     four_taps,
     grid_border,
+    on_box,
     pixels,
     take,
 )
@@ -55,7 +56,7 @@ def multiband_weights(
 ) -> Array:
     """The total (grid) with the weights of a layer on its box where it is valid."""
     result = total.astype(np.float64)
-    result[_part(box)] += np.where(layer[..., 3] > 0, field[..., 3], 0)
+    result[on_box(box)] += np.where(layer[..., 3] > 0, field[..., 3], 0)
     return result
 
 
@@ -74,7 +75,7 @@ def multiband_finest(
 ) -> tuple[Array, Array]:
     """What the layer shows, aligned and corrected, and 1; share of all weight: on a box of half the grid."""
     x, y = place(half_box, half, border)
-    everything = total[_part(box)].astype(np.float64)
+    everything = total[on_box(box)].astype(np.float64)
     some = (layer[..., 3] > 0) & (everything > 0)
     share = field[..., 3] / np.where(some, everything, 1)
     counted = np.where(some[..., None], np.concatenate([field[..., :3], share[..., None]], -1), 0.0)
@@ -99,8 +100,8 @@ def multiband_finest(
 
 def multiband_differ(level: Array, box: Sequence[int], mean: Array) -> Array:
     """How a level on a box differs from the mean (grid), and 1; zeros where one of them is not valid."""
-    known = (level[..., 3] > 0) & (mean[_part(box)][..., 3] > 0)
-    there = mean[_part(box)][..., :3].astype(np.float64)
+    known = (level[..., 3] > 0) & (mean[on_box(box)][..., 3] > 0)
+    there = mean[on_box(box)][..., :3].astype(np.float64)
     return _mean(level[..., :3] - there, known * 1.0)
 
 
@@ -153,7 +154,7 @@ def multiband_add(
     if coarse[0]:
         detail = detail - expand(smaller, smaller_box, *place(box, grid, coarse), coarse)
     result = total.astype(np.float64)
-    result[_part(box)] += np.concatenate([detail, np.ones((*share.shape, 1))], -1) * share[..., None]
+    result[on_box(box)] += np.concatenate([detail, np.ones((*share.shape, 1))], -1) * share[..., None]
     return result
 
 
@@ -171,7 +172,7 @@ def multiband_offset(
 ) -> Array:
     """The blend less the layer, shrunk towards 0; the mean of those around where the layer is not."""
     x, y = pixels(box[2], box[3], box[0], box[1])
-    valid, there = level[..., 3] > 0, blend[_part(box)]
+    valid, there = level[..., 3] > 0, blend[on_box(box)]
     some = (valid & (there[..., 3] > 0))[..., None]
     raised = np.where(some, there[..., :3].astype(np.float64) - level[..., :3], 0.0)
     known = np.concatenate([raised, some * 1.0], -1)
@@ -186,11 +187,6 @@ def multiband_offset(
     result = np.zeros((*valid.shape, 4))
     result[..., :3] = np.sign(offset) * np.maximum(np.abs(offset) - negligible, 0)
     return result
-
-
-def _part(box: Sequence[int]) -> tuple[slice, slice]:
-    left, top, width, height = box
-    return np.s_[top : top + height, left : left + width]
 
 
 def _mean(total: Array, weight: Array, nothing: float = 0.0) -> Array:
