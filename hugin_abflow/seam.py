@@ -21,36 +21,29 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-import scipy
 
+from hugin_abflow import comparison
 from hugin_abflow.cells import averaged, grown
 from hugin_abflow.coefficient import on_cells
 from hugin_abflow.colour import Correction, clipping
+from hugin_abflow.comparison import MEAN, SHARE, SQUARE, Found
 from hugin_abflow.content import ALIKE, Unlike
 from hugin_abflow.geometry import Pair
 from hugin_abflow.layer import Box
 from hugin_abflow.opencl import Buffer
 from hugin_abflow.regions import Cells, Choice, Gone, Prices, Residuals, completed, find, seen
 from hugin_abflow.scene import Scene
-from hugin_abflow.working import Grid, any_around, connected, shared_cells
+from hugin_abflow.working import Grid, any_around, shared_cells
 
 # Working pixels per cell of the seam grid.
 _CELL = 8
 # Without flow.
 _FINE_CELL = 4
-# Cells over which differences are averaged: texture that is a little off is no reason to cut; and how far.
-_SIGMA, _REACH = 1.0, 3
 # Price of a cut, in cells: what is cut off must be favoured by the softmax over this depth, times t / r; of
 # large regions over this share of their size.
 _CUT, _CUT_SHARE = 10.0, 0.25
 # The same without flow, where the softmax has little to say: overlaps are some hundred cells wide.
 _FINE_CUT = 120.0
-# Layers show unrelated things: what they differ by in all frequencies, at least, its square's share of the
-# sum of their variances (1 of what has nothing in common), and how many times one's is the other's (1 of one
-# texture that is not aligned); and how much of the smoother one, in all such cells that touch, may be in the
-# other as well (1 of what is the same and less sharp: photos of which one was out of focus, or shaken). So
-# many cells tell that by themselves, fewer as all such of both layers do.
-_UNRELATED, _OF_VARIANCES, _VARIANCE_RATIO, _RELATED, _ENOUGH = 0.06, 0.7, 1.5, 0.7, 64
 # Residual of layers that agree, without flow: of two cuts that nobody sees the shorter one is taken.
 _SHORTER = 0.005
 # The share of an overlap in which layers that are not aligned may show different things, at most.
@@ -63,12 +56,6 @@ _TRACE = 1e-12
 # How many times as much as a cut it may cost to take a region from one layer that has most of it, which shows
 # things once and whole: of what single.py found, and of any other.
 _SINGLE_FACTOR, _WHOLE_FACTOR = 2.0, 1.65
-# Of what `_differences` finds of a cell: the mean of the layers' difference in r, g, b, the largest mean
-# square of these, each layer's variance, those of blocks, in which noise is less, and their covariance, and
-# the share of the cell that tells.
-_MEAN, _SQUARE, _VARIANCES, _COARSE, _COVARIANCE, _SHARE = (
-    np.s_[..., :3], np.s_[..., 3], np.s_[..., 4:6], np.s_[..., 6:8], np.s_[..., 8], np.s_[..., 9],
-)  # fmt: skip
 
 
 def seam_grid(grid: Grid) -> Grid:
@@ -83,14 +70,13 @@ def residuals(scene: Scene, correction: Correction) -> Residuals:
     measured, unrelated = (np.zeros(cells.shape, bool) for _ in range(2))
     limits = [clipping(layer) for layer in scene.layers]
     for its, found in _differences(scene, correction, cells, limits):
-        share = found[_SHARE]
-        smooth = _smooth(np.dstack([found[..., :-1] * share[..., None], share]), cells)
-        smooth /= np.where(share > 0, smooth[_SHARE], np.inf)[..., None]
-        mean[its] = np.maximum(mean[its], np.abs(smooth[_MEAN]).max(-1))
-        square[its] = np.maximum(square[its], found[_SQUARE])
-        smooth_square[its] = np.maximum(smooth_square[its], smooth[_SQUARE])
-        measured[its] |= share > 0
-        unrelated[its] |= _unrelated(smooth, cells)
+        smooth = comparison.smoothed(found, cells)
+        other = ~comparison.in_another_light(found, smooth, cells)
+        mean[its] = np.maximum(mean[its], other * np.abs(smooth[MEAN]).max(-1))
+        square[its] = np.maximum(square[its], other * found[SQUARE])
+        smooth_square[its] = np.maximum(smooth_square[its], other * smooth[SQUARE])
+        measured[its] |= found[SHARE] > 0
+        unrelated[its] |= other & comparison.unrelated(smooth, cells)
     return Residuals(mean, np.sqrt(square), measured, np.sqrt(smooth_square), unrelated)
 
 
@@ -112,7 +98,7 @@ def clipping_prices(
     as_bright = np.zeros((len(scene.layers), *cells.shape), bool)
     differences = _differences(replace(scene, pairs=pairs), correction, cells)
     for pair, (its, found) in zip(pairs, differences, strict=True):
-        brighter, both = found[_MEAN].mean(-1), found[_SHARE] > 0
+        brighter, both = found[MEAN].mean(-1), found[SHARE] > 0
         as_bright[pair.a][its] |= both & (brighter < _DARKER)
         as_bright[pair.b][its] |= both & (-brighter < _DARKER)
     prices: Prices = _CLIPPED * as_bright * clips
@@ -198,8 +184,8 @@ def unlike(scene: Scene, correction: Correction) -> Unlike:
     mean = np.zeros(cells.shape)
     limits = [clipping(layer) for layer in scene.layers]
     for its, found in _differences(scene, correction, cells, limits):
-        measured = found[_SHARE] > 0
-        apart = np.where(measured, np.abs(found[_MEAN]).max(-1), 0)
+        measured = found[SHARE] > 0
+        apart = np.where(measured, np.abs(found[MEAN]).max(-1), 0)
         if np.count_nonzero(apart > ALIKE) <= _FEW * np.count_nonzero(measured):
             mean[its] = np.maximum(mean[its], apart)
     return Unlike.of(cells, mean, np.ones(cells.shape, bool), None)
@@ -210,8 +196,8 @@ def cut_unaligned(scene: Scene, correction: Correction) -> None:
     cells = scene.grid.coarser(_FINE_CELL)
     square = np.zeros(cells.shape)
     for its, found in _differences(scene, correction, cells):
-        measured = found[_SHARE] > 0
-        square[its] = np.maximum(square[its], np.where(measured, _SHORTER + found[_SQUARE], 0))
+        measured = found[SHARE] > 0
+        square[its] = np.maximum(square[its], np.where(measured, _SHORTER + found[SQUARE], 0))
     whole = square > 0
     owner, _ = _choice(scene, Residuals(square, square), whole, cells, _FINE_CUT).owners()
     yields = [(whole & (owner != k)).astype(np.float32) for k in range(len(scene.layers))]
@@ -263,10 +249,9 @@ def _yield(
 
 def _differences(
     scene: Scene, correction: Correction, cells: Grid, limits: Sequence[tuple[float, ...]] | None = None
-) -> Iterator[tuple[tuple[slice, slice], npt.NDArray[np.float64]]]:
-    """Of each two corrected layers, rows and columns of the cells that both may be in, and of these `_MEAN`
-    to `_SHARE`, (height, width, 10), of the pixels that are not brighter than their layer's limits (r, g, b,
-    1); None: of all.
+) -> Iterator[tuple[tuple[slice, slice], Found]]:
+    """Of each two corrected layers, rows and columns of the cells that both may be in, and what is found
+    of these, of the pixels that are not brighter than their layer's limits (r, g, b, 1); None: of all.
     """
     device, layers, fields, grid = scene.device, scene.layers, scene.fields, scene.grid
     limits = [(math.inf,) * 4] * len(layers) if limits is None else limits
@@ -303,35 +288,6 @@ def _differences(
         device.flush()
         yield found
     yield fetch(*started)
-
-
-def _unrelated(found: npt.NDArray[np.float64], cells: Grid) -> Cells:
-    """Where layers show things that have nothing in common, though they may be as bright. found: of
-    `_differences`, averaged over the cells around, on some of the grid's columns.
-    """
-    # layer by layer: along an axis of two NumPy takes ten times as long
-    square, (first, second) = found[_SQUARE], np.moveaxis(found[_VARIANCES], -1, 0)
-    apart = (square > _UNRELATED**2) & (square > _OF_VARIANCES * (first + second))
-    apart &= np.maximum(first, second) > _VARIANCE_RATIO * np.minimum(first, second)
-    smoother = np.where(first <= second, *np.moveaxis(found[_COARSE], -1, 0))
-    number = connected(apart, cells.wraps and apart.shape[1] == cells.width)
-    common, own, count = (
-        np.bincount(number.flat, (apart * one).flat) for one in (found[_COVARIANCE], smoother, 1.0)
-    )
-    few = count < _ENOUGH
-    common[few], own[few] = common.sum(), own.sum()
-    unrelated: Cells = apart & (common <= _RELATED * own)[number]
-    return unrelated
-
-
-def _smooth(values: npt.NDArray[np.float64], cells: Grid) -> npt.NDArray[np.float64]:
-    """A Gaussian of _SIGMA cells, not normalised at the borders, of some of a grid's columns side by side."""
-    columns = values.shape[1]
-    gap = min(_REACH, cells.width - columns)  # what is between its ends if columns wrap, and matters
-    values = np.pad(values, ((0, 0), (0, gap), (0, 0)))
-    modes = ("constant", "wrap" if cells.wraps else "constant", "constant")
-    smooth = scipy.ndimage.gaussian_filter(values, (_SIGMA, _SIGMA, 0), mode=modes, radius=_REACH)
-    return np.asarray(smooth[:, :columns])
 
 
 def _centres(cells: Grid, shape: Sequence[int]) -> tuple[npt.NDArray[np.intp], npt.NDArray[np.intp]]:
