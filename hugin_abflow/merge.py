@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from hugin_abflow import joint, sequential
-from hugin_abflow.brackets import of_one_exposure
+from hugin_abflow.brackets import of_one_exposure, to_be_made
 from hugin_abflow.devices import choose
 from hugin_abflow.errors import LayersMissingError, OutputError
 from hugin_abflow.exif import Metadata
@@ -62,7 +62,8 @@ def merge_project(
 
     output          format by its ending; default: named and typed as the project says, beside it.
     prefix, layers, remap, keep_layers    where the layers come from, see `nona.open_layers`. Of those that
-                    nobody named one by one, a view in several exposures is shown in one (`brackets.py`).
+                    nobody named one by one, a view in several exposures is shown in one, and
+                    only such are made that may be (`brackets.py`).
     compression, jpeg_quality    of the file, see `images.ImageWriter`; default: the project's, if the output
                     has the project's format. Without `output` a JPEG or PNG has its own whatever is chosen.
     metadata        write EXIF and, for viewers of 360-degree panoramas, GPano; see `metadata.describe`.
@@ -77,8 +78,9 @@ def merge_project(
         compression = storable(plan, compression)
     _check_early(plan, settings, output, compression)
     with open_layers(
-        plan, prefix=prefix, layers=layers, remap=remap, keep_layers=keep_layers, progress=progress
-    ) as opened:
+        plan, prefix=prefix, layers=layers, remap=remap, keep_layers=keep_layers,
+        images=None if prefix or layers else to_be_made(plan), progress=progress,
+    ) as opened:  # fmt: skip
         target = _target(plan, opened, output)
         shown = opened if layers else of_one_exposure(plan, opened)
         if ENDINGS.get(target.suffix.lower()) == ENDINGS[plan.output.ending]:

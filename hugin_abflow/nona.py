@@ -11,6 +11,7 @@ import subprocess
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import get_args
 
@@ -69,6 +70,7 @@ def open_layers(
     layers: Sequence[str | Path] | None = None,
     remap: Remap = "auto",
     keep_layers: bool = False,
+    images: Sequence[PlannedImage] | None = None,
     progress: Progress = silent,
 ) -> Iterator[list[Layer]]:
     """The project's layers in the order of its images, readable inside the ``with`` block.
@@ -81,6 +83,7 @@ def open_layers(
                     more than 2 s older than the project or its photo, and they can be made again (else
                     old ones are used, with a warning).
     keep_layers     layers that nona made are moved beside the project, named as Hugin does.
+    images          those of the project's of which layers are made; None, and where layers are kept: all.
 
     Layers are made in a folder under TMPDIR that is removed in the end. Raises `LayersMissingError`,
     `PhotoMissingError`, `NonaMissingError`, `NonaFailedError`, `LayersMismatchError`, `ImageReadError`,
@@ -95,7 +98,8 @@ def open_layers(
         elif prefix:
             files = layers_by_prefix(plan, prefix).in_order()
         else:
-            files = _find_or_make(plan, folder, remap, keep_layers, progress).in_order()
+            needed = plan if images is None or keep_layers else replace(plan, images=tuple(images))
+            files = _find_or_make(plan, needed, folder, remap, keep_layers, progress).in_order()
         found = [str(file) for file in files if file.parent != folder]
         opened = [layer for file in files for layer in read_layers(file)]
         try:
@@ -195,11 +199,14 @@ def _make_all(plan: Plan, folder: Path, keep: bool, progress: Progress) -> Found
     return Found(prefix, _keep(plan, prefix, made) if keep else made)
 
 
-def _find_or_make(plan: Plan, folder: Path, remap: Remap, keep: bool, progress: Progress) -> Found:
-    """Layers that nobody named: what is there, what nona makes, or both."""
+def _find_or_make(
+    plan: Plan, needed: Plan, folder: Path, remap: Remap, keep: bool, progress: Progress
+) -> Found:
+    """Layers that nobody named: what is there, what nona makes, or both; of no other images than `needed`."""
     found, missing = planned_layers(plan, remap)
     if found is None:
-        return _make_all(plan, folder, keep, progress)
+        return _make_all(needed, folder, keep, progress)
+    missing = [image for image in missing if image in needed.images]
     if not missing:
         return found
     made = _make_missing(plan, missing, folder, found.prefix, keep, progress)
@@ -333,15 +340,19 @@ def remapping(plan: Plan, options: Sequence[str], prefix: str, project: str) -> 
 
 
 def _project_for_nona(plan: Plan, folder: Path) -> Path:
-    """The project itself; a copy with absolute names where photos are not where it says.
+    """The project itself; a copy with absolute names where photos are not where it says, or the plan leaves
+    some of them out.
 
-    That happens to projects that were moved or come from Windows; nona does not look elsewhere.
+    The former happens to projects that were moved or come from Windows; nona does not look elsewhere.
     """
-    if all(plan.folder / image.name == image.photo for image in plan.images):
+    project, photos = pto.load(plan.file), {image.index: image.photo for image in plan.images}
+    others = [image for image in project.images if image.index not in photos and not image.disabled]
+    if not others and all(plan.folder / image.name == image.photo for image in plan.images):
         return plan.file
-    project = pto.load(plan.file)
-    for image in plan.images:
-        project.images[image.index].filename = str(image.photo)
+    for image in others:
+        image.disabled = True
+    for index, photo in photos.items():
+        project.images[index].filename = str(photo)
     copy = folder / "project.pto"
     copy.write_bytes(pto.dumps(project))
     return copy

@@ -3,18 +3,21 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 import tifffile
-from conftest import ProjectMaker
+from conftest import ProjectMaker, photo_pixels, whole
 from layer_files import write_layer
 
 from hugin_abflow import brackets
 from hugin_abflow.layer import Layer
 from hugin_abflow.merge import merge_project
+from hugin_abflow.nona import open_layers
 from hugin_abflow.project import read_plan
 
 VIEWS = (0, 0, 0, 60, 60, 60, 170)  # the last one was not taken in several exposures
@@ -26,9 +29,11 @@ def bracketed(
     exposures: tuple[float, ...] = (0, -2, 2, 0.1, -1.9, 2.1, 5),
     wanted: float = 0.0,
     extra: str = "",
+    photo: str = "photo {}.tif",
 ) -> Path:
     """A project of photos that look at VIEWS and have exposures; the panorama has the `wanted` one."""
-    project = make_project(yaws=VIEWS[: len(exposures)], panorama=CANVAS.format(wanted), extra=extra)
+    yaws = VIEWS[: len(exposures)]
+    project = make_project(yaws=yaws, panorama=CANVAS.format(wanted), extra=extra, photo=photo)
     values = iter(exposures)
     text = re.sub(r" p\d+ ", " p0 ", project.read_text())
     project.write_text(re.sub(r" Eev0 ", lambda _: f" Eev{next(values)} ", text))
@@ -135,3 +140,72 @@ def test_the_panorama_is_that_exposure(make_project: ProjectMaker) -> None:
     assert np.array_equal(tifffile.imread(folder / "panorama.tif"), first)
     merge_project(project, layers=[folder / "a0001.tif"], output=folder / "other.tif")
     assert not np.array_equal(tifffile.imread(folder / "other.tif"), first)
+
+
+JPEG = "photo {}.jpg"
+HDR = "#hugin_outputHDRBlended true\n"
+
+
+@pytest.mark.parametrize(
+    ("wanted", "photo", "extra", "made"),
+    [
+        (0, JPEG, "", (0, 3, 6)),
+        (-30, "photo {}.JPEG", "", (1, 4, 6)),
+        (0, "photo {}.tif", "", range(7)),  # may be transparent somewhere
+        (0, JPEG, 'k i1 t0 p"0 0 9 0 9 9"\n', range(7)),
+        (0, JPEG, HDR, range(7)),
+    ],
+)
+def test_no_layer_is_made_for_nothing(
+    make_project: ProjectMaker, wanted: float, photo: str, extra: str, made: Iterable[int]
+) -> None:
+    plan = read_plan(bracketed(make_project, wanted=wanted, photo=photo, extra=extra))
+    assert [image.index for image in brackets.to_be_made(plan)] == list(made)
+
+
+def test_all_layers_are_made_of_scripts_by_other_programs(make_project: ProjectMaker) -> None:
+    """In them no photo can be left out, as nona asks Hugin's lines for that."""
+    project = bracketed(make_project, (0, 2), photo=JPEG)
+    project.write_text(re.sub(r"#-hugin.*\n", "", project.read_text()))
+    plan = read_plan(project)
+    assert brackets.to_be_made(plan) == plan.images
+
+
+@pytest.mark.usefixtures("nona", "temporary")
+def test_nona_makes_the_layers_that_are_needed(make_project: ProjectMaker) -> None:
+    """The same as it makes of all photos, if one of the others is not there, too; and all that are kept."""
+    plan = read_plan(bracketed(make_project, photo=JPEG))
+    for image in plan.images:
+        cv2.imwrite(str(image.photo), photo_pixels(image.index, np.uint8, 3))
+    with open_layers(plan) as layers:
+        pixels = [whole(layer) for layer in layers]
+        assert len(layers) == 7
+    plan.images[1].photo.rename(plan.folder / "elsewhere")
+    with open_layers(plan, images=brackets.to_be_made(plan)) as layers:
+        assert [one.name for one in layers] == names(0, 3, 6)
+        for one, number in zip(layers, (0, 3, 6), strict=True):  # nona dithers, each time otherwise
+            assert np.abs(whole(one).astype(int) - pixels[number]).max() <= 1
+        assert brackets.of_one_exposure(plan, layers) == layers
+    (plan.folder / "elsewhere").rename(plan.images[1].photo)
+    with open_layers(plan, images=brackets.to_be_made(plan), keep_layers=True) as layers:
+        assert len(layers) == 7
+    (plan.folder / names(3)[0]).unlink()
+    (plan.folder / names(4)[0]).unlink()
+    with open_layers(plan, images=brackets.to_be_made(plan)) as layers:
+        assert [one.name for one in layers] == names(0, 1, 2, 3, 5, 6)
+
+
+@pytest.mark.usefixtures("nona", "temporary")
+def test_a_panorama_has_its_layers_made_only_once_for_each_view(
+    make_project: ProjectMaker, caplog: pytest.LogCaptureFixture
+) -> None:
+    project = bracketed(make_project, (0, -2, 2), photo=JPEG)
+    for number in range(3):
+        cv2.imwrite(str(project.with_name(JPEG.format(number))), photo_pixels(number, np.uint8, 3))
+    with caplog.at_level("INFO"):
+        merge_project(project)
+    said = [record.getMessage() for record in caplog.records]
+    assert [line for line in said if "another exposure" in line] == [
+        f"{JPEG.format(k)} shows a view in another exposure; no layer of it is needed" for k in (1, 2)
+    ]
+    assert "layers: 1, RGB, uint8" in said and project.with_suffix(".tif").is_file()
