@@ -208,24 +208,32 @@ def misfit(layer: Layer, canvas: Canvas) -> str | None:
     return None
 
 
-def check_layers(canvas: Canvas, layers: Sequence[Layer]) -> None:
+def check_layers(canvas: Canvas, layers: Sequence[Layer], names: Sequence[str] | None = None) -> None:
     """Raise `LayersMismatchError` unless the layers fit the canvas and each other.
 
     Alpha, canvas size (where a layer's file tells it), place inside the canvas, depth, number of channels.
+
+    names   what messages call the layers; None: their files.
     """
     again = "make the layers again with nona, or leave the file out"
-    for layer in layers:
-        name, first = layer.file or layer.name, layers[0]
+    called = names or [str(layer.file or layer.name) for layer in layers]
+    first, others = layers[0], []
+    for layer, name in zip(layers, called, strict=True):
         if why := misfit(layer, canvas):
             raise LayersMismatchError(f"{name} {why}; {again}")
         if layer.dtype != first.dtype:
             raise LayersMismatchError(
-                f"{name} has {layer.dtype} samples, {first.name} has {first.dtype}; {again}"
+                f"{name} has {layer.dtype} samples, {called[0]} has {first.dtype}; {again}"
             )
         if layer.channels != first.channels:
             kinds = {1: "grey", 3: "RGB"}
             raise LayersMismatchError(
-                f"{name} is {kinds[layer.channels]}, {first.name} is {kinds[first.channels]}; {again}"
+                f"{name} is {kinds[layer.channels]}, {called[0]} is {kinds[first.channels]}; {again}"
             )
-        if layer.icc != first.icc:
-            _log.warning("%s and %s differ in ICC profile; the first layer's is used", name, first.name)
+        others += [name] if layer.icc != first.icc else []
+    if others:
+        what = "that one's is used for all" if first.icc else "that one has none, and none is written"
+        _log.warning(
+            "ICC profiles other than that of %s: %s; colours are not converted, %s",
+            called[0], ", ".join(others), what,
+        )  # fmt: skip

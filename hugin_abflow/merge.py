@@ -196,8 +196,8 @@ def _bands(
             yield rows
     if not visible:
         _log.warning(
-            "the panorama is wholly transparent: no layer shows anything inside the crop; "
-            "check crop and masks in Hugin"
+            "the panorama is wholly transparent: no layer has an alpha of half or more inside the crop; "
+            "check crop and masks in Hugin, and alpha of layers that others made"
         )
 
 

@@ -32,6 +32,7 @@ from hugin_abflow.found import (
     Found,
     Remap,
     find,
+    known_as,
     layer_path,
     layers_by_prefix,
     named_files,
@@ -103,7 +104,7 @@ def open_layers(
         found = [str(file) for file in files if file.parent != folder]
         opened = [layer for file in files for layer in read_layers(file)]
         try:
-            check_layers(plan.canvas, opened)
+            check_layers(plan.canvas, opened, [known_as(plan, folder, layer) for layer in opened])
         except LayersMismatchError as error:
             if not found or not _can_make(plan):
                 raise

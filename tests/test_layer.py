@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from hugin_abflow.errors import ImageReadError
-from hugin_abflow.layer import Box, Canvas, Layer, full_scale
+from hugin_abflow.layer import Box, Canvas, Layer, check_layers, full_scale
 
 
 def test_box_is_a_place_and_a_part_of_arrays():
@@ -72,3 +72,21 @@ def test_array_in_foreign_byte_order_is_converted():
     layer = Layer.from_array("memory", pixels.astype(pixels.dtype.newbyteorder()))
     assert layer.read(0, 7).dtype.isnative
     assert np.array_equal(layer.read(0, 7), pixels)
+
+
+def test_different_profiles_are_reported(caplog):
+    """All at once, and what becomes of them."""
+
+    def layer(name, icc=b"profile"):
+        return Layer.from_array(name, np.zeros((3, 5, 4), np.uint8), icc=icc)
+
+    coloured = [layer("b"), layer("c")]
+    check_layers(Canvas.plane(31, 17), coloured)
+    assert not caplog.records
+    check_layers(Canvas.plane(31, 17), [layer("a", None), *coloured])
+    (said,) = caplog.messages
+    assert "other than that of a: b, c; " in said and "none is written" in said
+    caplog.clear()
+    check_layers(Canvas.plane(31, 17), [*coloured, layer("a", None)])
+    (said,) = caplog.messages
+    assert "other than that of b: a; " in said and "that one's is used for all" in said

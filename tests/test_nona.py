@@ -421,16 +421,11 @@ def test_layers_of_other_depth_are_named(make_project, nona):
     )
     with (
         pytest.raises(
-            LayersMismatchError, match=r"pano0001\.tif has uint16 samples, pano0000\.tif has uint8"
+            LayersMismatchError, match=r"pano0001\.tif has uint16 samples, .*pano0000\.tif has uint8"
         ),
         open_layers(plan),
     ):
         pass
-
-
-def test_different_profiles_are_reported(caplog):
-    check_layers(CANVAS, [layer("a"), Layer.from_array("b", np.zeros((3, 5, 4), np.uint8), icc=ICC)])
-    assert "b and a differ in ICC profile" in caplog.text
 
 
 def test_a_layer_that_is_no_image(make_project, nona):

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import os
 
+import numpy as np
 import pytest
 import tifffile
-from conftest import remap
+from conftest import ICC, photo_pixels, remap
 
 from hugin_abflow.errors import ImageReadError, LayersMismatchError, NonaFailedError, ProjectError
 from hugin_abflow.nona import open_layers
@@ -116,3 +117,13 @@ def test_nona_without_memory(make_project, tmp_path, monkeypatch):
     ):
         pass
     assert "TMPDIR" not in str(error.value)
+
+
+def test_photos_are_named_of_which_layers_were_made(make_project, nona, caplog):
+    plan = read_plan(make_project(icc=ICC))
+    tifffile.imwrite(plan.images[1].photo, photo_pixels(1, np.uint8, 3), photometric="rgb")
+    with open_layers(plan, keep_layers=True):
+        assert f"of {plan.folder / 'pano0000.tif'}: {plan.folder / 'pano0001.tif'};" in caplog.text
+    caplog.clear()
+    with open_layers(plan, remap="always"):
+        assert "of photo 0.tif: photo 1.tif;" in caplog.text
