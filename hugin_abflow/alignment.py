@@ -22,6 +22,7 @@ from hugin_abflow import (
     intermediate,
     membrane,
     seam,
+    shadows,
     transition,
 )
 from hugin_abflow.coefficient import Masks
@@ -69,12 +70,16 @@ def align(
     """Align layers by flow and exposure, without flow by cuts alone.
 
     flows       of `pairs`; emptied.
-    single      what single.py found, on the seam grid; None: nothing.
+    single      what single.py found, on the seam grid, to which shadows are added; None: nothing.
     """
     clipped = highlights.measure(device, layers, masks, grid, settings)
     fields = _fields(device, layers, flows, clipped, masks, grid, settings)
     extra = highlights.reduce_weights(device, layers, fields, clipped, masks, grid)
     measured = colour.measure(device, layers, fields, pairs, grid, masks.host)
+    if settings.flow and settings.seam:
+        shaded = shadows.find(measured, seam.seam_grid(grid))
+        if shaded is not None:
+            single = shaded if single is None else single | shaded
     device.give_back()  # two solutions at a time take the most memory
     scene = Scene(device, layers, pairs, fields, masks, grid)
     with ThreadPoolExecutor(2, "gains") as threads:  # each on one core: the device goes on meanwhile
@@ -169,7 +174,7 @@ def _find_regions(
     for _ in range(_SEAM_ROUNDS):
         correction = (first if whole is None else gains.strict(whole)).result()
         scene.device.give_back()
-        residual = seam.residuals(scene, correction)
+        residual = seam.residuals(scene, correction, single)
         found = seam.regions(residual, scene.grid, aligned=settings.flow, single=single)
         grown = found if whole is None else found | whole
         if not grown.any() or (whole is not None and np.array_equal(grown, whole)):

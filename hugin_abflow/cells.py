@@ -202,6 +202,15 @@ def neighbours(
     return inside, (np.clip(rows, 0, shape[0] - 1), columns % shape[1])
 
 
+def centres(cells: Grid, shape: Sequence[int]) -> tuple[npt.NDArray[np.intp], npt.NDArray[np.intp]]:
+    """Rows and columns, of an array (..., height, width) over the same region, at the centres of cells."""
+    row, column = (
+        ((np.arange(to) + 0.5) * of / to).astype(np.intp)
+        for to, of in zip(cells.shape, shape[-2:], strict=True)
+    )
+    return row, column
+
+
 def cells_at(
     places: Places, shape: tuple[int, ...], chart: Chart
 ) -> tuple[Mask, tuple[npt.NDArray[np.intp], npt.NDArray[np.intp]]]:

@@ -175,21 +175,21 @@ class _Overlap:
         """The cells that both layers' boxes reach into."""
         return shared_cells(self.layers[self.pair.a], self.layers[self.pair.b], self.grid, self.cells)
 
-    def start_difference(self, shoulder: float) -> tuple[Buffer, Buffer, Buffer]:
+    def start_difference(self, shoulder: float) -> tuple[Buffer, Buffer, Buffer, Buffer]:
         """Have the device find the difference on the exposure scale of a shoulder."""
         width, height = self._part.width, self._part.height
         values, beyond = (self.device.empty((height, width, 4)) for _ in range(2))
-        mixing = self.device.empty((height, width))
+        mixing, level = (self.device.empty((height, width)) for _ in range(2))
         self.device.run(
             "colour", "colour_difference", (width, height),
-            *self._sides, shoulder, *self._clipping, _SPREAD, values, beyond, mixing,
+            *self._sides, shoulder, *self._clipping, _SPREAD, values, beyond, mixing, level,
         )  # fmt: skip
-        return values, beyond, mixing
+        return values, beyond, mixing, level
 
-    def difference(self, values: Buffer, beyond: Buffer, mixing: Buffer) -> Difference:
+    def difference(self, *started: Buffer) -> Difference:
         """What `start_difference` started."""
-        one, other, seen = (v.get().astype(np.float64) for v in (values, beyond, mixing))
-        return Difference(self.pair.a, self.pair.b, one, other, seen, self._part.slices)
+        values, beyond, mixing, level = (one.get().astype(np.float64) for one in started)
+        return Difference(self.pair.a, self.pair.b, values, beyond, mixing, level, self._part.slices)
 
     def start_misfit(self) -> Buffer:
         """Have the device find what is left of the difference on the scale of each of _SHOULDERS: (height,

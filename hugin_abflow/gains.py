@@ -55,6 +55,7 @@ class Difference:
     beyond  the same where only one of them is clipped, a if the weight is positive, b if it is negative: at
             least that much.
     mixing  how far both are seen, (height, width).
+    level   the mean of both, all channels, on the exposure scale, where the weight of `values` is above 0.
     cells   rows and columns of the grid that these are; what only one layer can be in is left out.
     """
 
@@ -63,6 +64,7 @@ class Difference:
     values: npt.NDArray[np.float64]
     beyond: npt.NDArray[np.float64]
     mixing: npt.NDArray[np.float64]
+    level: npt.NDArray[np.float64]
     cells: tuple[slice, slice] = (slice(None), slice(None))
 
 

@@ -23,7 +23,7 @@ import numpy as np
 import numpy.typing as npt
 
 from hugin_abflow import comparison
-from hugin_abflow.cells import averaged, grown
+from hugin_abflow.cells import averaged, centres, grown
 from hugin_abflow.coefficient import on_cells
 from hugin_abflow.colour import Correction, clipping
 from hugin_abflow.comparison import MEAN, SHARE, SQUARE, Found
@@ -63,8 +63,11 @@ def seam_grid(grid: Grid) -> Grid:
     return grid.coarser(_CELL)
 
 
-def residuals(scene: Scene, correction: Correction) -> Residuals:
-    """What flow and exposure do not explain."""
+def residuals(scene: Scene, correction: Correction, single: Cells | None = None) -> Residuals:
+    """What flow and exposure do not explain.
+
+    single      cells that are to be taken from one layer in any case, whatever explains them.
+    """
     cells = seam_grid(scene.grid)
     mean, square, smooth_square = (np.zeros(cells.shape) for _ in range(3))
     measured, unrelated = (np.zeros(cells.shape, bool) for _ in range(2))
@@ -72,6 +75,8 @@ def residuals(scene: Scene, correction: Correction) -> Residuals:
     for its, found in _differences(scene, correction, cells, limits):
         smooth = comparison.smoothed(found, cells)
         other = ~comparison.in_another_light(found, smooth, cells)
+        if single is not None:
+            other |= single[its]
         mean[its] = np.maximum(mean[its], other * np.abs(smooth[MEAN]).max(-1))
         square[its] = np.maximum(square[its], other * found[SQUARE])
         smooth_square[its] = np.maximum(smooth_square[its], other * smooth[SQUARE])
@@ -90,7 +95,7 @@ def clipping_prices(
                 highlights grid (`highlights.Clipped`).
     """
     cells = seam_grid(scene.grid)
-    row, column = _centres(cells, excess.shape)
+    row, column = centres(cells, excess.shape)
     clips = excess[:, row[:, None], column] * whole
     pairs = [pair for pair in scene.pairs if clips[[pair.a, pair.b]].any()]
     if not pairs:
@@ -222,7 +227,7 @@ def _choice(
 def _weights(scene: Scene, cells: Grid) -> npt.NDArray[np.float64]:
     """The layers' colour weights at the centres of cells, (layers, height, width)."""
     device = scene.device
-    rows, columns = (device.upload(one, np.int32) for one in _centres(cells, scene.grid.shape))
+    rows, columns = (device.upload(one, np.int32) for one in centres(cells, scene.grid.shape))
     weights = [device.empty(cells.shape) for _ in scene.layers]
     for layer, field, one in zip(scene.layers, scene.fields, weights, strict=True):
         device.run(
@@ -288,12 +293,3 @@ def _differences(
         device.flush()
         yield found
     yield fetch(*started)
-
-
-def _centres(cells: Grid, shape: Sequence[int]) -> tuple[npt.NDArray[np.intp], npt.NDArray[np.intp]]:
-    """Rows and columns, of an array (..., height, width) over the same region, at the centres of cells."""
-    row, column = (
-        ((np.arange(to) + 0.5) * of / to).astype(np.intp)
-        for to, of in zip(cells.shape, shape[-2:], strict=True)
-    )
-    return row, column

@@ -19,7 +19,8 @@ static inline float colour_tells(float4 a, float4 b, float shoulder) {
 /* Mean difference a - b on the exposure scale over the pixels of a cell (every second one in x and y) that both
    layers show unclipped, by what they tell, and how far it can be trusted: less where the pixels disagree among
    themselves, that is, where the layers do not show the same thing. The same where one of them is clipped, if that is
-   most of the cell: the other has to be raised by that much at least. And how far both are seen, by their weights. */
+   most of the cell: the other has to be raised by that much at least. How far both are seen, by their weights. And the
+   mean of both on the exposure scale, of the samples that are compared. */
 __kernel void colour_difference(__global const float4 *layer_a, __global const float4 *field_a, int4 box_a,
                                 __global const float4 *layer_b, __global const float4 *field_b, int4 box_b,
                                 int4 border, float4 lonlat, /* working grid */
@@ -29,13 +30,14 @@ __kernel void colour_difference(__global const float4 *layer_a, __global const f
                                 float spread,               /* disagreement that halves the trust */
                                 __global float4 *difference, /* (part.w, part.z): r, g, b, weight 0..1 */
                                 __global float4 *beyond,     /* the same; weight > 0: a is clipped, < 0: b */
-                                __global float *mixing)      /* (part.w, part.z) 0..1 */
+                                __global float *mixing,      /* (part.w, part.z) 0..1 */
+                                __global float *level)       /* the same, of all channels */
 {
     const int column = get_global_id(0), row = get_global_id(1);
     if (column >= part.z || row >= part.w)
         return;
     const int4 its = cell_pixels(part.x + column, part.y + row, border, cells);
-    float3 sum = (float3)(0.0f), more = (float3)(0.0f), less = (float3)(0.0f);
+    float3 sum = (float3)(0.0f), both = sum, more = sum, less = sum;
     float squares = 0.0f, n = 0.0f, tried = 0.0f, above = 0.0f, below = 0.0f, mixed = 0.0f;
     for (int y = its.y; y < its.w; y += 2)
         for (int x = its.x; x < its.z; x += 2) {
@@ -46,7 +48,8 @@ __kernel void colour_difference(__global const float4 *layer_a, __global const f
             const float s = field_a[box_index((int2)(x, y), box_a)].w;
             const float t = field_b[box_index((int2)(x, y), box_b)].w;
             mixed += 4.0f * s * t / GREATEST((s + t) * (s + t), 1e-20f);
-            const float3 d = exposure_scale(a.xyz, shoulder) - exposure_scale(b.xyz, shoulder);
+            const float3 light_a = exposure_scale(a.xyz, shoulder), light_b = exposure_scale(b.xyz, shoulder);
+            const float3 d = light_a - light_b;
             const bool clips_a = colour_clips(a, clipped_a), clips_b = colour_clips(b, clipped_b);
             if (clips_a && !clips_b) {
                 more += d;
@@ -57,6 +60,7 @@ __kernel void colour_difference(__global const float4 *layer_a, __global const f
             } else if (!clips_a) {
                 const float tells = colour_tells(a, b, shoulder);
                 sum += tells * d;
+                both += tells * (light_a + light_b);
                 squares += tells * square3(d);
                 n += tells;
             }
@@ -75,6 +79,7 @@ __kernel void colour_difference(__global const float4 *layer_a, __global const f
         result = (float4)(less / below, 1.0f - 2.0f * below / tried);
     beyond[row * part.z + column] = result;
     mixing[row * part.z + column] = mixed / GREATEST(tried, 1.0f);
+    level[row * part.z + column] = n > 0.0f ? dot(both, (float3)(1.0f / 6.0f)) / n : 0.0f;
 }
 
 /* How far exposure scales of four shoulders are from explaining the difference of two aligned layers: per cell

@@ -69,7 +69,7 @@ def test_difference_equals_its_twin(device: Device, name: str, shoulder: float, 
         sides[0][..., :3] *= 0.5
         sides[3][..., :3] *= 0.35
     clipped = CLIPPED if shoulder else NEVER
-    results = [device.empty(shape) for shape in ((2, 5, 4), (2, 5, 4), (2, 5))]
+    results = [device.empty(shape) for shape in ((2, 5, 4), (2, 5, 4), (2, 5), (2, 5))]
     device.run(
         "colour", "colour_difference", (5, 2), *uploaded(device, sides),
         grid.border, grid.lonlat, cells.border, PART, shoulder, *clipped, SPREAD, *results,
@@ -264,7 +264,7 @@ def test_layers_agree_where_they_are_mixed(device: Device) -> None:
     for everywhere in (True, False):
         mixing = np.full((5, 40), float(everywhere))
         mixing[:, 16:24] = 1
-        difference = Difference(0, 1, values, np.zeros((5, 40, 4)), mixing)
+        difference = Difference(0, 1, values, np.zeros((5, 40, 4)), mixing, mixing)
         measured = Measured(cells, inside, 1.0, (difference,))
         a, b = (gain.get()[..., 0] for gain in colour.correction(device, measured, Settings()).gains)
         found.append(b - a)
@@ -284,7 +284,7 @@ def test_a_difference_goes_on_where_nothing_tells_of_it(device: Device, strict: 
     somebody[10:20] = True
     values[somebody, :3] = -1
     measured = Measured(
-        cells, inside, 1.0, (Difference(0, 1, values, np.zeros_like(values), np.ones((30, 40))),)
+        cells, inside, 1.0, (Difference(0, 1, values, np.zeros_like(values), *np.ones((2, 30, 40))),)
     )
     found = colour.correction(device, measured, Settings(), somebody, strict).gains
     one, other = (gain.get()[..., :3] for gain in found)
@@ -304,7 +304,7 @@ def test_what_is_ignored_counts_in_narrow_overlaps(device: Device, columns: int,
     values[unknown, :3] = 0.8
     values[..., 3] = inside.all(0)
     measured = Measured(
-        cells, inside, 1.0, (Difference(0, 1, values, np.zeros_like(values), np.ones((30, 40))),)
+        cells, inside, 1.0, (Difference(0, 1, values, np.zeros_like(values), *np.ones((2, 30, 40))),)
     )
     found = colour.correction(device, measured, Settings(), unknown).gains
     one, other = (gain.get()[..., 0] for gain in found)

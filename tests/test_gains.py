@@ -107,7 +107,7 @@ def overlapping(seed: int, cells: Grid) -> Measured:
         beyond[3:, ::2] = [0.9, 0.5, 0.7, 0.6]  # a is clipped
         beyond[4:, 1::2] = [-0.2, -0.6, -0.8, -0.9]
         mixing = np.ones(d.shape[:2])
-        differences.append(Difference(a, b, d, beyond * (inside[a] & inside[b])[..., None], mixing))
+        differences.append(Difference(a, b, d, beyond * (inside[a] & inside[b])[..., None], mixing, mixing))
     return Measured(cells, inside, 1.0, tuple(differences))
 
 
@@ -164,7 +164,7 @@ def test_what_is_clipped_is_a_bound_for_the_other() -> None:
     nothing = np.zeros_like(beyond)
 
     def solve(values: np.ndarray, beyond: np.ndarray) -> np.ndarray:
-        difference = Difference(0, 1, values, beyond, np.ones((5, 9)))
+        difference = Difference(0, 1, values, beyond, *np.ones((2, 5, 9)))
         return solved(Measured(CELLS["plane"], inside, 1.0, (difference,)))
 
     raised, other = solve(nothing, beyond)

@@ -120,8 +120,8 @@ def test_differences_count_in_their_rows_and_columns() -> None:
         one[..., 3] = np.abs(one[..., 3]) if one is few[0] else np.round(one[..., 3])
         same[1:5, 13:20] = one
     differences = (
-        Difference(0, 1, *few, np.ones((4, 7)), np.s_[1:5, 13:20]),
-        Difference(0, 1, *wide, np.ones(cells.shape)),
+        Difference(0, 1, *few, *np.ones((2, 4, 7)), np.s_[1:5, 13:20]),
+        Difference(0, 1, *wide, *np.ones((2, *cells.shape))),
     )
     for beyond_alone in (False, True):
         if beyond_alone:

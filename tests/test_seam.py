@@ -14,7 +14,7 @@ from scipy import ndimage
 from tolerances import POSITION, SUM, assert_close
 
 from hugin_abflow import seam
-from hugin_abflow.cells import averaged
+from hugin_abflow.cells import averaged, centres
 from hugin_abflow.coefficient import on_cells
 from hugin_abflow.geometry import Pair
 from hugin_abflow.opencl import Device
@@ -121,7 +121,7 @@ def test_yield_equals_its_twin(device: Device, name: str) -> None:
 def test_cells_read_what_lies_at_their_centres(size: tuple[int, int]) -> None:
     cells = plane(96, 72).resized(24, 18)
     values = np.arange(2 * size[0] * size[1], dtype=np.float32).reshape(2, size[1], size[0])
-    rows, columns = seam._centres(cells, values.shape)
+    rows, columns = centres(cells, values.shape)
     found = values[:, rows[:, None], columns]
     for y, x in ((0, 0), (3, 23), (17, 11)):
         row, column = int((y + 0.5) / 18 * size[1]), int((x + 0.5) / 24 * size[0])
@@ -159,7 +159,7 @@ def test_weights_equal_their_twin(device: Device, place: tuple[int, int, int, in
     grid = plane(60, 40)
     cells = grid.resized(13, 7)
     field = np.random.default_rng(4).random((place[3], place[2], 4)).astype(np.float32)
-    rows, columns = seam._centres(cells, grid.shape)
+    rows, columns = centres(cells, grid.shape)
     layers = [SimpleNamespace(box=place)]
     found = seam._weights(Scene(device, layers, [], [device.upload(field)], None, grid), cells)
     assert found.shape == (1, 7, 13) and 0 < (found > 0).mean() <= 1

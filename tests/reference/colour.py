@@ -39,17 +39,18 @@ def colour_difference(
     clipped_a: Numbers,
     clipped_b: Numbers,
     spread: float,
-) -> tuple[Array, Array, Array]:
+) -> tuple[Array, Array, Array, Array]:
     """Mean difference a - b of every cell's pixels, every other one in x and y, and its weight; the mean of
-    those that one layer shows clipped, where these are most; and how far both layers are seen.
+    those that one layer shows clipped, where these are most; how far both layers are seen; and their mean.
     """
     sides = ((layer_a, field_a, box_a), (layer_b, field_b, box_b))
     a, b, clips_a, clips_b, known = _seen(*sides, border, lonlat, clipped_a, clipped_b)
     columns, rows = pixels(border[0], border[1])
     s, t = (take(field, box, columns, rows)[..., 3].astype(np.float64) for _, field, box in sides)
     mixed = np.where(known, 4 * s * t / np.maximum((s + t) ** 2, 1e-20), 0)
-    mixing = np.zeros((cells[1], cells[0]))
-    difference = exposure_scale(a, shoulder) - exposure_scale(b, shoulder)
+    mixing, level = np.zeros((2, cells[1], cells[0]))
+    light = np.stack([exposure_scale(a, shoulder), exposure_scale(b, shoulder)])
+    difference = light[0] - light[1]
     tells = np.ones(known.shape)
     if shoulder:
         tells = np.clip((np.minimum(a.max(-1), b.max(-1)) - DARK) / (BRIGHT - DARK), 0, 1)
@@ -62,12 +63,13 @@ def colour_difference(
         if told.any():
             mean = np.average(values, 0, told)
             variance = np.average((values - mean) ** 2, 0, told).sum()
+            level[place] = np.average(light.mean((0, -1))[part][usable], weights=told)
             result[place] = [*mean, told.sum() / count / (1 + variance / spread**2)]
         for sign, alone in ((1, clips_a & ~clips_b), (-1, clips_b & ~clips_a)):
             values = difference[part][(known & alone)[part]]
             if 2 * len(values) > count:
                 beyond[place] = [*values.mean(0), sign * (2 * len(values) / count - 1)]
-    return result, beyond, mixing
+    return result, beyond, mixing, level
 
 
 def colour_misfit(
