@@ -10,7 +10,7 @@ from hugin_abflow.cells import grown
 from hugin_abflow.working import Grid, connected
 
 Cells = npt.NDArray[np.bool_]  # (height, width), some columns of the seam grid
-Found = npt.NDArray[np.float64]  # (height, width, 10) of the same cells: MEAN to SHARE
+Comparison = npt.NDArray[np.float64]  # (height, width, 10) of the same cells: MEAN to SHARE
 
 # Of a cell: the mean of the layers' difference in r, g, b, the largest mean square of these, each layer's
 # variance, those of blocks, in which noise is less, and their covariance, and the share of the cell that
@@ -37,9 +37,9 @@ _MOST, _WIDE, _SAME = 0.7, 3.0, 0.8
 _CONTRAST, _FEW, _RIM_SAME = 0.01, 0.2, 0.6
 
 
-def smoothed(found: Found, cells: Grid, sigma: float = _SIGMA) -> Found:
-    """The mean of the cells around each, by a Gaussian of sigma cells, as far as they tell; share: 0..1, less
-    at borders.
+def smoothed(found: Comparison, cells: Grid, sigma: float = _SIGMA) -> Comparison:
+    """The mean of the cells around each, by a Gaussian of sigma cells, as far as they tell; share: 1 where
+    any does, else 0.
     """
     share = found[SHARE]
     smooth = _gaussian(np.dstack([found[..., :-1] * share[..., None], share]), cells, sigma)
@@ -47,7 +47,7 @@ def smoothed(found: Found, cells: Grid, sigma: float = _SIGMA) -> Found:
     return smooth
 
 
-def unrelated(smooth: Found, cells: Grid) -> Cells:
+def unrelated(smooth: Comparison, cells: Grid) -> Cells:
     """Where layers show things that have nothing in common, though they may be as bright."""
     # layer by layer: along an axis of two NumPy takes ten times as long
     square, (first, second) = smooth[SQUARE], np.moveaxis(smooth[VARIANCES], -1, 0)
@@ -63,7 +63,7 @@ def unrelated(smooth: Found, cells: Grid) -> Cells:
     return np.asarray(apart & (common <= _RELATED * own)[number])
 
 
-def in_another_light(found: Found, smooth: Found, cells: Grid) -> Cells:
+def in_another_light(found: Comparison, smooth: Comparison, cells: Grid) -> Cells:
     """Where layers show the same things in another light, as far as that reaches.
 
     Light that strays in one camera's lens, where the sun is beside the photo, is added to all that it shows:
@@ -84,26 +84,26 @@ def in_another_light(found: Found, smooth: Found, cells: Grid) -> Cells:
     lit = (all_ >= _LEAST) & (its_same >= _MOST * all_) & (apart <= _FEW * its_rim)
     light = lit[number]  # of no part's cells: of 0
     reach = connected((found[SHARE] > 0) & (light | ~strong) & (same | ~shows), wraps)
-    return np.asarray(np.isin(reach, np.unique(reach[light & same])) & (reach > 0))
+    return np.isin(reach, np.unique(reach[light & same]))
 
 
-def _shows(smooth: Found) -> Cells:
+def _shows(smooth: Comparison) -> Cells:
     """Where either layer shows more than noise."""
     return np.asarray(smooth[COARSE].max(-1) > _CONTRAST**2)
 
 
-def _correlated(smooth: Found, correlation: float) -> Cells:
+def _correlated(smooth: Comparison, correlation: float) -> Cells:
     """Where what layers show is correlated by more than that."""
     first, second = np.moveaxis(smooth[COARSE], -1, 0)
     return np.asarray(smooth[COVARIANCE] > correlation * np.sqrt(np.maximum(first * second, 0)))
 
 
-def _wraps(found: Found, cells: Grid) -> bool:
+def _wraps(found: Comparison, cells: Grid) -> bool:
     """Whether the last column of what was found is beside the first one."""
     return cells.wraps and found.shape[1] == cells.width
 
 
-def _gaussian(values: Found, cells: Grid, sigma: float) -> Found:
+def _gaussian(values: Comparison, cells: Grid, sigma: float) -> Comparison:
     """A Gaussian of sigma cells, not normalised at the borders, of some of a grid's columns side by side."""
     columns, reach = values.shape[1], round(_REACH * sigma)
     gap = min(reach, cells.width - columns)  # what is between its ends if columns wrap, and matters

@@ -214,11 +214,14 @@ def check_layers(canvas: Canvas, layers: Sequence[Layer], names: Sequence[str] |
     Alpha, canvas size (where a layer's file tells it), place inside the canvas, depth, number of channels.
 
     names   what messages call the layers; None: their files.
+
+    Warns of layers whose ICC profile is not that of the first one.
     """
     again = "make the layers again with nona, or leave the file out"
     called = names or [str(layer.file or layer.name) for layer in layers]
-    first, others = layers[0], []
+    others = []
     for layer, name in zip(layers, called, strict=True):
+        first = layers[0]
         if why := misfit(layer, canvas):
             raise LayersMismatchError(f"{name} {why}; {again}")
         if layer.dtype != first.dtype:
@@ -232,8 +235,8 @@ def check_layers(canvas: Canvas, layers: Sequence[Layer], names: Sequence[str] |
             )
         others += [name] if layer.icc != first.icc else []
     if others:
-        what = "that one's is used for all" if first.icc else "that one has none, and none is written"
         _log.warning(
-            "ICC profiles other than that of %s: %s; colours are not converted, %s",
-            called[0], ", ".join(others), what,
+            "ICC profiles other than that of %s: %s; colours are not converted, and the panorama has that of "
+            "its first layer, if there is one",
+            called[0], ", ".join(others),
         )  # fmt: skip

@@ -79,7 +79,7 @@ def merge_project(
     _check_early(plan, settings, output, compression)
     with open_layers(
         plan, prefix=prefix, layers=layers, remap=remap, keep_layers=keep_layers,
-        images=None if prefix or layers else to_be_made(plan), progress=progress,
+        images=None if prefix or layers or keep_layers else to_be_made(plan), progress=progress,
     ) as opened:  # fmt: skip
         target = _target(plan, opened, output)
         shown = opened if layers else of_one_exposure(plan, opened)

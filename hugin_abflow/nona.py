@@ -203,7 +203,7 @@ def _make_all(plan: Plan, folder: Path, keep: bool, progress: Progress) -> Found
 def _find_or_make(
     plan: Plan, needed: Plan, folder: Path, remap: Remap, keep: bool, progress: Progress
 ) -> Found:
-    """Layers that nobody named: what is there, what nona makes, or both; of no other images than `needed`."""
+    """Layers that nobody named: what is there, what nona makes of the images of `needed`, or both."""
     found, missing = planned_layers(plan, remap)
     if found is None:
         return _make_all(needed, folder, keep, progress)

@@ -26,7 +26,7 @@ from hugin_abflow import comparison
 from hugin_abflow.cells import averaged, centres, grown
 from hugin_abflow.coefficient import on_cells
 from hugin_abflow.colour import Correction, clipping
-from hugin_abflow.comparison import MEAN, SHARE, SQUARE, Found
+from hugin_abflow.comparison import MEAN, SHARE, SQUARE, Comparison
 from hugin_abflow.content import ALIKE, Unlike
 from hugin_abflow.geometry import Pair
 from hugin_abflow.layer import Box
@@ -54,7 +54,7 @@ _CLIPPED, _DARKER = 0.5, 0.05
 # What is left of a layer's weight where it yields: a pixel that no other layer can fill stays opaque.
 _TRACE = 1e-12
 # How many times as much as a cut it may cost to take a region from one layer that has most of it, which shows
-# things once and whole: of what single.py found, and of any other.
+# things once and whole: of what single.py and shadows.py found, and of any other.
 _SINGLE_FACTOR, _WHOLE_FACTOR = 2.0, 1.65
 
 
@@ -114,7 +114,7 @@ def regions(residual: Residuals, grid: Grid, aligned: bool = True, single: Cells
     """Where layers differ too much to be blended, (height, width) on the seam grid.
 
     aligned     whether the layers are; else texture differs everywhere and tells nothing.
-    single      what single.py found: cells that belong to a region whatever the layers show there.
+    single      what single.py and shadows.py found: cells that belong to a region whatever layers show there.
     """
     residual = residual if aligned else Residuals(residual.mean, residual.mean)
     return find(residual, seam_grid(grid), np.zeros(residual.mean.shape, bool) if single is None else single)
@@ -131,8 +131,8 @@ def cut(
     """Give each cell of the regions `whole` to one layer: the others lose their colour weight there
     (fields[...].w, in place).
 
-    single      what single.py found: a region that has cells of it is cut in two only if that is much better,
-                others if it is clearly better.
+    single      what single.py and shadows.py found: a region that has cells of it is cut in two only if that
+                is much better, others if it is clearly better.
     clipping_price    what each layer costs in a cell besides (`clipping_prices`).
     choose      the layers of a choice, and who is gone then; default: the least energy, and nobody.
 
@@ -254,7 +254,7 @@ def _yield(
 
 def _differences(
     scene: Scene, correction: Correction, cells: Grid, limits: Sequence[tuple[float, ...]] | None = None
-) -> Iterator[tuple[tuple[slice, slice], Found]]:
+) -> Iterator[tuple[tuple[slice, slice], Comparison]]:
     """Of each two corrected layers, rows and columns of the cells that both may be in, and what is found
     of these, of the pixels that are not brighter than their layer's limits (r, g, b, 1); None: of all.
     """

@@ -23,9 +23,10 @@ Mask = npt.NDArray[np.bool_]
 _TRUSTED, _EVEN = 0.3, 0.25
 # Cells that a place has, at least, and up to how many from it others are around it.
 _LEAST, _AROUND = 6, 4
-# By how much more or less layers differ in a place than in most cells around, on the exposure scale; and by
-# how much of that the layer without a shadow may change there.
-_JUMP, _MOST, _ALONE = 0.3, 0.7, 0.3
+# By how much more or less layers differ in a place than in most cells around, on the exposure scale; the part
+# of that which the layer without a shadow may change by there; and what the colour that differs least does of
+# that which differs most: somebody in a coat has another colour than what is behind him.
+_JUMP, _MOST, _ALONE, _GREY = 0.3, 0.7, 0.3, 0.4
 # Cells by which places are grown: those that an outline cuts are not even, nor those beside them.
 _GROWN = 2
 
@@ -34,50 +35,68 @@ def find(measured: Measured, cells: Grid) -> Mask | None:
     """Where shadows are, (height, width) on the grid `cells` over the same region; None: nowhere."""
     found = np.zeros(measured.grid.shape, bool)
     for difference in measured.differences:
-        found[difference.cells] |= _of(difference)
+        found[difference.cells] |= _of(difference, measured.grid)
     if not found.any():
         return None
     row, column = centres(cells, found.shape)
     return np.asarray(grown(found, _GROWN, measured.grid.wraps)[row[:, None], column])
 
 
-def _of(difference: Difference) -> Mask:
-    """The places of two layers' overlap in which one of them shows a shadow, but for its outline. The largest
-    one is what others lie in.
-    """
-    differ, trusted = difference.values[..., :3].mean(-1), difference.values[..., 3] > _TRUSTED
-    place = scipy.ndimage.label(_even(differ, trusted))[0]
-    size = np.bincount(place.ravel())
-    size[0] = 0  # what is not even
-    large = np.flatnonzero(size >= _LEAST)
-    others, shadows = np.isin(place, large), np.zeros(place.shape, bool)
-    windows = scipy.ndimage.find_objects(place)
-    for number in large[large != size.argmax()]:
-        near = tuple(slice(max(0, one.start - _AROUND), one.stop + _AROUND) for one in windows[number - 1])
-        its = place[near] == number
-        if _apart(its, others[near] & ~its, differ[near], difference.level[near]):
-            shadows[near] |= its
+def _of(difference: Difference, grid: Grid) -> Mask:
+    """The places of two layers' overlap in which one of them shows a shadow, but for its outline."""
+    differ, level = difference.values[..., :3], difference.level
+    around = grid.wraps and level.shape[1] == grid.width
+    even = _even(differ.mean(-1), difference.values[..., 3] > _TRUSTED, around)
+    shadows = np.zeros(level.shape, bool)
+    for turn in (0, grid.width // 2) if around else (0,):  # what the border cuts is whole in one of them
+        found = _shadows(np.roll(differ, turn, 1), np.roll(level, turn, 1), np.roll(even, turn, 1))
+        shadows |= np.roll(found, -turn, 1)
     return shadows
 
 
-def _apart(its: Mask, others: Mask, differ: npt.NDArray[np.float64], level: npt.NDArray[np.float64]) -> bool:
-    """Whether layers differ in a place otherwise than in others around it, and one of them hardly changes."""
-    around = others & grown(its, _AROUND, wraps=False)
-    if not around.any():
-        return False
+def _shadows(differ: npt.NDArray[np.float64], level: npt.NDArray[np.float64], even: Mask) -> Mask:
+    """Those that no border of the arrays cuts."""
+    place = scipy.ndimage.label(even)[0]
+    windows = scipy.ndimage.find_objects(place)
+    size = np.bincount(place.ravel(), minlength=1)
+    size[0] = 0  # what is not even
+    large, shadows = size >= _LEAST, np.zeros(place.shape, bool)
+    for number in np.flatnonzero(large):
+        near = tuple(slice(max(0, one.start - _AROUND), one.stop + _AROUND) for one in windows[number - 1])
+        its = place[near] == number
+        around = large[place[near]] & ~its & grown(its, _AROUND, wraps=False)
+        # what others lie in is none, though they have less light by as much as it has more
+        if size[np.unique(place[near][around])].sum() > size[number]:
+            shadows[near] |= its & _darker(its, around, differ[near], level[near])
+    return shadows
+
+
+def _darker(its: Mask, around: Mask, differ: npt.NDArray[np.float64], level: npt.NDArray[np.float64]) -> bool:
+    """Whether one layer is clearly darker in a place than in cells around, in all colours, and the other one
+    much the same.
+
+    differ, level       what they differ by, r, g, b, and the mean of both and of these.
+    """
     nearest = scipy.ndimage.distance_transform_edt(~its, return_distances=False, return_indices=True)
     inside = tuple(nearest[:, around])
     jump, change = (one[around] - one[inside] for one in (differ, level))
-    more, both = np.median(jump), np.median(change)
-    alone = min(abs(both - more / 2), abs(both + more / 2)) < _ALONE * abs(more)
-    return bool(alone and np.mean(np.sign(more) * jump > _JUMP) > _MOST)
+    colours = np.median(jump, 0)
+    more = colours.mean()
+    grey = (np.sign(more) * colours).min() > _GREY * np.abs(colours).max()
+    alone = abs(np.median(change) - abs(more) / 2) < _ALONE * abs(more)
+    return bool(grey and alone and np.mean(np.sign(more) * jump.mean(-1) > _JUMP) > _MOST)
 
 
-def _even(values: npt.NDArray[np.float64], trusted: Mask) -> Mask:
-    """The trusted cells that differ little from the four beside them, of those that are trusted."""
-    beside = scipy.ndimage.generate_binary_structure(2, 1)
+def _even(values: npt.NDArray[np.float64], trusted: Mask, around: bool) -> Mask:
+    """The trusted cells that differ little from the four beside them, of those that are trusted; around:
+    whether the last column is beside the first one.
+    """
+    beside, ends = scipy.ndimage.generate_binary_structure(2, 1), ((0, 0), (int(around),) * 2)
     high, low = (
-        scipy.ndimage.grey_dilation(np.where(trusted, sign * values, -np.inf), footprint=beside)
+        scipy.ndimage.grey_dilation(
+            np.pad(np.where(trusted, sign * values, -np.inf), ends, mode="wrap"), footprint=beside
+        )
         for sign in (1, -1)
     )
-    return np.asarray(trusted & (high + low < _EVEN))
+    near = (high + low < _EVEN)[:, ends[1][0] : values.shape[1] + ends[1][0]]
+    return np.asarray(trusted & near)

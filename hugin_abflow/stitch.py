@@ -293,7 +293,7 @@ class _Maker:
         """Blend layers, stacks or exposures as `merge.merge_project` does."""
         target, plan = self._target(step, files, scratch), self.plan
         layers = [read_layer(files[name]) for name in step.inputs]
-        check_layers(plan.canvas, layers)
+        check_layers(plan.canvas, layers, step.inputs)
         final = plan.output if step.final else None
         write_panorama(
             target, layers, plan.canvas, self.settings, projection=plan.projection,

@@ -15,7 +15,7 @@ from hugin_abflow.layer import Canvas
 COLUMNS, ROWS, CELL = 60, 40, 8
 
 
-def compared(a: np.ndarray, b: np.ndarray) -> comparison.Found:
+def compared(a: np.ndarray, b: np.ndarray) -> comparison.Comparison:
     """As kernels/seam.cl compares two grey pictures of whole cells, of two samples to a px in x and in y."""
     cells = np.stack([a, b]).reshape(2, ROWS, CELL, COLUMNS, CELL).swapaxes(2, 3)
     blocks = (

@@ -85,8 +85,9 @@ def test_different_profiles_are_reported(caplog):
     assert not caplog.records
     check_layers(Canvas.plane(31, 17), [layer("a", None), *coloured])
     (said,) = caplog.messages
-    assert "other than that of a: b, c; " in said and "none is written" in said
+    assert "other than that of a: b, c; " in said
     caplog.clear()
     check_layers(Canvas.plane(31, 17), [*coloured, layer("a", None)])
     (said,) = caplog.messages
-    assert "other than that of b: a; " in said and "that one's is used for all" in said
+    assert "other than that of b: a; " in said and "not converted" in said
+    check_layers(Canvas.plane(31, 17), [])

@@ -21,9 +21,12 @@ def grid(wraps: bool = False) -> Grid:
     return plane(COLUMNS * 16, ROWS * 16, wraps).resized(COLUMNS, ROWS)
 
 
-def found(differ: np.ndarray, level: np.ndarray, weight: float = 1.0, wraps: bool = False) -> np.ndarray:
+def found(
+    differ: np.ndarray, level: np.ndarray, weight: float | np.ndarray = 1.0, wraps: bool = False
+) -> np.ndarray:
     """Where shadows are, on the colour grid itself, of two layers that differ by so much everywhere."""
-    values = np.dstack([differ] * 3 + [np.full(differ.shape, weight)])
+    colours = [differ] * 3 if differ.ndim == 2 else list(np.moveaxis(differ, -1, 0))
+    values = np.dstack([*colours, np.broadcast_to(weight, level.shape)])
     difference = Difference(0, 1, values, np.zeros_like(values), np.ones_like(level), level)
     inside = np.ones((2, ROWS, COLUMNS), bool)
     mask = shadows.find(Measured(grid(wraps), inside, 1.0, (difference,)), grid(wraps))
@@ -55,6 +58,8 @@ def test_the_shadow_in_one_layer_is_found(jump: float) -> None:
     [
         (0.6, -2.0, False, 1.0),  # light that strays where both are dark
         (0.6, 1.0, False, 1.0),  # and a shoulder where both are bright
+        (0.6, 0.3, False, 1.0),  # a lamp that one of them shows, and what is around that
+        (-0.6, 0.3, False, 1.0),
         (0.2, -0.1, False, 1.0),  # hardly to be seen
         (0.6, -0.3, True, 1.0),  # soft: gains follow that
         (0.6, -0.3, False, 0.2),  # something else
@@ -65,6 +70,16 @@ def test_what_is_no_shadow_is_none(jump: float, level: float, soft: bool, weight
     assert not found(*scene(jump, level, soft), weight).any()
 
 
+@pytest.mark.parametrize(("blue", "counts"), [(0.6, True), (0.2, False), (-1.0, False)])
+def test_a_shadow_is_bluish_at_most(blue: float, counts: bool) -> None:
+    """Of other colours is somebody himself. blue: how much it differs by, of the others."""
+    differ, level = scene(0.9, -0.45)
+    values = np.dstack([differ] * 3)
+    values[..., 2] = scene(0.9 * blue, 0)[0]
+    level -= (blue - 1) * 0.15 * (scene(1, 0)[0] - scene(0, 0)[0])
+    assert found(values, level).any() == counts
+
+
 def test_a_line_is_none() -> None:
     """The edge of a near thing that is a little off; and a place of few cells."""
     y, x = np.mgrid[:ROWS, :COLUMNS]
@@ -72,12 +87,25 @@ def test_a_line_is_none() -> None:
         assert not found(0.8 * place, -0.4 * place).any()
 
 
-def test_a_shadow_goes_on_across_the_border() -> None:
-    """Of a canvas that wraps, with the cells that its outline cuts."""
-    differ, level = (np.roll(one, -12, 1) for one in scene(0.8, -0.4))
-    differ += 0.03 * ((np.arange(COLUMNS) + 12) // COLUMNS) * COLUMNS  # the slope of exposure goes on
-    assert found(differ, level, wraps=True)[5:15, [-1]].all()
-    assert not found(differ, level)[:, -1].any()
+@pytest.mark.parametrize("columns", [12, 17])
+def test_a_shadow_goes_on_across_the_border(columns: int) -> None:
+    """Of a canvas that wraps, with the cells that its outline cuts: the same as elsewhere."""
+    differ, level = scene(0.8, -0.4)
+    differ -= 0.03 * np.arange(COLUMNS)  # of exposure nothing changes from column to column
+    elsewhere = found(differ, level, wraps=True)
+    turned = found(np.roll(differ, -columns, 1), np.roll(level, -columns, 1), wraps=True)
+    assert elsewhere[5:15, 11:23].all() and elsewhere.sum() == 120
+    assert np.array_equal(np.roll(turned, columns, 1), elsewhere)
+
+
+def test_what_a_shadow_lies_in_is_none() -> None:
+    """Neither where overlaps are in two pieces, nor where it crosses the smaller one."""
+    y, x = np.mgrid[:ROWS, :COLUMNS]
+    for shadow in ((abs(x - 33) < 3) & (abs(y - 9) < 4), abs(y - 12) < 5):
+        differ, level = 0.8 * shadow, -0.4 * shadow
+        mask = found(differ, level, np.where((x < 23) | (x > 26), 1.0, 0.0))
+        assert mask[shadow & (x > 28) & (x < 38)].all()
+        assert not mask[~ndimage.binary_dilation(shadow, np.ones((3, 3)), 2)].any()
 
 
 @pytest.mark.usefixtures(one_device.__name__)
