@@ -6,11 +6,11 @@ import numpy as np
 import numpy.typing as npt
 import scipy
 
-from hugin_abflow.cells import grown
+from hugin_abflow.cells import Mask, grown
 from hugin_abflow.working import Grid, connected
 
-Cells = npt.NDArray[np.bool_]  # (height, width), some columns of the seam grid
-Comparison = npt.NDArray[np.float64]  # (height, width, 10) of the same cells: MEAN to SHARE
+# Of some columns of the seam grid, (height, width, 10): MEAN to SHARE. Masks are of the same cells.
+Comparison = npt.NDArray[np.float64]
 
 # Of a cell: the mean of the layers' difference in r, g, b, the largest mean square of these, each layer's
 # variance, those of blocks, in which noise is less, and their covariance, and the share of the cell that
@@ -19,7 +19,7 @@ MEAN, SQUARE, VARIANCES, COARSE, COVARIANCE, SHARE = (
     np.s_[..., :3], np.s_[..., 3], np.s_[..., 4:6], np.s_[..., 6:8], np.s_[..., 8], np.s_[..., 9],
 )  # fmt: skip
 
-# Cells over which differences are averaged: texture that is a little off is no reason to cut; and how many
+# Mask over which differences are averaged: texture that is a little off is no reason to cut; and how many
 # times as far others count.
 _SIGMA, _REACH = 1.0, 3
 # Layers show unrelated things: what they differ by in all frequencies, at least, its square's share of the
@@ -47,7 +47,7 @@ def smoothed(found: Comparison, cells: Grid, sigma: float = _SIGMA) -> Compariso
     return smooth
 
 
-def unrelated(smooth: Comparison, cells: Grid) -> Cells:
+def unrelated(smooth: Comparison, cells: Grid) -> Mask:
     """Where layers show things that have nothing in common, though they may be as bright."""
     # layer by layer: along an axis of two NumPy takes ten times as long
     square, (first, second) = smooth[SQUARE], np.moveaxis(smooth[VARIANCES], -1, 0)
@@ -63,14 +63,14 @@ def unrelated(smooth: Comparison, cells: Grid) -> Cells:
     return np.asarray(apart & (common <= _RELATED * own)[number])
 
 
-def in_another_light(found: Comparison, smooth: Comparison, cells: Grid) -> Cells:
+def in_another_light(found: Comparison, smooth: Comparison, cells: Grid) -> Mask:
     """Where layers show the same things in another light, as far as that reaches.
 
     Light that strays in one camera's lens, where the sun is beside the photo, is added to all that it shows:
     dark things are lightened more than bright ones, as by no exposure. The strict gains, by which regions are
     found, leave that; the final ones follow it bit by bit, as well as they can.
     """
-    strong: Cells = (found[SHARE] > 0) & (np.abs(smooth[MEAN]).max(-1) > _STRONG)
+    strong: Mask = (found[SHARE] > 0) & (np.abs(smooth[MEAN]).max(-1) > _STRONG)
     if not strong.any():
         return strong
     wraps, wide = _wraps(found, cells), smoothed(found, cells, _WIDE)
@@ -87,12 +87,12 @@ def in_another_light(found: Comparison, smooth: Comparison, cells: Grid) -> Cell
     return np.isin(reach, np.unique(reach[light & same]))
 
 
-def _shows(smooth: Comparison) -> Cells:
+def _shows(smooth: Comparison) -> Mask:
     """Where either layer shows more than noise."""
     return np.asarray(smooth[COARSE].max(-1) > _CONTRAST**2)
 
 
-def _correlated(smooth: Comparison, correlation: float) -> Cells:
+def _correlated(smooth: Comparison, correlation: float) -> Mask:
     """Where what layers show is correlated by more than that."""
     first, second = np.moveaxis(smooth[COARSE], -1, 0)
     return np.asarray(smooth[COVARIANCE] > correlation * np.sqrt(np.maximum(first * second, 0)))

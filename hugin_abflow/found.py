@@ -91,14 +91,6 @@ def layer_path(prefix: str, index: int, ending: str) -> Path:
     return Path(layer_name(prefix, index, ending)).absolute()
 
 
-def known_as(plan: Plan, made_in: Path, layer: Layer) -> str:
-    """What a user knows a layer by: its file; its photo, if it was made in a folder that will be gone."""
-    assert layer.file is not None
-    if layer.file.parent != made_in:
-        return str(layer.file)
-    return next(image.name for image in plan.images if layer.file.stem.endswith(f"{image.index:04d}"))
-
-
 def _find_under(plan: Plan, prefix: str) -> Found | None:
     """Layers that begin with `prefix`, if any."""
     endings = (".exr", ".tif", ".tiff") if plan.hdr else (".tif", ".tiff", ".exr")

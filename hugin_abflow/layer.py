@@ -217,21 +217,22 @@ def check_layers(canvas: Canvas, layers: Sequence[Layer], names: Sequence[str] |
 
     Warns of layers whose ICC profile is not that of the first one.
     """
+    if not layers:
+        return
     again = "make the layers again with nona, or leave the file out"
     called = names or [str(layer.file or layer.name) for layer in layers]
-    others = []
+    first, first_name, others = layers[0], Path(called[0]).name, []
     for layer, name in zip(layers, called, strict=True):
-        first = layers[0]
         if why := misfit(layer, canvas):
             raise LayersMismatchError(f"{name} {why}; {again}")
         if layer.dtype != first.dtype:
             raise LayersMismatchError(
-                f"{name} has {layer.dtype} samples, {called[0]} has {first.dtype}; {again}"
+                f"{name} has {layer.dtype} samples, {first_name} has {first.dtype}; {again}"
             )
         if layer.channels != first.channels:
             kinds = {1: "grey", 3: "RGB"}
             raise LayersMismatchError(
-                f"{name} is {kinds[layer.channels]}, {called[0]} is {kinds[first.channels]}; {again}"
+                f"{name} is {kinds[layer.channels]}, {first_name} is {kinds[first.channels]}; {again}"
             )
         others += [name] if layer.icc != first.icc else []
     if others:

@@ -32,7 +32,6 @@ from hugin_abflow.found import (
     Found,
     Remap,
     find,
-    known_as,
     layer_path,
     layers_by_prefix,
     named_files,
@@ -103,8 +102,11 @@ def open_layers(
             files = _find_or_make(plan, needed, folder, remap, keep_layers, progress).in_order()
         found = [str(file) for file in files if file.parent != folder]
         opened = [layer for file in files for layer in read_layers(file)]
+        names = {image.index: image.name for image in plan.images}
+        photos = {str(file): names[index] for index, file in _made(plan, folder).items()}
+        called = [photos.get(str(layer.file), str(layer.file)) for layer in opened]  # what was made will go
         try:
-            check_layers(plan.canvas, opened, [known_as(plan, folder, layer) for layer in opened])
+            check_layers(plan.canvas, opened, called)
         except LayersMismatchError as error:
             if not found or not _can_make(plan):
                 raise
@@ -186,7 +188,7 @@ def _make_all(plan: Plan, folder: Path, keep: bool, progress: Progress) -> Found
     for image in plan.images:
         _require_photo(plan, image)
     with progress("remap", len(_STEPS) * len(plan.images)) as advance:
-        code, lines = _run(plan, plan.images, folder, [], advance)
+        code, lines = _run(plan, _project_for_nona(plan, folder), plan.images, folder, [], advance)
     made = _made(plan, folder)
     if code:
         raise _failure(plan, plan.images, folder, code, lines)
@@ -220,9 +222,10 @@ def _make_missing(
     """Have nona make the layers that are not there; images that miss the crop have none."""
     if keep:
         _refuse_to_keep(prefix)
+    project = _project_for_nona(plan, folder)
     with progress("remap", len(_STEPS) * len(missing)) as advance:
         for image in missing:
-            code, lines = _run(plan, [image], folder, ["-i", str(image.index)], advance)
+            code, lines = _run(plan, project, [image], folder, ["-i", str(image.index)], advance)
             if code and f"image with number {image.index}" in " ".join(lines):
                 # nona does not count an image outside the crop as one of the project's
                 log.info("image %d (%s) misses the crop: it has no layer", image.index, image.name)
@@ -260,6 +263,7 @@ def _require_photo(plan: Plan, image: PlannedImage) -> None:
 
 def _run(
     plan: Plan,
+    project: Path,
     images: Sequence[PlannedImage],
     folder: Path,
     options: list[str],
@@ -269,7 +273,6 @@ def _run(
 
     Raises `ImageReadError` for a photo of which pixels are missing.
     """
-    project = _project_for_nona(plan, folder)
     command = remapping(plan, options, _prefix(plan, folder), str(project))
     log.info("%s", " ".join(command))
     try:

@@ -12,11 +12,9 @@ import numpy as np
 import numpy.typing as npt
 import scipy
 
-from hugin_abflow.cells import centres, grown
+from hugin_abflow.cells import Mask, centres, grown
 from hugin_abflow.gains import Difference, Measured
 from hugin_abflow.working import Grid
-
-Mask = npt.NDArray[np.bool_]
 
 # Weight of a cell that counts: one that is cut by an outline may weigh more, but is not even. The exposure
 # scale over which a cell and those beside it are; its unit is a factor of e.
@@ -91,12 +89,12 @@ def _even(values: npt.NDArray[np.float64], trusted: Mask, around: bool) -> Mask:
     """The trusted cells that differ little from the four beside them, of those that are trusted; around:
     whether the last column is beside the first one.
     """
-    beside, ends = scipy.ndimage.generate_binary_structure(2, 1), ((0, 0), (int(around),) * 2)
+    beside, by = scipy.ndimage.generate_binary_structure(2, 1), int(around)
     high, low = (
         scipy.ndimage.grey_dilation(
-            np.pad(np.where(trusted, sign * values, -np.inf), ends, mode="wrap"), footprint=beside
-        )
+            np.pad(np.where(trusted, sign * values, -np.inf), ((0, 0), (by, by)), mode="wrap"),
+            footprint=beside,
+        )[:, by : by + values.shape[1]]
         for sign in (1, -1)
     )
-    near = (high + low < _EVEN)[:, ends[1][0] : values.shape[1] + ends[1][0]]
-    return np.asarray(trusted & near)
+    return np.asarray(trusted & (high + low < _EVEN))

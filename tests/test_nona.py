@@ -421,7 +421,7 @@ def test_layers_of_other_depth_are_named(make_project, nona):
     )
     with (
         pytest.raises(
-            LayersMismatchError, match=r"pano0001\.tif has uint16 samples, .*pano0000\.tif has uint8"
+            LayersMismatchError, match=r"pano0001\.tif has uint16 samples, pano0000\.tif has uint8"
         ),
         open_layers(plan),
     ):
