@@ -84,7 +84,7 @@ class Choice:
     whole       (height, width): the cells of all regions.
     residual    on the same grid.
     shares      (layers, height, width): s_k, of the softmax.
-    cover       (layers, height, width): the cells that each layer covers.
+    cover       (layers, height, width): the cells that each layer can be taken from.
     wraps       whether columns are periodic.
     cut_price   c: of a cut, in cells. cut_share: the share of a region's size, the root of its cells, that c
                 is at least: what one layer favours grows with the area, a cut through somebody with the size.
@@ -228,7 +228,7 @@ def completed(residual: Residuals, cover: npt.NDArray[np.bool_], wraps: bool) ->
     away from there, so that a cut would cost nothing, and leave half of somebody. What else residuals tell,
     by which regions are found, is left out.
 
-    cover       (layers, height, width): the cells that each of them covers.
+    cover       (layers, height, width): the cells that each of them can be taken from.
     """
     if residual.measured is None or not residual.measured.any():
         return residual

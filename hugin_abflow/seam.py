@@ -144,7 +144,7 @@ def cut(
     if single is not None:
         factor = np.where(single, _SINGLE_FACTOR, _WHOLE_FACTOR)
     choice = replace(
-        _choice(scene, seen(residual), whole, cells, _CUT),
+        _choice(scene, seen(residual), whole, cells, _shown(scene, cells), _CUT),
         cut_share=_CUT_SHARE, whole_factor=factor, clipping=clipping_price,
     )  # fmt: skip
     owner, gone = choose(choice) if choose else (choice.owners()[0], Gone())
@@ -204,7 +204,8 @@ def cut_unaligned(scene: Scene, correction: Correction) -> None:
         measured = found[SHARE] > 0
         square[its] = np.maximum(square[its], np.where(measured, _SHORTER + found[SQUARE], 0))
     whole = square > 0
-    owner, _ = _choice(scene, Residuals(square, square), whole, cells, _FINE_CUT).owners()
+    cover = on_cells(scene.masks.host, cells, np.logical_and)
+    owner, _ = _choice(scene, Residuals(square, square), whole, cells, cover, _FINE_CUT).owners()
     yields = [(whole & (owner != k)).astype(np.float32) for k in range(len(scene.layers))]
     _yield(scene, yields, whole.astype(np.float32), cells)
 
@@ -214,14 +215,30 @@ def _choice(
     residual: Residuals,
     whole: Cells,
     cells: Grid,
+    cover: npt.NDArray[np.bool_],
     cut_price: float,
 ) -> Choice:
-    """The choice of the layer that each cell of the regions `whole` is taken from."""
-    cover = on_cells(scene.masks.host, cells, np.logical_and)
+    """The layer, of those that `cover` it, that each cell of the regions `whole` is taken from."""
     shares = _weights(scene, cells)
     shares /= np.maximum(shares.sum(0), 1e-12)
     residual = completed(residual, cover, cells.wraps)
     return Choice(whole, residual, shares, cover, cells.wraps, cut_price)
+
+
+def _shown(scene: Scene, cells: Grid) -> npt.NDArray[np.bool_]:
+    """The cells that each layer can be taken from, (layers, height, width): those that it covers and where it
+    is not sampled beyond its border, unless all that cover them are.
+    """
+    device, grid = scene.device, scene.grid
+    cover = on_cells(scene.masks.host, cells, np.logical_and)
+    shown = [device.empty(cells.shape, np.uint8) for _ in scene.layers]
+    for layer, field, one in zip(scene.layers, scene.fields, shown, strict=True):
+        device.run(
+            "seam", "seam_shown", cells.border[:2],
+            layer.pixels, field, layer.box, grid.border, grid.lonlat, cells.border, one,
+        )  # fmt: skip
+    inside = cover & np.stack([one.get() > 0 for one in shown])
+    return np.where(inside.any(0), inside, cover)
 
 
 def _weights(scene: Scene, cells: Grid) -> npt.NDArray[np.float64]:

@@ -115,6 +115,30 @@ __kernel void seam_weights(__global const float4 *field, /* (box.w, box.z) */
     weights[y * cells.x + x] = at < 0 ? 0.0f : field[at].w;
 }
 
+/* Whether a layer shows something wherever it is sampled for a cell: for every second pixel in x and y that it covers. */
+__kernel void seam_shown(__global const float4 *layer, /* (box.w, box.z) */
+                         __global const float4 *field, /* the same */
+                         int4 box, int4 border,        /* place on the working grid; working grid */
+                         float4 lonlat,
+                         int4 cells,                   /* seam grid, over the same region; run size */
+                         __global uchar *shown)        /* (cells.y, cells.x): 0 or 1 */
+{
+    const int cx = get_global_id(0), cy = get_global_id(1);
+    if (cx >= cells.x || cy >= cells.y)
+        return;
+    const int4 its = cell_pixels(cx, cy, border, cells);
+    bool all_of_it = true;
+    for (int y = its.y; y < its.w && all_of_it; y += 2)
+        for (int x = its.x; x < its.z; x += 2) {
+            const int at = box_index((int2)(x, y), box);
+            if (at < 0 || layer[at].w == 0.0f)
+                continue;
+            const float2 there = layer_position((float2)(x + 0.5f, y + 0.5f), field[at].xyz, lonlat);
+            all_of_it = all_of_it && layer_sample(layer, box, there, border).w != 0.0f;
+        }
+    shown[cy * cells.x + cx] = all_of_it;
+}
+
 /* Halvings in which it is found how far a displacement leads to what a layer shows. */
 #define SEAM_HALVINGS 5
 

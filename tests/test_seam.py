@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from grids import GRIDS, patches, plane, random_layer
 from labels import label
-from reference.seam import seam_clamp, seam_difference, seam_weights, seam_yield
+from reference.seam import seam_clamp, seam_difference, seam_shown, seam_weights, seam_yield
 from scipy import ndimage
 from tolerances import POSITION, SUM, assert_close
 
@@ -23,6 +23,14 @@ from hugin_abflow.scene import Scene
 from hugin_abflow.working import Grid
 
 WRAPS = [False, True]
+
+
+def whole_layer(device: Device, width: int, height: int) -> SimpleNamespace:
+    """A white working layer without holes."""
+    return SimpleNamespace(
+        box=(0, 0, width, height), pixels=device.upload(np.ones((height, width, 4), np.float32))
+    )
+
 
 # The kernel
 
@@ -152,6 +160,52 @@ def test_what_stays_equals_its_twin(device: Device, name: str) -> None:
     changed = (np.abs(expected - field)[..., :3] > 0.1 * scale).any(-1)
     assert 0.01 < changed.mean() < 0.5
     assert np.array_equal(out.get()[..., 3], field[..., 3])
+
+
+@pytest.mark.parametrize("name", list(GRIDS))
+def test_what_is_shown_equals_its_twin(device: Device, name: str) -> None:
+    """Of a layer with holes, displaced by some pixels."""
+    grid = GRIDS[name]
+    cells = grid.resized(19, 13)
+    box = (9, 1, grid.width - 9, grid.height - 1)
+    layer = random_layer(20, box[2], box[3], 0.9)
+    field = ndimage.gaussian_filter(np.random.default_rng(3).normal(size=(box[3], box[2], 4)), (4, 4, 0))
+    field = (60 * field * (grid.lonlat[1] or 1)).astype(np.float32)
+    if not grid.lonlat[1]:
+        field[..., 2] = 0
+    out = device.empty(cells.shape, np.uint8)
+    device.run(
+        "seam", "seam_shown", cells.border[:2], device.upload(layer), device.upload(field), box, grid.border,
+        grid.lonlat, cells.border, out,
+    )  # fmt: skip
+    expected = seam_shown(layer, field, box, grid.border, grid.lonlat, cells.border)
+    assert 0.1 < expected.mean() < 0.9
+    assert (out.get() != expected).mean() < 0.02
+
+
+def test_nothing_is_taken_from_beyond_a_border(device: Device) -> None:
+    """Two layers, of which the second one begins at column 20 and is displaced by up to 12 px to the left
+    there: it cannot be taken from cells that would show what is beyond, unless the first one ends before.
+    """
+    grid = plane(80, 24)
+    cells = grid.coarser(4)
+    for ends, first in ((80, 8), (28, 7)):
+        masks = np.zeros((2, *grid.shape), bool)
+        masks[0, :, :ends] = masks[1, :, 20:] = True
+        layers, fields = [], []
+        for mask, left, width in zip(masks, (0, 20), (80, 60), strict=True):
+            box = (left, 0, width, 24)
+            pixels = np.ones((24, width, 4), np.float32) * mask[:, left : left + width, None]
+            field = np.zeros((24, width, 4), np.float32)
+            if left:
+                field[..., 0] = -12
+            layers.append(SimpleNamespace(box=box, pixels=device.upload(pixels)))
+            fields.append(device.upload(field))
+        scene = Scene(device, layers, [Pair(0, 1)], fields, SimpleNamespace(host=masks), grid)
+        shown = seam._shown(scene, cells)
+        assert shown.shape == (2, 6, 20)
+        assert np.array_equal(shown[0], np.broadcast_to(np.arange(20) < ends // 4, (6, 20)))
+        assert np.array_equal(shown[1], np.broadcast_to(np.arange(20) >= first, (6, 20)))
 
 
 @pytest.mark.parametrize("place", [(0, 0, 60, 40), (11, 7, 31, 23), (29, 0, 31, 40)])
@@ -324,7 +378,7 @@ def test_a_cut_is_where_it_was_chosen(device: Device, weight: float) -> None:
     fields = [np.full((104, 184, 4), one, np.float32) for one in (1.0, weight)]
     fields[1][60:, :60, 3] = 0
     fields = [device.upload(field) for field in fields]
-    layers = [SimpleNamespace(box=(0, 0, 184, 104))] * 2
+    layers = [whole_layer(device, 184, 104)] * 2
     masks = SimpleNamespace(host=np.ones((2, 104, 184), bool))
     nothing = Residuals(np.zeros(shape), np.zeros(shape))
     scene = Scene(device, layers, [], fields, masks, grid)
@@ -346,7 +400,7 @@ def test_who_is_gone_is_wholly_gone(device: Device) -> None:
     gone = np.zeros(shape, bool)
     gone[3:9, 4:7] = True
     fields = [device.upload(np.ones((104, 184, 4), np.float32)) for _ in range(2)]
-    layers = [SimpleNamespace(box=(0, 0, 184, 104))] * 2
+    layers = [whole_layer(device, 184, 104)] * 2
     nothing = Residuals(np.zeros(shape), np.zeros(shape))
     scene = Scene(device, layers, [], fields, SimpleNamespace(host=np.ones((2, 104, 184), bool)), grid)
     seam.cut(scene, nothing, whole, choose=lambda _: (owner, {0: gone}))
@@ -358,15 +412,12 @@ def test_who_is_gone_is_wholly_gone(device: Device) -> None:
 
 def test_no_cell_comes_from_a_layer_that_covers_a_part_of_it(device: Device) -> None:
     grid = plane(184, 104)
-    cells = seam.seam_grid(grid)
     masks = np.ones((2, 104, 184), bool)
     masks[0, 50, 90] = False
-    fields = [device.upload(np.ones((104, 184, 4), np.float32))] * 2
-    layers = [SimpleNamespace(box=(0, 0, 184, 104))] * 2
+    fields = [device.zeros((104, 184, 4))] * 2
+    layers = [whole_layer(device, 184, 104)] * 2
     scene = Scene(device, layers, [], fields, SimpleNamespace(host=masks), grid)
-    nothing = Residuals(np.zeros(cells.shape), np.zeros(cells.shape))
-    choice = seam._choice(scene, nothing, np.ones(cells.shape, bool), cells, 1.0)
-    assert np.argwhere(~choice.cover).tolist() == [[0, 50 // 8, 90 // 8]]
+    assert np.argwhere(~seam._shown(scene, seam.seam_grid(grid))).tolist() == [[0, 50 // 8, 90 // 8]]
 
 
 def test_cells_that_a_layer_covers_whole() -> None:

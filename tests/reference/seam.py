@@ -13,6 +13,7 @@ from reference.common import (
     cell_parts,
     layer_look,
     layer_seen,
+    on_box,
     pixels,
 )
 
@@ -94,6 +95,26 @@ def seam_weights(field: Array, box: Sequence[int], rows: Array, columns: Array) 
     weights = np.zeros((max(box[1] + box[3], rows.max() + 1), max(box[0] + box[2], columns.max() + 1)))
     weights[box[1] :, box[0] :][: box[3], : box[2]] = field[..., 3]
     return weights[np.ix_(rows, columns)]
+
+
+def seam_shown(
+    layer: Array,
+    field: Array,
+    box: Sequence[int],
+    border: Sequence[int],
+    lonlat: Numbers,
+    cells: Sequence[int],
+) -> Array:
+    """The cells (height, width) of which every second pixel that the layer covers is sampled where it shows
+    something."""
+    columns, rows = pixels(box[2], box[3], box[0], box[1])
+    ends = (layer[..., 3] > 0) & (layer_seen(layer, field, box, columns, rows, border, lonlat)[..., 3] == 0)
+    beyond = np.zeros((border[1], border[0]), bool)
+    beyond[on_box(box)] = ends
+    result = np.ones((cells[1], cells[0]), bool)
+    for place, its in cell_parts(border, cells, 2):
+        result[place] = not beyond[its].any()
+    return result
 
 
 def seam_clamp(
