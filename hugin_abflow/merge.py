@@ -20,6 +20,7 @@ from hugin_abflow.errors import LayersMissingError, OutputError
 from hugin_abflow.exif import Metadata
 from hugin_abflow.found import Remap, candidates
 from hugin_abflow.guides import Guide, check_guides
+from hugin_abflow.holes import Coverage
 from hugin_abflow.images import ENDINGS, ImageWriter, check_target, use_threads
 from hugin_abflow.kept import in_use, kept_device
 from hugin_abflow.layer import Canvas, Layer, check_canvas, check_layers
@@ -184,7 +185,7 @@ def _bands(
     device = (open_device or kept_device)(settings.device, settings.threads)
     _log.info("device: %s", device.name)
     method = method or {"joint": joint.merge, "sequential": sequential.merge}[settings.merge]
-    visible = False
+    coverage = Coverage(canvas)
     with (
         in_use(device),
         spooled(layers) as layers,
@@ -192,13 +193,9 @@ def _bands(
         closing(method(device, layers, canvas, settings, progress, guides)) as bands,
     ):
         for rows in bands:
-            visible = visible or bool(rows[..., -1].any())
+            coverage.add(rows)
             yield rows
-    if not visible:
-        _log.warning(
-            "the panorama is wholly transparent: no layer has an alpha of half or more inside the crop; "
-            "check crop and masks in Hugin, and alpha of layers that others made"
-        )
+    coverage.report()
 
 
 def guides_between(plan: Plan, layers: Sequence[Layer], settings: Settings) -> list[Guide]:

@@ -107,3 +107,16 @@ def test_where_the_others_are_masked_a_photo_is_copied(project: Path, kind: str)
         alone = alpha & ~other
         assert alone.sum() > 5000
         np.testing.assert_array_equal(result[alone], layer[alone])
+
+
+def test_a_hole_between_masks_that_contradict_each_other_is_told(
+    project: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Each of two photos includes what the other one does: nona leaves it out of both."""
+    text = project.read_text("utf-8")
+    for box, told in (((150, 90, 190, 130), False), ((60, 30, 110, 70), True)):
+        project.write_text(text + line("k i0 t1", CHOSEN) + line("k i1 t1", box), "utf-8")
+        result, _ = merged(project, flow=False)
+        shown = result[..., 3] > 0
+        assert ((ndimage.binary_fill_holes(shown) & ~shown).sum() > 500) == told
+        assert ("the panorama has a hole of about" in caplog.text) is told
