@@ -1,78 +1,108 @@
-"""What a panorama does not show: holes are easily overlooked before it is printed."""
+"""Places within a panorama that no photo shows: who does not look there finds them on paper."""
 
 from __future__ import annotations
 
 import logging
-from typing import Any
+import math
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 import scipy
 
 from hugin_abflow.layer import Canvas
+from hugin_abflow.projection import Projection
 
 _log = logging.getLogger(__name__)
 
-# Pixels of a row that are looked at, about; and how many of these a hole is wide and high at least.
-_LOOKED_AT, _LEAST = 1000, 3
+# Pixels of a panorama that are looked at, at most.
+_LOOKED_AT = 1_000_000
+# Sine of the elevation from which on a place is straight up or down.
+_POLE = 0.98
+
+
+class Hole(NamedTuple):
+    """The box of a hole on a grid, and how many of its pixels the hole has, without those at its outline."""
+
+    left: int
+    top: int
+    right: int
+    bottom: int
+    size: int
 
 
 class Coverage:
     """Where a panorama is opaque, from its rows as they are made."""
 
     def __init__(self, canvas: Canvas) -> None:
-        self._crop = canvas.crop
-        self._wraps = canvas.wraps and canvas.crop.width == canvas.width
-        self._every = max(1, canvas.crop.width // _LOOKED_AT)
-        self._seen = 0
+        crop = canvas.crop
+        self._crop = crop
+        self._wraps = canvas.wraps and crop.width == canvas.width
+        self._projection = Projection.of(canvas.projection, canvas.width, canvas.height, canvas.hfov)
+        self._every = math.ceil(math.sqrt(crop.width * crop.height / _LOOKED_AT))
+        self._done = 0
         self._visible = False
         self._rows = list[npt.NDArray[np.bool_]]()
 
     def add(self, rows: npt.NDArray[Any]) -> None:
         """The next rows of the crop, (rows, width, channels), alpha last."""
-        alpha = rows[..., -1]
-        self._rows.append(alpha[-self._seen % self._every :: self._every, :: self._every] > 0)
+        alpha, every = rows[..., -1], self._every
+        first = -self._done % every  # of these rows, counted from the crop's first
+        self._rows.append(alpha[first::every, ::every] > 0)
         self._visible = self._visible or bool(alpha.any())
-        self._seen += len(rows)
+        self._done += len(rows)
 
     def report(self) -> None:
-        """Warn if nothing is opaque, or of the largest place within the panorama that is not.
-
-        What reaches the crop's border or a pole, as where nobody photographed the ground, is no such place.
-        """
+        """Warn if nothing is opaque, or of the largest hole."""
         if not self._visible:
             _log.warning(
                 "the panorama is wholly transparent: no layer has an alpha of half or more inside the crop; "
                 "check crop and masks in Hugin, and alpha of layers that others made"
             )
             return
-        places = self._every * holes(np.concatenate(self._rows), self._wraps)
-        if places.size:
-            left, top, right, bottom = places[np.argmax(np.prod(places[:, 2:] - places[:, :2], 1))]
+        found = holes(np.concatenate(self._rows), self._wraps)
+        found = [hole for hole in found if not self._shows_a_pole(hole)]
+        if found:
+            hole, every = max(found, key=lambda one: one.size), self._every
             _log.warning(
-                "the panorama has %s of about %d x %d px at (%d, %d), where no layer shows anything; if you "
-                "do not want that, check masks in Hugin: what one photo includes is left out of all others, "
-                "also where these include it",
-                "a hole" if len(places) == 1 else f"{len(places)} holes, the largest",
-                right - left, bottom - top, self._crop.left + left, self._crop.top + top,
+                "the panorama has %s of about %d x %d px at (%d, %d) of the canvas, which no photo shows; "
+                "if you do not want that, see in Hugin whether a photo is missing, or masks hide it in all: "
+                "what two photos include is left out of both",
+                "a hole" if len(found) == 1 else f"{len(found)} holes, the largest",
+                every * (hole.right - hole.left), every * (hole.bottom - hole.top),
+                self._crop.left + every * hole.left, self._crop.top + every * hole.top,
             )  # fmt: skip
 
+    def _shows_a_pole(self, hole: Hole) -> bool:
+        """Whether a hole is straight up or down, as the ground that nobody photographed below a tripod is on
+        a little planet. (On most other canvases it reaches the border.)
+        """
+        if self._projection is None:
+            return False
+        across, down = (np.linspace(*ends, 9) for ends in (hole[0:3:2], hole[1:4:2]))
+        x, y = np.meshgrid(across, down)
+        places = self._every * np.stack([x.ravel(), y.ravel()], 1) + (self._crop.left, self._crop.top)
+        return bool((abs(self._projection.bearings(places)[:, 2]) > _POLE).any())
 
-def holes(covered: npt.NDArray[np.bool_], wraps: bool) -> npt.NDArray[np.intp]:
-    """Places (n, 4), left, top, right, bottom, of what is not covered and does not reach the border, px.
+
+def holes(covered: npt.NDArray[np.bool_], wraps: bool) -> list[Hole]:
+    """What is not covered and does not reach the border, but for slits of less than three pixels.
 
     covered     (height, width); wraps: whether its columns are periodic. Of a hole that lies across the
                 border of such columns the right end is beyond the width.
     """
     if covered.all():
-        return np.empty((0, 4), np.intp)
+        return []
     # columns that wrap twice, so that what lies across the border is whole in the middle
-    labels, _ = scipy.ndimage.label(~np.tile(covered, 2 if wraps else 1), np.ones((3, 3)))
+    gaps = ~np.tile(covered, 2 if wraps else 1)
+    gaps = scipy.ndimage.binary_erosion(gaps, np.ones((3, 3)), border_value=1)
+    labels, _ = scipy.ndimage.label(gaps, np.ones((3, 3)))
+    sizes = np.bincount(labels.ravel())
     height, width = labels.shape
     found = []
-    for rows, columns in scipy.ndimage.find_objects(labels):
+    for number, (rows, columns) in enumerate(scipy.ndimage.find_objects(labels), 1):
         inside = rows.start > 0 and rows.stop < height and columns.start > 0 and columns.stop < width
-        large = min(rows.stop - rows.start, columns.stop - columns.start) >= _LEAST
-        if inside and large and columns.start < covered.shape[1]:
-            found.append([columns.start, rows.start, columns.stop, rows.stop])
-    return np.asarray(found, np.intp).reshape(-1, 4)
+        if inside and columns.start - 1 < covered.shape[1]:
+            box = columns.start - 1, rows.start - 1, columns.stop + 1, rows.stop + 1
+            found.append(Hole(*box, int(sizes[number])))
+    return found

@@ -218,7 +218,7 @@ def _choice(
     cover: npt.NDArray[np.bool_],
     cut_price: float,
 ) -> Choice:
-    """The layer, of those that `cover` it, that each cell of the regions `whole` is taken from."""
+    """From which layer, of those that `cover` it, each cell of the regions `whole` is to be taken."""
     shares = _weights(scene, cells)
     shares /= np.maximum(shares.sum(0), 1e-12)
     residual = completed(residual, cover, cells.wraps)
@@ -227,7 +227,7 @@ def _choice(
 
 def _shown(scene: Scene, cells: Grid) -> npt.NDArray[np.bool_]:
     """The cells that each layer can be taken from, (layers, height, width): those that it covers and where it
-    is not sampled beyond its border, unless all that cover them are.
+    is not sampled beyond its border. Where that is none of those that cover a cell, it is all of them.
     """
     device, grid = scene.device, scene.grid
     cover = on_cells(scene.masks.host, cells, np.logical_and)

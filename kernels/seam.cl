@@ -115,7 +115,11 @@ __kernel void seam_weights(__global const float4 *field, /* (box.w, box.z) */
     weights[y * cells.x + x] = at < 0 ? 0.0f : field[at].w;
 }
 
-/* Whether a layer shows something wherever it is sampled for a cell: for every second pixel in x and y that it covers. */
+/* Px of the working grid by which a layer may be sampled beyond its border: clamped to that, it smears nothing. */
+#define SEAM_BEYOND 0.5f
+
+/* Whether a layer shows something wherever it is sampled for a cell: for every second pixel in x and y that it covers.
+   Of a cell that it does not cover that says nothing. */
 __kernel void seam_shown(__global const float4 *layer, /* (box.w, box.z) */
                          __global const float4 *field, /* the same */
                          int4 box, int4 border,        /* place on the working grid; working grid */
@@ -133,8 +137,14 @@ __kernel void seam_shown(__global const float4 *layer, /* (box.w, box.z) */
             const int at = box_index((int2)(x, y), box);
             if (at < 0 || layer[at].w == 0.0f)
                 continue;
-            const float2 there = layer_position((float2)(x + 0.5f, y + 0.5f), field[at].xyz, lonlat);
-            all_of_it = all_of_it && layer_sample(layer, box, there, border).w != 0.0f;
+            const float2 q = (float2)(x + 0.5f, y + 0.5f);
+            const float3 d = field[at].xyz;
+            float2 way = layer_position(q, d, lonlat) - q;
+            /* longitudes jump where they go once around */
+            way.x -= whole_turns(way.x, lonlat.y != 0.0f ? 2.0f * M_PI_F / lonlat.y : 0.0f);
+            const float length = ROOT(square2(way));
+            const float part = length > SEAM_BEYOND ? 1.0f - SEAM_BEYOND / length : 0.0f;
+            all_of_it = all_of_it && layer_sample(layer, box, layer_position(q, part * d, lonlat), border).w != 0.0f;
         }
     shown[cy * cells.x + cx] = all_of_it;
 }

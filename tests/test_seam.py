@@ -183,29 +183,32 @@ def test_what_is_shown_equals_its_twin(device: Device, name: str) -> None:
     assert (out.get() != expected).mean() < 0.02
 
 
-def test_nothing_is_taken_from_beyond_a_border(device: Device) -> None:
-    """Two layers, of which the second one begins at column 20 and is displaced by up to 12 px to the left
-    there: it cannot be taken from cells that would show what is beyond, unless the first one ends before.
+@pytest.mark.parametrize(
+    ("ends", "first", "moved"), [(80, 8, -12), (28, 7, -12), (80, 5, -0.4), (80, 6, -0.6)]
+)
+def test_nothing_is_taken_from_beyond_a_border(device: Device, ends: int, first: int, moved: float) -> None:
+    """Two layers, of which the second one begins at column 20 and is displaced to the left there: it cannot
+    be taken from cells that would show what is beyond, unless the first one ends before, or by less than
+    half a pixel.
     """
     grid = plane(80, 24)
     cells = grid.coarser(4)
-    for ends, first in ((80, 8), (28, 7)):
-        masks = np.zeros((2, *grid.shape), bool)
-        masks[0, :, :ends] = masks[1, :, 20:] = True
-        layers, fields = [], []
-        for mask, left, width in zip(masks, (0, 20), (80, 60), strict=True):
-            box = (left, 0, width, 24)
-            pixels = np.ones((24, width, 4), np.float32) * mask[:, left : left + width, None]
-            field = np.zeros((24, width, 4), np.float32)
-            if left:
-                field[..., 0] = -12
-            layers.append(SimpleNamespace(box=box, pixels=device.upload(pixels)))
-            fields.append(device.upload(field))
-        scene = Scene(device, layers, [Pair(0, 1)], fields, SimpleNamespace(host=masks), grid)
-        shown = seam._shown(scene, cells)
-        assert shown.shape == (2, 6, 20)
-        assert np.array_equal(shown[0], np.broadcast_to(np.arange(20) < ends // 4, (6, 20)))
-        assert np.array_equal(shown[1], np.broadcast_to(np.arange(20) >= first, (6, 20)))
+    masks = np.zeros((2, *grid.shape), bool)
+    masks[0, :, :ends] = masks[1, :, 20:] = True
+    layers, fields = [], []
+    for mask, left, width in zip(masks, (0, 20), (80, 60), strict=True):
+        box = (left, 0, width, 24)
+        pixels = np.ones((24, width, 4), np.float32) * mask[:, left : left + width, None]
+        field = np.zeros((24, width, 4), np.float32)
+        if left:
+            field[..., 0] = moved
+        layers.append(SimpleNamespace(box=box, pixels=device.upload(pixels)))
+        fields.append(device.upload(field))
+    scene = Scene(device, layers, [Pair(0, 1)], fields, SimpleNamespace(host=masks), grid)
+    shown = seam._shown(scene, cells)
+    assert shown.shape == (2, 6, 20)
+    assert np.array_equal(shown[0], np.broadcast_to(np.arange(20) < ends // 4, (6, 20)))
+    assert np.array_equal(shown[1], np.broadcast_to(np.arange(20) >= first, (6, 20)))
 
 
 @pytest.mark.parametrize("place", [(0, 0, 60, 40), (11, 7, 31, 23), (29, 0, 31, 40)])

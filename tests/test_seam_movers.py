@@ -10,6 +10,7 @@ import pytest
 from grids import on_device, plane
 from hypothesis import given
 from labels import alike, energies, label, many, problems
+from test_seam import whole_layer
 
 from hugin_abflow import coefficient, labelling, regions, seam
 from hugin_abflow.colour import Correction
@@ -179,7 +180,7 @@ def owners(device: Device, told: np.ndarray, residual: np.ndarray, turn: int = 0
             device, [SimpleNamespace(box=(0, 0, 240, 96))] * 2, [],
             [device.upload(field, np.float32) for field in fields], SimpleNamespace(host=covers), grid,
         ),
-        Residuals(residual, residual, told), region, seam.seam_grid(grid), seam._CUT,
+        Residuals(residual, residual, told), region, seam.seam_grid(grid), covers, seam._CUT,
     )  # fmt: skip
     choice = replace(choice, whole_factor=seam._SINGLE_FACTOR * region)
     return np.roll(choice.owners()[0], -turn, 1)
@@ -257,7 +258,7 @@ def test_one_layer_may_cost_more_where_something_moved(
     residual = np.where(region, 0.3, 0.0)
     residual[:, 14:16] = 0
     masks = SimpleNamespace(host=np.ones((2, 12, 30), bool))
-    scene = Scene(device, [SimpleNamespace(box=(0, 0, 240, 96))] * 2, [], fields, masks, grid)
+    scene = Scene(device, [whole_layer(device, 240, 96)] * 2, [], fields, masks, grid)
     found, _ = seam.cut(scene, Residuals(residual, residual), region, once)
     assert len(seen) == 1
     assert (len(np.unique(found[region])) == 2) == cut

@@ -10,6 +10,8 @@ from reference.common import (
     Array,
     Numbers,
     bilinear,
+    canvas_point,
+    canvas_position,
     cell_parts,
     layer_look,
     layer_seen,
@@ -97,6 +99,9 @@ def seam_weights(field: Array, box: Sequence[int], rows: Array, columns: Array) 
     return weights[np.ix_(rows, columns)]
 
 
+BEYOND = 0.5
+
+
 def seam_shown(
     layer: Array,
     field: Array,
@@ -106,9 +111,17 @@ def seam_shown(
     cells: Sequence[int],
 ) -> Array:
     """The cells (height, width) of which every second pixel that the layer covers is sampled where it shows
-    something."""
+    something, but for half a pixel."""
     columns, rows = pixels(box[2], box[3], box[0], box[1])
-    ends = (layer[..., 3] > 0) & (layer_seen(layer, field, box, columns, rows, border, lonlat)[..., 3] == 0)
+    points = canvas_point(columns + 0.5, rows + 0.5, lonlat) + field[..., :3]
+    x, y = canvas_position(points, lonlat)
+    around = 2 * np.pi / lonlat[1] if lonlat[1] else np.inf
+    across = x - columns - 0.5
+    across -= np.rint(across / around) * around if lonlat[1] else 0
+    length = np.hypot(across, y - rows - 0.5)
+    part = np.maximum(1 - BEYOND / np.maximum(length, 1e-9), 0)[..., None]
+    shorter = np.concatenate([part * field[..., :3], field[..., 3:]], -1).astype(np.float32)
+    ends = (layer[..., 3] > 0) & (layer_seen(layer, shorter, box, columns, rows, border, lonlat)[..., 3] == 0)
     beyond = np.zeros((border[1], border[0]), bool)
     beyond[on_box(box)] = ends
     result = np.ones((cells[1], cells[0]), bool)
