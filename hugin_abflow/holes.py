@@ -70,7 +70,7 @@ class Coverage:
                 "what two photos include is left out of both",
                 "a hole" if len(found) == 1 else f"{len(found)} holes, the largest",
                 every * (hole.right - hole.left), every * (hole.bottom - hole.top),
-                self._crop.left + every * hole.left, self._crop.top + every * hole.top,
+                self._crop.left + every * hole.left % self._crop.width, self._crop.top + every * hole.top,
             )  # fmt: skip
 
     def _shows_a_pole(self, hole: Hole) -> bool:
@@ -89,7 +89,7 @@ def holes(covered: npt.NDArray[np.bool_], wraps: bool) -> list[Hole]:
     """What is not covered and does not reach the border, but for slits of less than three pixels.
 
     covered     (height, width); wraps: whether its columns are periodic. Of a hole that lies across the
-                border of such columns the right end is beyond the width.
+                border of such columns the right end is beyond the width, of one that begins there both are.
     """
     if covered.all():
         return []
@@ -102,7 +102,7 @@ def holes(covered: npt.NDArray[np.bool_], wraps: bool) -> list[Hole]:
     found = []
     for number, (rows, columns) in enumerate(scipy.ndimage.find_objects(labels), 1):
         inside = rows.start > 0 and rows.stop < height and columns.start > 0 and columns.stop < width
-        if inside and columns.start - 1 < covered.shape[1]:
+        if inside and columns.start - 1 <= covered.shape[1]:  # others are there twice
             box = columns.start - 1, rows.start - 1, columns.stop + 1, rows.stop + 1
             found.append(Hole(*box, int(sizes[number])))
     return found

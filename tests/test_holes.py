@@ -61,6 +61,8 @@ def test_a_hole_across_the_border_of_columns_that_wrap_is_one() -> None:
     assert not holes(gap, wraps=False)
     assert boxes(holes(gap, wraps=True)) == [(170, 20, 191, 40)]
     assert boxes(holes(covered(np.s_[20:40, 50:80]), wraps=True)) == [(50, 20, 80, 40)]
+    for left, right, found in ((0, 9, [181]), (1, 9, [1]), (172, 181, [172])):
+        assert [one.left for one in holes(covered(np.s_[20:40, left:right]), wraps=True)] == found
     assert not holes(covered(np.s_[20:40]), wraps=True)  # all around: two panoramas
 
 
@@ -83,6 +85,8 @@ def test_nothing_is_told_of_the_ground_below_a_tripod(caplog: pytest.LogCaptureF
     assert not told(canvas, mask, caplog)
     mask[40:60, :9] = mask[40:60, 171:] = False
     assert "a hole of about 18 x 20 px at (171, 40)" in told(canvas, mask, caplog)
+    mask[40:60, 171:] = True
+    assert "a hole of about 9 x 20 px at (0, 40)" in told(canvas, mask, caplog)
     mask[:] = False
     assert "wholly transparent" in told(canvas, mask, caplog)
 
