@@ -18,7 +18,7 @@ from hugin_abflow.project import read_plan
 def as_nobody(nona, tmp_path, monkeypatch):
     """Have nona read no more than it may: to root nothing is forbidden."""
     if os.name == "nt":
-        pytest.skip("Windows has other permissions")
+        pytest.skip("Windows has other permissions")  # modes and root are those of POSIX
     if os.geteuid() == 0:
         folder = tmp_path / "bin"
         folder.mkdir()
