@@ -293,16 +293,16 @@ class ImageWriter:
 
     def _discard(self) -> None:
         """Close and remove what is not finished; nothing is left of it after `_finish`."""
-        tiff, self._tiff = self._tiff, None
-        if tiff:
-            tiff.abandon()
-        output, self._output = self._output, None
-        if output is not None:
-            with contextlib.suppress(OSError):
-                os.truncate(self._part, 0)  # room for the blanks that complete a JPEG
-            with contextlib.suppress(RuntimeError):
-                output.close()
-        self._scratch.close()
+        with self._scratch:  # removes the file, whatever fails before
+            tiff, self._tiff = self._tiff, None
+            if tiff:
+                tiff.abandon()
+            output, self._output = self._output, None
+            if output is not None:
+                with contextlib.suppress(OSError):
+                    os.truncate(self._part, 0)  # room for the blanks that complete a JPEG
+                with contextlib.suppress(RuntimeError):
+                    output.close()
 
     def _failure(self, why: str) -> OutputError:
         reason = (why.strip() or "no reason given").splitlines()[0]  # PNG's writer adds a line for each block

@@ -10,6 +10,7 @@ import queue
 import threading
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import suppress
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -159,8 +160,9 @@ class TiffWriter:
         """End at once; the file is no good."""
         self._encoders.shutdown(wait=False, cancel_futures=True)
         self._error = self._error or RuntimeError("given up")
-        while not self._strips.empty():
-            self._strips.get_nowait()
+        with suppress(queue.Empty):  # asked beforehand, it may be emptied by the thread meanwhile
+            while True:
+                self._strips.get_nowait()
         self._end()
 
     def _end(self) -> None:

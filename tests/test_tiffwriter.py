@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import queue
 import threading
 
 import numpy as np
@@ -67,6 +68,32 @@ def test_what_fails_in_the_background_is_told(tmp_path, monkeypatch):
     with pytest.raises(OutputError, match=r"a\.tif cannot be written: No space left on device"), writer:
         for _ in range(100):
             writer.write_rows(noise(np.uint8))
+    assert not list(tmp_path.iterdir())
+
+
+def test_thread_may_take_the_last_strip_while_it_is_given_up(tmp_path, monkeypatch):
+    """The caller's error is told, not that the queue became empty after it was asked whether it is."""
+    monkeypatch.setattr(queue.Queue, "empty", lambda strips: False)
+    with (
+        pytest.raises(ValueError, match="the caller's"),
+        ImageWriter(tmp_path / "a.tif", 131, 77, 3, np.uint8),
+    ):
+        raise ValueError("the caller's")
+    assert not list(tmp_path.iterdir())
+
+
+def test_what_fails_while_it_is_given_up_leaves_nothing(tmp_path, monkeypatch):
+    abandon = tiffwriter.TiffWriter.abandon
+
+    def fail(writer):
+        abandon(writer)
+        raise RuntimeError("cannot end a thread")
+
+    monkeypatch.setattr(tiffwriter.TiffWriter, "abandon", fail)
+    writer = ImageWriter(tmp_path / "a.tif", 131, 77, 3, np.uint8)
+    with pytest.raises(RuntimeError, match="cannot end") as error, writer:
+        raise ValueError("the caller's")
+    assert isinstance(error.value.__context__, ValueError)
     assert not list(tmp_path.iterdir())
 
 
