@@ -17,6 +17,7 @@ from hugin_abflow.batch import pool, worker
 from hugin_abflow.batch.pool import ATTEMPTS, Pool
 from hugin_abflow.batch.record import Record
 from hugin_abflow.batch.task import Task
+from hugin_abflow.batch.task import perform as perform_alone
 from hugin_abflow.errors import ExitCode
 from hugin_abflow.opencl import Device
 from hugin_abflow.settings import Settings
@@ -206,6 +207,31 @@ def test_one_project_at_a_time_computes_on_a_graphics_card(
     turns = [who for who, _ in groupby(computing, key=lambda event: event[0])]
     if card:
         assert sorted(turns) == sorted(set(turns)) and set(turns) >= set("abd")
+
+
+@pytest.mark.parametrize("method", ["joint", "sequential"])
+def test_every_phase_but_those_before_it_computes_has_a_turn(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, method: str
+) -> None:
+    class Turn:
+        held = False
+
+        def take(self) -> None:
+            self.held = True
+
+        def give_back(self) -> None:
+            self.held = False
+
+    class Watcher(Ear):
+        def phase_began(self, name: str, total: int) -> None:
+            (with_turn if turn.held else without).add(name)
+
+    turn, with_turn, without = Turn(), set[str](), set[str]()
+    monkeypatch.setattr(Device, "kind", "GPU")
+    (todo,) = tasks_in(tmp_path, "a", settings=Settings(merge=method))
+    assert perform_alone(todo, Watcher(), turn=turn).result == "made"
+    assert without <= {"remap", "read"} and with_turn >= {"flow", "align", "blend"}
+    assert not turn.held
 
 
 def test_turn_of_a_dead_process_goes_to_the_next(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -28,8 +28,9 @@ from hugin_abflow.terminal import explain, is_bug, messages
 
 _log = logging.getLogger(__name__)
 
-# Phases that keep the device busy, up to the last; before them layers are remapped and decoded.
-_COMPUTING = ("flow", "align", "blend")
+# Phases that keep the device busy, up to the last; before them layers are remapped and decoded. "merge" is
+# that of --merge sequential: all of its merges but the last, whose own phases it does not tell.
+_COMPUTING = ("merge", "flow", "align", "blend")
 
 
 @dataclass(frozen=True)
