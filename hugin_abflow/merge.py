@@ -132,7 +132,9 @@ def write_panorama(
         threads=settings.cores,
     ) as writer:  # fmt: skip
         _report(canvas, projection, layers, writer)
-        _write(writer, _bands(layers, canvas, settings, progress, guides(), method, open_device))
+        # where writing fails, what was opened is closed now, not when the error is forgotten
+        with closing(_bands(layers, canvas, settings, progress, guides(), method, open_device)) as bands:
+            _write(writer, bands)
 
 
 def _depth(target: Path, layer: Layer, wanted: npt.DTypeLike | None) -> npt.DTypeLike:
@@ -179,7 +181,7 @@ def _bands(
     guides: Sequence[Guide],
     method: Method | None = None,
     open_device: OpenDevice | None = None,
-) -> Iterator[npt.NDArray[Any]]:
+) -> Generator[npt.NDArray[Any], None, None]:
     """The panorama's rows from top to bottom."""
     use_threads(settings.cores)
     device = (open_device or kept_device)(settings.device, settings.threads)

@@ -17,11 +17,12 @@ from hugin_abflow.errors import (
     GuideError,
     LayersMismatchError,
     LayersMissingError,
+    OutputError,
 )
 from hugin_abflow.guides import Guide
-from hugin_abflow.images import read_layer
+from hugin_abflow.images import ImageWriter, read_layer
 from hugin_abflow.layer import Box, Canvas, Layer
-from hugin_abflow.merge import merge_layers, merge_project
+from hugin_abflow.merge import merge_layers, merge_project, write_panorama
 from hugin_abflow.project import read_plan
 from hugin_abflow.settings import Settings
 
@@ -384,6 +385,31 @@ def test_memory_too_small_for_the_smallest_band_is_an_error(small_memory, monkey
     monkeypatch.setattr(blend, "_bands", too_small)
     with pytest.raises(DeviceError, match="no memory for a band"):
         merged(with_parallax(CANVASES["plane"]), CANVASES["plane"])
+
+
+# What fails
+
+
+def test_nothing_is_open_any_more_when_the_file_cannot_be_written(monkeypatch, tmp_path):
+    """While the error is handled, and so holds all frames: the folder of the layers goes next."""
+    closed = []
+
+    def bands(*arguments):
+        try:
+            while True:
+                yield np.zeros((1, WIDTH, 4), np.uint8)
+        finally:
+            closed.append(True)
+
+    def full(writer, rows):
+        raise OutputError("no space")
+
+    monkeypatch.setattr(ImageWriter, "write_rows", full)
+    layers = [Layer.from_array("a", noise(HEIGHT, WIDTH), 0, 0)]
+    with pytest.raises(OutputError, match="no space") as error:
+        write_panorama(tmp_path / "a.tif", layers, CANVASES["plane"], Settings(), projection="", method=bands)
+    assert error.tb and closed
+    assert not list(tmp_path.iterdir())
 
 
 # The engine is ours
