@@ -8,6 +8,7 @@ from __future__ import annotations
 import contextlib
 import errno
 import logging
+import math
 import os
 import shutil
 from collections.abc import Iterator
@@ -58,11 +59,10 @@ _KNOWN = {
 }  # fmt: skip
 _PNG_LEVEL = 4  # twice as fast as zlib's usual 6 for 2 % more bytes
 _JPEG_LIMIT = 65500  # pixels a side, of libjpeg
-_JPEG_WORST, _JPEG_LEAST = 2, 1 << 16  # bytes that noise takes for each sample, and a file beside them
+_JPEG_LEAST = 1 << 16  # bytes of a JPEG beside its samples
 _JPEG_BLANK = 1 / 64  # bytes that nothing takes for each sample
 _CLASSIC_LIMIT = 0xFFFFFFFF - (16 << 20)  # bytes of a classic TIFF, with room for tags and metadata
 _OVERSHOOT = 1.2  # of white, beside edges that were sampled by cubic and longer filters
-_LZW_WORST = 1.5  # LZW codes of up to 12 bits may stand for a byte each
 
 
 class ImageWriter:
@@ -185,11 +185,11 @@ class ImageWriter:
         if self.format == "tiff":
             shape = self.height, self.width, self.channels + 1
             compression, _, quality = self.compression.partition(":")
-            worst = _LZW_WORST if self.compression == "lzw" else 1.01
+            worst = tiffwriter.worst_case(compression, int(quality or 0))
             self._tiff = tiffwriter.TiffWriter(
                 self._part, shape, self.stored, compression=compression,
                 quality=int(quality or 0), offset=self._offset, icc=self._icc, threads=self._threads,
-                big=int(np.prod(shape)) * self.stored.itemsize * worst > _CLASSIC_LIMIT,
+                big=math.prod(shape) * self.stored.itemsize * worst > _CLASSIC_LIMIT,
             )  # fmt: skip
             return ""
         if self.format == "jpeg":
@@ -255,7 +255,7 @@ class ImageWriter:
         samples     that are written next. OpenImageIO completes with blanks what is closed before its end.
         """
         blank = _JPEG_BLANK * self.width * (self.height - self._done) * self.channels
-        needed = _JPEG_WORST * samples + blank + _JPEG_LEAST
+        needed = tiffwriter.worst_case("jpeg", 100) * samples + blank + _JPEG_LEAST
         disk = shutil.disk_usage(self._part.parent)
         if disk.total and disk.free < needed:  # some network folders say 0 of 0
             raise self._failure(os.strerror(errno.ENOSPC))

@@ -31,10 +31,27 @@ COMPRESSIONS = {
     "zstd": "zstd",
     "jpeg": "jpeg",
 }
+# Bytes that noise takes for each byte of pixels, at most.
+_WORST = {
+    "none": 1.0,
+    "packbits": 1.01,  # a byte in front of 128
+    "lzw": 1.5,  # codes of up to 12 bits may stand for a byte each
+    "deflate": 1.01,  # blocks that do not shrink are stored, as are zstd's
+    "zstd": 1.01,
+    "jpeg": 2.0,  # 1.9 for noise of black and white at a quality of 100
+}
+_MODEST = 90  # quality of JPEG up to which it is at most 1
 _PREDICTED = {"lzw", "deflate", "zstd"}
 _ROWS = 32  # of a strip
 _DEFLATE_LEVEL, _ZSTD_LEVEL = 6, 3
 _WAIT = 0.2  # seconds after which a waiting thread looks whether the other is still there
+
+
+def worst_case(compression: str, quality: int) -> float:
+    """Bytes that a byte of pixels may take: before the first strip is made, it is decided whether a file may
+    become too large for a classic TIFF. quality: of JPEG, 1..100.
+    """
+    return 1.0 if compression == "jpeg" and quality <= _MODEST else _WORST[compression]
 
 
 def encode(rows: Pixels, compression: str, quality: int) -> bytes:

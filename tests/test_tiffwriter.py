@@ -10,7 +10,7 @@ import pytest
 import tifffile
 from conftest import noise, whole
 
-from hugin_abflow import tiffwriter
+from hugin_abflow import imagewriter, tiffwriter
 from hugin_abflow.errors import OutputError
 from hugin_abflow.images import ImageWriter, read_layer, write_image
 
@@ -55,6 +55,31 @@ def test_neither_threads_nor_bands_change_the_file(tmp_path, compression):
                 writer.write_rows(noise(np.uint8)[top : top + rows])
         files.add((tmp_path / "a.tif").read_bytes())
     assert len(files) == 1
+
+
+# bytes of a strip beside its pixels: JPEG's tables and marks
+TABLES = 700
+
+
+@pytest.mark.parametrize("quality", [90, 100])
+@pytest.mark.parametrize("compression", ["none", "packbits", "lzw", "deflate", "zstd", "jpeg"])
+@pytest.mark.parametrize("values", [2, 256])
+def test_noise_takes_no_more_than_the_worst_case(compression, values, quality):
+    """Else a panorama of nearly 4 GB is lost in its last moment; black and white noise is JPEG's worst."""
+    random = np.random.default_rng(0).integers(0, values, (32, 1001, 4))
+    rows = (random * (255 // (values - 1))).astype(np.uint8)
+    made = len(tiffwriter.encode(rows, compression, quality))
+    assert made <= tiffwriter.worst_case(compression, quality) * rows.nbytes + TABLES
+
+
+def test_jpeg_gets_room_for_noise(tmp_path, monkeypatch):
+    """At a quality of 100 it takes more than uncompressed; at the usual one the file stays a classic TIFF."""
+    limit = 1.2 * noise(np.uint8).nbytes
+    monkeypatch.setattr(imagewriter, "_CLASSIC_LIMIT", limit)
+    for quality, version in ((None, 42), (100, 43)):
+        write_image(tmp_path / "a.tif", noise(np.uint8), compression="jpeg", jpeg_quality=quality)
+        assert ((tmp_path / "a.tif").stat().st_size > limit) == (version == 43)
+        assert (tmp_path / "a.tif").read_bytes()[2] == version
 
 
 def test_what_fails_in_the_background_is_told(tmp_path, monkeypatch):
