@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import shlex
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
 from itertools import groupby
@@ -60,10 +60,13 @@ def stitch_project(
     metadata: bool = True,
     progress: Progress = silent,
     open_device: OpenDevice | None = None,
+    finished: Callable[[Path], None] = lambda file: None,
 ) -> list[Path]:
     """Make all outputs that are checked in Hugin for a project; returns their files, beside it.
 
     With `output`, `prefix` or `layers`: the one panorama of `merge.merge_project`, whose arguments these are.
+
+    finished        is told each file when it is complete, so that it is known where a later one fails.
 
     Outputs whose programs are not installed are left out, with a warning. Each file appears when it is
     complete; one that fails ends the run, and what was made before stays. Raises the `AbflowError` family,
@@ -73,23 +76,30 @@ def stitch_project(
         merge_project, path, settings, output=output, prefix=prefix, layers=layers, compression=compression,
         jpeg_quality=jpeg_quality, metadata=metadata, progress=progress, open_device=open_device,
     )  # fmt: skip
-    if output or prefix or layers:
-        return [one(remap=remap, keep_layers=keep_layers)]
     made: list[Path] = []
+
+    def finish(*files: Path) -> None:
+        for file in files:
+            made.append(file)
+            finished(file)
+
+    if output or prefix or layers:
+        finish(one(remap=remap, keep_layers=keep_layers))
+        return made
     for branch in _branches(read_plan(path)):
         if Kind.LAYERS in branch.kinds:
             with open_layers(branch.plan, remap=remap, keep_layers=True, progress=progress) as opened:
-                made += _files(opened)
+                finish(*_files(opened))
         if Kind.PANORAMA in branch.kinds:
             # layers that were kept just now are not made again
             again: Remap = "auto" if made and remap == "always" else remap
-            made.append(one(remap=again, keep_layers=keep_layers))
+            finish(one(remap=again, keep_layers=keep_layers))
         if branch.plan.hdr or branch.plan.ignore_exposure:
             stored = _stored(branch.plan, compression, jpeg_quality)
             maker = _Maker(
-                replace(branch, plan=stored), settings or Settings(), metadata, progress, open_device
+                replace(branch, plan=stored), settings or Settings(), metadata, progress, open_device, finish
             )
-            made += maker.make(remap, keep_layers)
+            maker.make(remap, keep_layers)
     return made
 
 
@@ -241,13 +251,14 @@ class _Maker:
         metadata: bool,
         progress: Progress,
         open_device: OpenDevice | None,
+        finish: Callable[..., None],
     ) -> None:
         self.branch, self.plan, self.settings = branch, branch.plan, settings
         self.metadata = describe(branch.plan) if metadata else None
-        self.progress, self.open_device = progress, open_device
+        self.progress, self.open_device, self.finish = progress, open_device, finish
 
-    def make(self, remap: Remap, keep_layers: bool) -> list[Path]:
-        """Make the layers, if need be, then all that is made of them; gives the outputs."""
+    def make(self, remap: Remap, keep_layers: bool) -> None:
+        """Make the layers, if need be, then all that is made of them; `finish` is told the outputs."""
         keep = keep_layers or self.branch.keeps_layers
         remap = _remap(self.plan, remap)
         with (
@@ -257,20 +268,18 @@ class _Maker:
             images = _images(self.plan, opened)
             names = [self.branch.layer(image) for image in images]
             files = dict(zip(names, _files(opened), strict=True))
-            made = _files(opened) if self.branch.keeps_layers else []
+            if self.branch.keeps_layers:
+                self.finish(*_files(opened))
             for program, steps in groupby(self.branch.steps(images), key=lambda step: step.program):
                 if program == BLEND:
                     for step in steps:
                         files[step.result] = self._blend(step, files, scratch)
-                        made += [files[step.result]] if step.wanted else []
                     continue
                 todo = list(steps)
                 with self.progress(program, len(todo)) as advance:
                     for step in todo:
                         files[step.result] = self._run(step, files, scratch)
-                        made += [files[step.result]] if step.wanted else []
                         advance(1)
-        return made
 
     def _target(self, step: Step, files: dict[str, Path], scratch: Path) -> Path:
         """Where the result goes, which must be none of the inputs."""
@@ -287,6 +296,7 @@ class _Maker:
             if self.metadata:
                 embed(result, ENDINGS[result.suffix], self.metadata)
             move_whole(result, target, "free the folder")
+            self.finish(target)
         return target
 
     def _blend(self, step: Step, files: dict[str, Path], scratch: Path) -> Path:
@@ -303,4 +313,6 @@ class _Maker:
             metadata=self.metadata if step.wanted else None,
             progress=self.progress, open_device=self.open_device,
         )  # fmt: skip
+        if step.wanted:
+            self.finish(target)
         return target

@@ -97,7 +97,9 @@ def replace(monkeypatch: pytest.MonkeyPatch) -> Callable[[Merge], None]:
     """Put a function in the place of `stitch_project`, for one output; all is made in this process then."""
 
     def put(merge: Merge) -> None:
-        monkeypatch.setattr(task, "stitch_project", lambda path, **keywords: [merge(path, **keywords)])
+        monkeypatch.setattr(
+            task, "stitch_project", lambda path, finished, **keywords: finished(merge(path, **keywords))
+        )
         monkeypatch.setattr(run, "Pool", lambda jobs, *rest: pool.Alone(*rest))
         monkeypatch.setattr(run, "Cluster", lambda scheduler, *rest: pool.Alone(*rest))
 

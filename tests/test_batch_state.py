@@ -53,7 +53,9 @@ def make(shoot: Path, monkeypatch: pytest.MonkeyPatch) -> Make:
         tifffile.imwrite(target, pixels, photometric="rgb", extrasamples=["unassalpha"])
         return target
 
-    monkeypatch.setattr(task, "stitch_project", lambda path, **keywords: [merge(path, **keywords)])
+    monkeypatch.setattr(
+        task, "stitch_project", lambda path, finished, **keywords: finished(merge(path, **keywords))
+    )
 
     def run(folder: Path = shoot, resume: bool = True, **options: object) -> Record:
         keywords = {"settings": Settings(), "output": None, "remap": "auto"} | options

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import shlex
 import subprocess
@@ -217,6 +218,21 @@ def test_program_that_fails_leaves_nothing(
     with pytest.raises(ProgramFailedError, match=r"enfuse failed \(exit code 1\).*\n  no such mask"):
         stitch_project(project)
     assert names_in(project.parent) == before
+
+
+def test_what_was_made_before_a_failure_is_told(
+    make_project: ProjectMaker, no_enfuse: Path, tmp_path: Path, capsys
+) -> None:
+    project = stacked(make_project(panorama=CANVAS), asked(Kind.PANORAMA, Kind.FUSED_STACKS))
+    enfuse, report = no_enfuse / "enfuse", tmp_path / "report.json"
+    enfuse.write_text("#!/bin/sh\nexit 1\n")
+    enfuse.chmod(0o755)
+    assert cli.main(["--report", str(report), str(project)]) == ExitCode.PROGRAM
+    panorama = project.with_suffix(".tif")
+    assert capsys.readouterr().out == f"{panorama}\n"
+    (record,) = json.loads(report.read_text("utf-8"))["projects"]
+    assert record["result"] == "failed"
+    assert record["outputs"] == [{"file": str(panorama), "bytes": panorama.stat().st_size}]
 
 
 def test_compression_that_enfuse_does_not_know(make_project: ProjectMaker, caplog) -> None:

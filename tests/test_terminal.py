@@ -109,7 +109,7 @@ from pathlib import Path
 from hugin_abflow import __main__
 from hugin_abflow.batch import pool, run, task
 {merge}
-task.stitch_project = lambda path, **keywords: [merge(path, **keywords)]
+task.stitch_project = lambda path, finished, **keywords: finished(merge(path, **keywords))
 run.Pool = lambda jobs, *rest: pool.Alone(*rest)
 sys.exit(__main__.main())
 """

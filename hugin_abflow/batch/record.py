@@ -20,7 +20,7 @@ class Record:
 
     project     its file, absolute.
     result      "made", "skipped" (what was made before still holds) or "failed".
-    outputs     the files that were made, with "file" and "bytes".
+    outputs     the files that were made, with "file" and "bytes"; of a failed one those before the failure.
     inputs      the project, its photos, and layers that were there before, as `outputs`.
     message     what went wrong and what to do; empty if nothing.
     exit_code   what a run of this project alone ends with.

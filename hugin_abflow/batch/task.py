@@ -149,11 +149,15 @@ def _stitch(task: Task, record: Record, listener: Listener, turn: Turn | None) -
         if turn and phase == _COMPUTING[-1]:
             turn.give_back()  # what is left is to encode
 
-    made = stitch_project(
-        task.project, **task.options, progress=trace.phases(progress), open_device=open_device
-    )
-    record.outputs = _sizes(made)
-    record.result = "made"
+    made: list[Path] = []
+    try:
+        stitch_project(
+            task.project, **task.options,
+            progress=trace.phases(progress), open_device=open_device, finished=made.append,
+        )  # fmt: skip
+        record.result = "made"
+    finally:
+        record.outputs = _sizes(made)  # what comes before one that fails is there, too
 
 
 def settings_of(task: Task) -> dict[str, Any]:
