@@ -15,7 +15,7 @@ from io import SEEK_CUR, SEEK_END, BytesIO
 from pathlib import Path
 from typing import BinaryIO
 
-from hugin_abflow import tifftags
+from hugin_abflow import jpeg, tifftags
 from hugin_abflow.tifftags import ASCII, EXIF, GPS, MAIN, SHORT, UNDEFINED, Directories, Value
 
 _log = logging.getLogger(__name__)
@@ -23,7 +23,6 @@ _log = logging.getLogger(__name__)
 XMP_TAG = 700  # of TIFF
 _PNG = b"\x89PNG\r\n\x1a\n"
 _EXIF_MARK, _XMP_MARK = b"Exif\0\0", b"http://ns.adobe.com/xap/1.0/\0"  # of JPEG's APP1
-_SCAN, _APP0, _APP1 = 0xDA, 0xE0, 0xE1
 _LONGEST = 65533  # bytes of a JPEG segment
 _BLOCK = 16 << 20  # bytes that are moved at a time
 _NOT_IN_TIFF = (40962, 40963)  # PixelXDimension, PixelYDimension
@@ -112,7 +111,7 @@ def read_exif(path: Path) -> dict[int, dict[int, Value]]:
     try:
         with path.open("rb") as file:
             mark = file.read(8)
-            if mark[:2] == b"\xff\xd8":
+            if mark[:2] == jpeg.START:
                 block = _find_in_jpeg(file)
             elif mark == _PNG:
                 block = _find_in_png(file)
@@ -125,18 +124,11 @@ def read_exif(path: Path) -> dict[int, dict[int, Value]]:
 
 
 def _find_in_jpeg(file: BinaryIO) -> bytes:
-    """The EXIF block of a JPEG file."""
-    file.seek(2)
-    while True:
-        mark, kind = struct.unpack(">BB", file.read(2))
-        while mark == kind == 0xFF:  # any number of bytes may fill up what is before a segment
-            (kind,) = struct.unpack(">B", file.read(1))
-        if mark != 0xFF or kind == _SCAN:
-            return b""
-        (length,) = struct.unpack(">H", file.read(2))
-        content = file.read(length - 2)
-        if kind == _APP1 and content.startswith(_EXIF_MARK):
+    """The EXIF block of a JPEG file, behind which the file is then."""
+    for kind, content in jpeg.segments(file):
+        if kind == jpeg.APP1 and content.startswith(_EXIF_MARK):
             return content[len(_EXIF_MARK) :]
+    return b""
 
 
 def _find_in_png(file: BinaryIO, wanted: bytes = b"eXIf") -> bytes:
@@ -188,7 +180,9 @@ def _insert_in_jpeg(path: Path, metadata: Metadata) -> None:
     if left_out:
         _log.warning("left out of the panorama, as too long for JPEG: %s", ", ".join(left_out))
     segments = b"".join(
-        struct.pack(">BBH", 0xFF, _APP1, len(content) + 2) + content for content in (block, xmp) if content
+        struct.pack(">BBH", 0xFF, jpeg.APP1, len(content) + 2) + content
+        for content in (block, xmp)
+        if content
     )
     with path.open("r+b") as file:
         empty = len(_find_in_jpeg(file))
@@ -196,7 +190,7 @@ def _insert_in_jpeg(path: Path, metadata: Metadata) -> None:
         if not empty:
             file.seek(2)
             mark, kind, length = struct.unpack(">BBH", file.read(4))
-            file.seek(2 + (2 + length if (mark, kind) == (0xFF, _APP0) else 0))
+            file.seek(2 + (2 + length if (mark, kind) == (0xFF, jpeg.APP0) else 0))
         _insert(file, file.tell() - replaced, segments, replaced)
 
 

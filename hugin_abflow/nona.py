@@ -39,6 +39,7 @@ from hugin_abflow.found import (
 )
 from hugin_abflow.images import image_size, read_layers
 from hugin_abflow.imagewriter import named_in_unicode
+from hugin_abflow.jpeg import is_cut
 from hugin_abflow.layer import Layer, check_layers, other_canvas
 from hugin_abflow.programs import move_whole, stop
 from hugin_abflow.progress import Progress, silent
@@ -54,8 +55,6 @@ _LOADING = "loading "  # and at its beginning
 # be missing: some cameras leave out no more than the mark of the end.
 _LOSS, _CUT = ": Read error on ", "Premature end of JPEG file"
 _DOUBTS = (_CUT, "Corrupt JPEG data")
-# A JPEG file's first bytes; any mark but restarts, which lie within what is coded; the mark of the end.
-_JPEG, _MARK, _END = b"\xff\xd8", re.compile(rb"\xff([^\x00\xff\xd0-\xd7])", re.DOTALL), 0xD9
 _INSTALL = (
     "nona is not in PATH; install Hugin (Debian, Ubuntu: apt install hugin-tools; Fedora: dnf install hugin; "
     "macOS, Windows: put the folder of Hugin's programs into PATH)"
@@ -311,29 +310,11 @@ def _run(
             raise
     for doubt in sorted(doubts):
         # libjpeg names no file, and what it says overtakes what nona does
-        cut = [str(image.photo) for image in images if doubt.startswith(_CUT) and _is_cut(image.photo)]
+        cut = [str(image.photo) for image in images if doubt.startswith(_CUT) and is_cut(image.photo)]
         log.warning(
             "%s may be damaged (%s); look at the panorama", ", ".join(cut) or "one of the photos", doubt
         )
     return process.returncode, list(lines)
-
-
-def _is_cut(photo: Path) -> bool:
-    """Whether a JPEG file ends before the mark of its image's end; there may be other things behind that."""
-    try:
-        with photo.open("rb") as file:
-            if file.read(2) != _JPEG:
-                return False
-            content = file.read()
-    except OSError:
-        return False
-    at = 0
-    while mark := _MARK.search(content, at):
-        if mark[1][0] == _END:
-            return False
-        length = int.from_bytes(content[mark.end() : mark.end() + 2])
-        at = mark.end() + length  # what is coded comes behind the last segment, up to the next mark
-    return True
 
 
 def remapping(plan: Plan, options: Sequence[str], prefix: str, project: str) -> list[str]:

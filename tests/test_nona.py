@@ -252,24 +252,6 @@ def test_photo_that_was_cut_is_told(make_project, nona, caplog):
         assert caplog.text.count("may be damaged") == 1  # no other photo, and not the project
 
 
-def test_a_jpeg_that_is_cut_is_known(tmp_path):
-    """Whatever comes behind it, and with a whole thumbnail in front; other files are none."""
-    _, image = cv2.imencode(".jpg", photo_pixels(1))
-    _, small = cv2.imencode(".jpg", photo_pixels(1)[::8, ::8])
-    whole, thumbnail = image.tobytes(), small.tobytes()
-    segment = b"\xff\xe1" + (len(thumbnail) + 2).to_bytes(2) + thumbnail
-    trailer = np.random.default_rng(1).integers(0, 256, 200_000, np.uint8).tobytes()
-    assert b"\xff\xda" in trailer
-    photo = tmp_path / "photo.jpg"
-    for content, cut in (
-        (whole, False), (whole[:-800], True), (whole[:2] + segment + whole[2:], False),
-        (whole[:2] + segment + whole[2:-800], True), (whole + trailer, False), (b"II*\0" + whole[:-9], False),
-    ):  # fmt: skip
-        photo.write_bytes(content)
-        assert program._is_cut(photo) == cut
-    assert not program._is_cut(tmp_path / "none.jpg")
-
-
 def test_photo_of_a_missing_layer_missing(make_project, nona):
     plan = read_plan(make_project())
     remap(plan, "pano")

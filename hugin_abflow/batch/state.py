@@ -20,6 +20,7 @@ from hugin_abflow.batch.record import Record, write_json
 from hugin_abflow.errors import AbflowError
 from hugin_abflow.found import layers_there
 from hugin_abflow.images import read_layers
+from hugin_abflow.jpeg import is_cut
 from hugin_abflow.metadata import version
 from hugin_abflow.outputs import checked_outputs, impossible, possible_outputs
 from hugin_abflow.project import read_plan
@@ -31,8 +32,6 @@ FOLDER = ".abflow"
 # Options that do not change the panorama, but how and where it is made.
 RESOURCES = frozenset({"device", "band_rows", "remap", "threads", "max_memory"})
 _ROWS = 256  # that are decoded at a time
-# Marks of JPEG (ITU-T T.81, B.1): how a file begins; of a scan, whose data has no other; of the end.
-_JPEG, _SCAN, _END = b"\xff\xd8", b"\xff\xda", b"\xff\xd9"
 
 Entry = dict[str, Any]
 
@@ -192,8 +191,8 @@ def _flush(file: Path) -> None:
 
 
 def _decodes(file: Path) -> bool:
-    """Whether an image can be decoded to its end. Raises OSError."""
-    if not _jpeg_ends(file):
+    """Whether an image can be decoded to its end."""
+    if is_cut(file):
         return False
     try:
         for layer in read_layers(file):
@@ -202,11 +201,3 @@ def _decodes(file: Path) -> bool:
     except AbflowError:
         return False
     return True
-
-
-def _jpeg_ends(file: Path) -> bool:
-    """Whether a JPEG file has the mark of its end after its last scan; true for other files. Decoders paint
-    grey what is missing, and are content. Raises OSError.
-    """
-    data = file.read_bytes()
-    return not data.startswith(_JPEG) or data.find(_END, data.rfind(_SCAN)) >= 0
