@@ -261,6 +261,20 @@ def test_failure_is_not_remembered(make: Make, shoot: Path, monkeypatch: pytest.
     assert not (shoot / ".abflow").exists()
 
 
+@pytest.mark.skipif(os.name == "nt", reason="Windows writes out only what is open for writing")
+def test_panorama_that_must_not_be_written_is_flushed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """One that replaces such a file keeps its permissions. Root may write it all the same."""
+    import fcntl  # Unix alone has it
+
+    flags: list[int] = []
+    monkeypatch.setattr(os, "fsync", lambda file: flags.append(fcntl.fcntl(file, fcntl.F_GETFL)))
+    (tmp_path / "a.tif").touch(0o444)
+    state._flush(tmp_path / "a.tif")
+    assert [flag & os.O_ACCMODE for flag in flags] == [os.O_RDONLY]
+
+
 def test_state_that_cannot_be_written_is_a_warning(make: Make, shoot: Path) -> None:
     (shoot / ".abflow").write_text("a file where the folder belongs")
     record = make()

@@ -186,7 +186,8 @@ def _digest(file: Path) -> str:
 
 def _flush(file: Path) -> None:
     """Have the system write a file to the disk, so that no power cut loses what is remembered as made."""
-    with file.open("rb+") as stream:
+    # for writing where it has to be; elsewhere that would refuse panoramas that are not to be written
+    with file.open("rb+" if os.name == "nt" else "rb") as stream:
         os.fsync(stream.fileno())
 
 
