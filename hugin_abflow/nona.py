@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import logging
-import os
 import re
 import shutil
-import signal
 import subprocess
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
@@ -25,6 +23,8 @@ from hugin_abflow.errors import (
     NonaMissingError,
     OutputError,
     PhotoMissingError,
+    ProgramFailedError,
+    ProgramMissingError,
     ProjectError,
     SettingsError,
 )
@@ -41,24 +41,19 @@ from hugin_abflow.images import image_size, read_layers
 from hugin_abflow.imagewriter import named_in_unicode
 from hugin_abflow.jpeg import is_cut
 from hugin_abflow.layer import Layer, check_layers, other_canvas
-from hugin_abflow.programs import move_whole, stop
+from hugin_abflow.programs import LAST_LINES, ending, last_lines, move_whole, started
 from hugin_abflow.progress import Progress, silent
 from hugin_abflow.project import Plan, PlannedImage, file_key
 from hugin_abflow.scratch import is_file, work_folder
 
 log = logging.getLogger("hugin_abflow.nona")
 
-_LAST_LINES = 8  # of nona's output, in the message of a failure
 _STEPS = ("remapping ", "saving ")  # what nona -v says at the end of a photo's loading and remapping
 _LOADING = "loading "  # and at its beginning
 # What libtiff and libjpeg say of a photo that nona remaps as if it were whole: pixels are missing; or may
 # be missing: some cameras leave out no more than the mark of the end.
 _LOSS, _CUT = ": Read error on ", "Premature end of JPEG file"
 _DOUBTS = (_CUT, "Corrupt JPEG data")
-_INSTALL = (
-    "nona is not in PATH; install Hugin (Debian, Ubuntu: apt install hugin-tools; Fedora: dnf install hugin; "
-    "macOS, Windows: put the folder of Hugin's programs into PATH)"
-)
 
 
 @contextmanager
@@ -273,23 +268,10 @@ def _run(
     Raises `ImageReadError` for a photo of which pixels are missing.
     """
     command = remapping(plan, options, _prefix(plan, folder), str(project))
-    log.info("%s", " ".join(command))
-    try:
-        process = subprocess.Popen(
-            command,
-            stdin=subprocess.DEVNULL,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.STDOUT,
-            text=True,
-            errors="replace",
-            env={**os.environ, "LANGUAGE": "en"},  # progress is read from the messages
-        )
-    except FileNotFoundError:
-        raise NonaMissingError(f"{_INSTALL}; or name layers that exist with --prefix or --layers") from None
-    lines: deque[str] = deque(maxlen=_LAST_LINES)
+    lines: deque[str] = deque(maxlen=LAST_LINES)
     photo, doubts = plan.file, set[str]()
-    with process:  # closes the pipe and waits
-        try:
+    try:
+        with started(command, stdin=subprocess.DEVNULL, stderr=subprocess.STDOUT) as process:
             assert process.stdout is not None
             for line in process.stdout:
                 if line.strip():
@@ -305,9 +287,10 @@ def _run(
                     )
                 elif any(mark in line for mark in _DOUBTS):
                     doubts.add(line.strip())
-        except BaseException:
-            stop(process)
-            raise
+    except ProgramMissingError as error:
+        raise NonaMissingError(f"{error}; or name layers that exist with --prefix or --layers") from None
+    except ProgramFailedError as error:
+        raise NonaFailedError(str(error)) from None
     for doubt in sorted(doubts):
         # libjpeg names no file, and what it says overtakes what nona does
         cut = [str(image.photo) for image in images if doubt.startswith(_CUT) and is_cut(image.photo)]
@@ -361,7 +344,7 @@ def _failure(
     plan: Plan, images: Sequence[PlannedImage], folder: Path, code: int, lines: list[str]
 ) -> AbflowError:
     """What to raise for a run of nona over `images` that failed; it does not always say which is to blame."""
-    said = "\n  ".join(lines) or "(nothing)"
+    said = last_lines(lines)
     for image in images:
         if any(f"Unable to open file '{name}'" in said for name in (image.name, image.photo)):
             return ImageReadError(f"{image.photo} cannot be opened; check its permissions")
@@ -382,11 +365,10 @@ def _failure(
                     f"{image.photo} has {size[0]}x{size[1]} pixels, in {plan.file} it has "
                     f"{wanted[0]}x{wanted[1]}; put that photo back, or align this one in Hugin"
                 )
-    how = f"was killed ({signal.Signals(-code).name})" if code < 0 else f"failed (exit code {code})"
     advice = f"it wrote into {folder.parent}, TMPDIR chooses another folder"
     if "bad_alloc" in said:
         advice = "it had not enough memory: close other programs, or make the panorama smaller in Hugin"
-    return NonaFailedError(f"nona {how} on {plan.file}; {advice}. Its last lines:\n  {said}")
+    return NonaFailedError(f"nona {ending(code)} on {plan.file}; {advice}. Its last lines:\n  {said}")
 
 
 def _refuse_to_keep(prefix: str) -> None:

@@ -6,9 +6,10 @@ import logging
 import os
 import shlex
 import shutil
+import signal
 import subprocess
-from collections.abc import Sequence
-from contextlib import suppress
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from hugin_abflow.errors import OutputError, ProgramFailedError, ProgramMissingError
@@ -16,10 +17,12 @@ from hugin_abflow.scratch import part_beside, put
 
 _log = logging.getLogger(__name__)
 
-_LAST_LINES = 8  # of a program's output, in the message of a failure
+LAST_LINES = 8  # of a program's output, in the message of a failure
 _KILL_SECONDS = 5.0
 # Where a program comes from on Debian and Ubuntu; elsewhere all of them come with Hugin.
-_PACKAGES = {"enfuse": "enfuse", "hugin_hdrmerge": "hugin-tools", "pano_trafo": "hugin-tools"}
+_PACKAGES = {
+    "enfuse": "enfuse", "hugin_hdrmerge": "hugin-tools", "nona": "hugin-tools", "pano_trafo": "hugin-tools",
+}  # fmt: skip
 
 
 def missing(program: str) -> str | None:
@@ -27,9 +30,49 @@ def missing(program: str) -> str | None:
     if shutil.which(program) is not None:
         return None
     return (
-        f"{program} is not in PATH; install Hugin (Debian, Ubuntu: apt install {_PACKAGES[program]}; macOS, "
-        "Windows: put the folder of Hugin's programs into PATH)"
+        f"{program} is not in PATH; install Hugin (Debian, Ubuntu: apt install {_PACKAGES[program]}; Fedora: "
+        "dnf install hugin; macOS, Windows: put the folder of Hugin's programs into PATH)"
     )
+
+
+@contextmanager
+def started(
+    command: Sequence[str],
+    folder: Path | None = None,
+    *,
+    stdin: int = subprocess.PIPE,
+    stderr: int = subprocess.PIPE,
+) -> Iterator[subprocess.Popen[str]]:
+    """A program that runs in a folder, and ends with the ``with`` block; it does not outlive an exception.
+
+    stdin, stderr   as `subprocess` has them; stdout is a pipe.
+
+    Raises `ProgramMissingError`, and `ProgramFailedError` if it cannot be run.
+    """
+    _log.info("%s", shlex.join(command))
+    try:
+        process = subprocess.Popen(
+            command,
+            cwd=folder,
+            stdin=stdin,
+            stdout=subprocess.PIPE,
+            stderr=stderr,
+            text=True,
+            errors="replace",
+            env={**os.environ, "LANGUAGE": "en"},  # what it says is read, and told
+        )
+    except FileNotFoundError:
+        raise ProgramMissingError(missing(command[0]) or f"{command[0]} cannot be run") from None
+    except OSError as error:
+        raise ProgramFailedError(
+            f"{command[0]} cannot be run: {error.strerror}; look at its file and at the folders in PATH"
+        ) from None
+    with process:  # closes the pipes and waits
+        try:
+            yield process
+        except BaseException:
+            _stop(process)
+            raise
 
 
 def run(command: Sequence[str], folder: Path, asked: str = "") -> str:
@@ -39,38 +82,26 @@ def run(command: Sequence[str], folder: Path, asked: str = "") -> str:
 
     It does not outlive an exception. Raises `ProgramMissingError`, `ProgramFailedError`.
     """
-    _log.info("%s", shlex.join(command))
-    try:
-        process = subprocess.Popen(
-            command,
-            cwd=folder,
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE,
-            text=True,
-            errors="replace",
-            env={**os.environ, "LANGUAGE": "en"},
-        )
-    except FileNotFoundError:
-        raise ProgramMissingError(missing(command[0]) or f"{command[0]} cannot be run") from None
-    except OSError as error:
-        raise ProgramFailedError(f"{command[0]} cannot be run: {error.strerror}") from None
-    with process:  # closes the pipes and waits
-        try:
-            answer, messages = process.communicate(asked)
-        except BaseException:
-            stop(process)
-            raise
+    with started(command, folder) as process:
+        answer, messages = process.communicate(asked)
     if process.returncode:
-        lines = [line.strip() for line in (messages or answer).splitlines() if line.strip()]
-        said = "\n  ".join(lines[-_LAST_LINES:]) or "(nothing)"
-        raise ProgramFailedError(
-            f"{command[0]} failed (exit code {process.returncode}). Its last lines:\n  {said}"
-        )
+        said = last_lines((messages or answer).splitlines())
+        raise ProgramFailedError(f"{command[0]} {ending(process.returncode)}. Its last lines:\n  {said}")
     return answer
 
 
-def stop(process: subprocess.Popen[str]) -> None:
+def ending(code: int) -> str:
+    """How a program ended that did not succeed, in words."""
+    return f"was killed ({signal.Signals(-code).name})" if code < 0 else f"failed (exit code {code})"
+
+
+def last_lines(lines: Sequence[str]) -> str:
+    """The end of what a program said, for the message of a failure."""
+    said = [line.strip() for line in lines if line.strip()]
+    return "\n  ".join(said[-LAST_LINES:]) or "(nothing)"
+
+
+def _stop(process: subprocess.Popen[str]) -> None:
     """End a program, which may tidy up first."""
     process.terminate()
     try:

@@ -119,6 +119,18 @@ def test_nona_without_memory(make_project, tmp_path, monkeypatch):
     assert "TMPDIR" not in str(error.value)
 
 
+def test_nona_that_must_not_be_run(make_project, tmp_path, monkeypatch):
+    """As where it was copied from a file system that knows no permissions."""
+    (tmp_path / "nona").write_text("#!/bin/sh\n")
+    (tmp_path / "nona").chmod(0o644)
+    monkeypatch.setenv("PATH", str(tmp_path))
+    with (
+        pytest.raises(NonaFailedError, match="nona cannot be run: Permission denied"),
+        open_layers(read_plan(make_project())),
+    ):
+        pass
+
+
 def test_photos_are_named_of_which_layers_were_made(make_project, nona, caplog):
     plan = read_plan(make_project(icc=ICC))
     tifffile.imwrite(plan.images[1].photo, photo_pixels(1, np.uint8, 3), photometric="rgb")

@@ -1,0 +1,59 @@
+"""Other programs: what they answer, and what is told of those that do not."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import pytest
+
+from hugin_abflow.errors import ProgramFailedError, ProgramMissingError
+from hugin_abflow.programs import run, started
+
+pytestmark = pytest.mark.skipif(os.name == "nt", reason="the programs are shell scripts")
+
+
+@pytest.fixture
+def enfuse(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A program that says what it is asked, twice."""
+    program = tmp_path / "bin" / "enfuse"
+    program.parent.mkdir()
+    program.write_text("#!/bin/sh\nread -r asked\necho $asked $asked $LANGUAGE\n")
+    program.chmod(0o755)
+    monkeypatch.setenv("PATH", f"{program.parent}{os.pathsep}{os.environ['PATH']}")
+    return program
+
+
+def test_answer_is_what_it_says(enfuse: Path, tmp_path: Path) -> None:
+    assert run(["enfuse"], tmp_path, "a\n") == "a a en\n"
+
+
+@pytest.mark.parametrize(
+    ("script", "said"),
+    [
+        ("echo one; echo two >&2; exit 3", r"failed \(exit code 3\)\. Its last lines:\n  two$"),
+        ("echo one; exit 1", r"failed \(exit code 1\)\. Its last lines:\n  one$"),
+        ("kill -9 $$", r"was killed \(SIGKILL\)\. Its last lines:\n  \(nothing\)$"),
+    ],
+)
+def test_failure_is_told(enfuse: Path, tmp_path: Path, script: str, said: str) -> None:
+    enfuse.write_text(f"#!/bin/sh\n{script}\n")
+    with pytest.raises(ProgramFailedError, match=f"enfuse {said}"):
+        run(["enfuse"], tmp_path)
+
+
+def test_what_cannot_be_run_is_told(enfuse: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("PATH", str(enfuse.parent))
+    enfuse.chmod(0o644)
+    with pytest.raises(ProgramFailedError, match=r"enfuse cannot be run: Permission denied; look at"):
+        run(["enfuse"], tmp_path)
+    enfuse.unlink()
+    with pytest.raises(ProgramMissingError, match=r"enfuse is not in PATH; install .*apt install enfuse"):
+        run(["enfuse"], tmp_path)
+
+
+def test_it_does_not_outlive_an_exception(enfuse: Path) -> None:
+    enfuse.write_text("#!/bin/sh\nexec sleep 60\n")
+    with pytest.raises(KeyboardInterrupt), started(["enfuse"]) as program:
+        raise KeyboardInterrupt
+    assert program.returncode < 0
