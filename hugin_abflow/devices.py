@@ -100,8 +100,8 @@ def choose(wanted: str | None, threads: int = 0) -> cl.Device:
         for device in found:
             if wanted.lower() in f"{device.name} {device.platform.name}".lower():
                 return device
-    names = ", ".join(f"{i}: {d.name.strip()}" for i, d in enumerate(found))
-    raise DeviceError(f"no OpenCL device fits --device {wanted}; there are {names}")
+    names = ", ".join(f"{i} ({d.name.strip()})" for i, d in enumerate(found))
+    raise DeviceError(f"no OpenCL device fits --device {wanted}; those of this machine, by number: {names}")
 
 
 def limited(device: cl.Device, threads: int) -> cl.Device:

@@ -54,6 +54,8 @@ _LOADING = "loading "  # and at its beginning
 # be missing: some cameras leave out no more than the mark of the end.
 _LOSS, _CUT = ": Read error on ", "Premature end of JPEG file"
 _DOUBTS = (_CUT, "Corrupt JPEG data")
+# What it says of photos of two depths, or of grey ones beside coloured ones.
+_DIFFERENT = re.compile("uses [A-Z0-9]+ valued pixel, while|has [0-9] channels?, while")
 
 
 @contextmanager
@@ -365,6 +367,11 @@ def _failure(
                     f"{image.photo} has {size[0]}x{size[1]} pixels, in {plan.file} it has "
                     f"{wanted[0]}x{wanted[1]}; put that photo back, or align this one in Hugin"
                 )
+    if _DIFFERENT.search(said):
+        return LayersMismatchError(
+            f"{plan.file}: photos differ in depth or in colour channels; give all the same, such as "
+            f"8 bit RGB, under the same names. nona's last lines:\n  {said}"
+        )
     advice = f"it wrote into {folder.parent}, TMPDIR chooses another folder"
     if "bad_alloc" in said:
         advice = "it had not enough memory: close other programs, or make the panorama smaller in Hugin"

@@ -57,6 +57,21 @@ def test_photo_of_another_size(make_project, nona):
         pass
 
 
+@pytest.mark.parametrize("other", ["16 bits", "grey"])
+def test_photos_that_differ(make_project, nona, other):
+    """One was developed otherwise."""
+    plan = read_plan(make_project())
+    photo = plan.images[1].photo
+    pixels = tifffile.imread(photo)
+    if other == "grey":
+        tifffile.imwrite(photo, pixels[..., 0], photometric="minisblack")
+    else:
+        tifffile.imwrite(photo, pixels.astype(np.uint16) * 257, photometric="rgb")
+    said = rf"(?s)photos differ in depth or in colour channels.*{photo.name}"
+    with pytest.raises(LayersMismatchError, match=said), open_layers(plan):
+        pass
+
+
 def test_photo_that_is_remapped_is_blamed(make_project, nona):
     """The first one's layer is there; so its photo need not be."""
     plan = read_plan(make_project())
