@@ -112,11 +112,12 @@ class ImageWriter:
         self.width, self.height, self.channels, self.dtype = width, height, channels, np.dtype(dtype)
         self.format = _format_of(self.path)
         self.stored = _stored_dtype(self.path, self.format, self.dtype, depth)
-        if self.format == "jpeg" and max(width, height) > _JPEG_LIMIT:
-            raise OutputError(f"{path}: JPEG ends at {_JPEG_LIMIT} pixels a side; choose .tif or .png")
         self.compression, self._option = _compression(
             self.path, self.format, self.stored, channels, compression, jpeg_quality
         )
+        tall = height if self.format == "jpeg" else 0  # within TIFF each strip is a JPEG
+        if self.compression.startswith("jpeg") and max(width, tall) > _JPEG_LIMIT:
+            raise OutputError(f"{path}: JPEG ends at {_JPEG_LIMIT} pixels a side; choose a TIFF with LZW")
         self._offset, self._icc = offset, icc
         self._spec = self._make_spec(offset, icc, canvas_size)
         self._done = 0

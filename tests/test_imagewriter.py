@@ -34,9 +34,8 @@ def test_tiff_comes_back_exactly(tmp_path, dtype, channels, compression):
     pixels = noise(dtype, channels)
     write_image(tmp_path / "a.tif", pixels, offset=(656, 49), icc=ICC, compression=compression)
     layer = read_layer(tmp_path / "a.tif")
-    assert layer.box == Box(656, 49, 656 + 131, 49 + 77)
-    assert (layer.dtype, layer.channels, layer.icc) == (np.dtype(dtype), channels, ICC)
-    assert layer.canvas_size is None
+    assert (layer.box, layer.channels) == (Box(656, 49, 656 + 131, 49 + 77), channels)
+    assert (layer.dtype, layer.icc, layer.canvas_size) == (np.dtype(dtype), ICC, None)
     assert np.array_equal(whole(layer), pixels)  # colours under alpha 0 too
     # and another program agrees
     page = tifffile.TiffFile(tmp_path / "a.tif").pages[0]
@@ -324,8 +323,9 @@ def test_output_errors_name_the_file_and_what_to_do(tmp_path):
         write_image(tmp_path / "a.tif", pixels, compression="jpeg:85")
     with pytest.raises(OutputError, match="quality 101"):
         write_image(tmp_path / "a.jpg", pixels, jpeg_quality=101)
-    with pytest.raises(OutputError, match="65500"):
-        ImageWriter(tmp_path / "a.jpg", 70_000, 9, 3, np.uint8)
+    for name in ("a.jpg", "a.tif"):
+        with pytest.raises(OutputError, match="65500"):
+            ImageWriter(tmp_path / name, 70_000, 9, 3, np.uint8, compression="jpeg")
     with pytest.raises(OutputError, match="negative position"):
         write_image(tmp_path / "a.tif", pixels, offset=(-1, 0))
     assert names_in(tmp_path) == ["b.tif"]
