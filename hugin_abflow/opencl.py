@@ -51,10 +51,10 @@ _OF_PIXELS = frozenset({"blend", "working"})
 
 
 def kernel_source(*modules: str) -> str:
-    """Source of ``kernels/<module>.cl``, in front of it common.cl and what is its own, as blend_rows.cl of
-    blend.cl; #line keeps messages true.
+    """Source of ``kernels/<module>.cl``, in front of it common.cl, and in front of both what is their own, as
+    blend_rows.cl of blend.cl; #line keeps messages true.
     """
-    names = ["common", *(name for one in modules for name in (*_parts(one), one))]
+    names = [name for one in ("common", *modules) for name in (*_parts(one), one)]
     return "".join(f'#line 1 "{name}.cl"\n{_kernel_files()[name]}\n' for name in names)
 
 

@@ -20,9 +20,10 @@ from hugin_abflow.errors import DeviceError
 from hugin_abflow.opencl import Device, kernel_source
 
 KERNELS = Path(__file__).parent.parent / "kernels"
-# files that are no module's own, but in front of one
+# files that are no module's own, but in front of one, or of all
 PARTS = {"blend_rows": "blend", "blend_sample": "blend"}
-MODULES = sorted({path.stem for path in KERNELS.glob("*.cl")} - {"common"} - PARTS.keys())
+SHARED = ["common_numbers", "common"]
+MODULES = sorted({path.stem for path in KERNELS.glob("*.cl")} - PARTS.keys() - set(SHARED))
 
 
 def kernels_of(module: str) -> list[str]:
@@ -173,7 +174,7 @@ def test_kernels_are_read_whatever_the_locale() -> None:
 
 def test_source_lines_keep_their_own_file_and_number() -> None:
     source = kernel_source("working")
-    assert source.startswith('#line 1 "common.cl"\n')
+    assert source.startswith('#line 1 "common_numbers.cl"\n')
     own = source.partition('#line 1 "working.cl"\n')[2]
     assert own.rstrip("\n") == (KERNELS / "working.cl").read_text().rstrip("\n")
 
@@ -182,7 +183,7 @@ def test_a_part_is_in_front_of_its_file_alone() -> None:
     for part, module in PARTS.items():
         heads = [line for line in kernel_source(module).splitlines() if line.startswith("#line")]
         parts = sorted(name for name, its in PARTS.items() if its == module)
-        assert heads == [f'#line 1 "{name}.cl"' for name in ("common", *parts, module)]
+        assert heads == [f'#line 1 "{name}.cl"' for name in (*SHARED, *parts, module)]
         assert all(f'"{part}.cl"' not in kernel_source(other) for other in MODULES if other != module)
 
 
