@@ -29,8 +29,7 @@ __kernel void guidance_start(__global const float2 *flow,   /* (grid.y, grid.x) 
     for (int i = 0; i < count; ++i) {
         const float4 guide = guides[i];
         float2 way = q - guide.xy;
-        if (grid.z)
-            way.x -= grid.x * rint(way.x / grid.x);
+        way.x -= whole_turns(way.x, grid.z ? grid.x : 0.0f);
         const float g = exp(-0.5f * dot(way, way) / (sigmas[i] * sigmas[i]));
         sum += g * guide.zw;
         total += g;

@@ -146,8 +146,7 @@ __kernel void relay_hold(__global const float4 *points, /* (count) place, move, 
     float most = 0.0f;
     for (int i = 0; i < count; ++i) {
         float2 way = (float2)(x + 0.5f, y + 0.5f) - points[i].xy;
-        if (grid.z)
-            way.x -= grid.x * rint(way.x / grid.x);
+        way.x -= whole_turns(way.x, grid.z ? grid.x : 0.0f);
         const float near = exp(-0.5f * square2(way) / (sigma * sigma));
         most = GREATEST(most, near * relay_agreement(found[at].xy - points[i].zw, agrees));
     }
