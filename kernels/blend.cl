@@ -195,7 +195,7 @@ __kernel void blend_mark(
     const int width = LEAST(BLOCK, band.z - x);
     blend_real ends = (blend_real)(place.x + width - 0.5f); /* the last pixel's, and as x the first one's */
     ends.x = place.x + 0.5f;
-    const float2 scale = blend_scale(border, field_border);
+    const float2 scale = grid_ratio(field_border, border);
     const blend_between columns = blend_split(ends / scale.x);
     const float row = (place.y + 0.5f) / scale.y;
     __global uint *shown = marks + 2 * words * blend_block(x, y, band);
@@ -241,8 +241,8 @@ __kernel void blend_band(
     const int2 place = (int2)(x + band.x, y + band.y);
     const blend_real px = BLEND_REALS(place.x + BLEND_COUNT) + 0.5f;
     const float py = place.y + 0.5f;
-    const float2 scale = blend_scale(border, field_border), gain_scale = blend_scale(gain_border, border);
-    const float2 offset_scale = blend_scale(offset_border, border);
+    const float2 scale = grid_ratio(field_border, border), gain_scale = grid_ratio(border, gain_border);
+    const float2 offset_scale = grid_ratio(border, offset_border);
     const blend_corrections corrections = {
         gains, offsets, blend_within(blend_split(px * gain_scale.x), (int2)(0, gain_border.x), gain_border),
         blend_split(px * offset_scale.x), py * gain_scale.y, py * offset_scale.y, offset_border};

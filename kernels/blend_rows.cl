@@ -99,11 +99,6 @@ typedef struct {
     long rows;                  /* where they begin: there may be more than 2^31 pixels */
 } blend_layer;
 
-/* How many columns and rows of one grid there are per one of another. */
-static inline float2 blend_scale(int4 grid, int4 other) {
-    return (float2)((float)grid.x / other.x, (float)grid.y / other.y);
-}
-
 /* pixel_samples for two pixels: in OpenCL C no text says which samples go where for both. */
 static inline float8 blend_pair(blend_two p) {
 #if SAMPLES > 2

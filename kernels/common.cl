@@ -215,6 +215,16 @@ static inline float whole_turns(float way, float period) {
     return period > 0.0f ? period * floor_int(way / period + 0.5f) : 0.0f;
 }
 
+/* The period of a canvas's columns: longitudes jump where they go once around. 0 on a plane, where positions go on. */
+static inline float canvas_turn(float4 lonlat) {
+    return lonlat.y != 0.0f ? 2.0f * M_PI_F / lonlat.y : 0.0f;
+}
+
+/* Pixels of another grid over the same region for each pixel of a grid. */
+static inline float2 grid_ratio(int4 from, int4 to) {
+    return (float2)((float)to.x / from.x, (float)to.y / from.y);
+}
+
 /* Where a pixel lies on another grid over the same region. */
 static inline float2 grid_place(int x, int y, int4 from, int4 to) {
     return (float2)((x + 0.5f) * to.x / from.x, (y + 0.5f) * to.y / from.y);

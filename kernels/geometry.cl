@@ -98,8 +98,7 @@ __kernel void geometry_within(__global float4 *field, /* (box.w, box.z), in plac
         return;
     const float2 q = (float2)(x + box.x + 0.5f, y + box.y + 0.5f);
     float2 there = layer_position(q, own.xyz, lonlat);
-    /* longitudes jump where they go once around */
-    there.x -= whole_turns(there.x - q.x, lonlat.y != 0.0f ? 2.0f * M_PI_F / lonlat.y : 0.0f);
+    there.x -= whole_turns(there.x - q.x, canvas_turn(lonlat));
     const float2 size = (float2)(border.x, border.y), least = 0.5f * q + 0.25f, most = 0.5f * (q + size) - 0.25f;
     float2 inside = there;
     if (!border.z)

@@ -138,7 +138,7 @@ __kernel void multiband_reduce(__global const float4 *level, __global const floa
     const int x = get_global_id(0), y = get_global_id(1);
     if (x >= smaller_box.z || y >= smaller_box.w)
         return;
-    const float2 ratio = (float2)((float)fine.x / coarse.x, (float)fine.y / coarse.y);
+    const float2 ratio = grid_ratio(coarse, fine);
     const float2 q = grid_place(x + smaller_box.x, y + smaller_box.y, coarse, fine);
     const int2 first = floor_int2(q - 1.5f * ratio), last = floor_int2(q + 1.5f * ratio);
     float across[MULTIBAND_TAPS];

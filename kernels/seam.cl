@@ -89,8 +89,7 @@ __kernel void seam_yield(__global float4 *field,        /* (box.w, box.z) of the
     const int x = get_global_id(0), y = get_global_id(1), at = y * box.z + x;
     if (x >= box.z || y >= box.w || !(field[at].w > 0.0f))
         return;
-    const float2 ratio = (float2)((float)cells.x / border.x, (float)cells.y / border.y);
-    const float2 place = (float2)(x + box.x + 0.5f, y + box.y + 0.5f) * ratio;
+    const float2 place = (float2)(x + box.x + 0.5f, y + box.y + 0.5f) * grid_ratio(border, cells);
     const float keep = 1.0f - bilinear_scalar(yields, place, cells), power = 1.0f - bilinear_scalar(same, place, cells);
     /* to the fourth power: the softmax's own weights span many powers of ten */
     const float left = keep * keep * keep * keep;
@@ -140,8 +139,7 @@ __kernel void seam_shown(__global const float4 *layer, /* (box.w, box.z) */
             const float2 q = (float2)(x + 0.5f, y + 0.5f);
             const float3 d = field[at].xyz;
             float2 way = layer_position(q, d, lonlat) - q;
-            /* longitudes jump where they go once around */
-            way.x -= whole_turns(way.x, lonlat.y != 0.0f ? 2.0f * M_PI_F / lonlat.y : 0.0f);
+            way.x -= whole_turns(way.x, canvas_turn(lonlat));
             const float length = ROOT(square2(way));
             const float part = length > SEAM_BEYOND ? 1.0f - SEAM_BEYOND / length : 0.0f;
             all_of_it = all_of_it && layer_sample(layer, box, layer_position(q, part * d, lonlat), border).w != 0.0f;
@@ -164,7 +162,7 @@ __kernel void seam_clamp(__global const float4 *layer, /* (box.w, box.z) */
     if (x >= box.z || y >= box.w || layer[at].w == 0.0f)
         return;
     const float2 q = (float2)(x + box.x + 0.5f, y + box.y + 0.5f);
-    const int2 cell = convert_int2(q * (float2)((float)cells.x / border.x, (float)cells.y / border.y));
+    const int2 cell = convert_int2(q * grid_ratio(border, cells));
     if (!taken[min(cell.y, cells.y - 1) * cells.x + min(cell.x, cells.x - 1)])
         return;
     const float4 own = field[at];

@@ -53,8 +53,8 @@ __kernel void transition_texture(__global const float4 *layer, /* (box.w, box.z)
 static inline float transition_met(__global const float *texture, int4 place, float2 p, float2 end, int4 border,
                                    float4 lonlat, int4 cells) {
     float2 way = end - p;
-    way.x -= whole_turns(way.x, lonlat.y != 0.0f ? 2.0f * M_PI_F / lonlat.y : border.z ? border.x : 0.0f);
-    const float2 ratio = (float2)((float)cells.x / border.x, (float)cells.y / border.y);
+    way.x -= whole_turns(way.x, lonlat.y == 0.0f && border.z ? border.x : canvas_turn(lonlat));
+    const float2 ratio = grid_ratio(border, cells);
     const int steps = 1 + (int)LEAST(GREATEST(MAGNITUDE(way.x * ratio.x), MAGNITUDE(way.y * ratio.y)), TRANSITION_FAR);
     float met = 0.0f;
     for (int step = 0; step <= steps; ++step) {
@@ -164,8 +164,7 @@ __kernel void transition_refine(__global const float *coarse,       /* shares of
     if (x >= cells.x || y >= cells.y)
         return;
     const int begin = first[y * cells.x + x], end = first[y * cells.x + x + 1];
-    const float2 ratio = (float2)((float)coarse_cells.x / cells.x, (float)coarse_cells.y / cells.y);
-    const float2 q = ((float2)(x, y) + 0.5f) * ratio;
+    const float2 q = ((float2)(x, y) + 0.5f) * grid_ratio(cells, coarse_cells);
     float total = 0.0f;
     for (int s = begin; s < end; ++s) {
         share[s] = TRANSITION_TRACE +
@@ -252,8 +251,7 @@ __kernel void transition_expand(__global float *blend,            /* (box.w, box
     const int at = y * box.z + x;
     float w = blend[at];
     if (w > 0.0f && w < 1.0f) {
-        const float2 ratio = (float2)((float)cells.x / border.x, (float)cells.y / border.y);
-        const float2 q = ((float2)(x + box.x, y + box.y) + 0.5f) * ratio;
+        const float2 q = ((float2)(x + box.x, y + box.y) + 0.5f) * grid_ratio(border, cells);
         w = transition_read(share, first, owner, q, cells, layer);
         w = GREATEST(w, TRANSITION_TRACE);
     }
