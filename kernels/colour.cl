@@ -12,8 +12,7 @@ static inline bool colour_clips(float4 c, float4 clipped) {
 /* How much two samples tell of exposure, 0..1: what is nearly black in either may have been any darker, most of all at
    the rim of a dark lens, and by how much is seen by nobody. Of floats it is not known what is dark. */
 static inline float colour_tells(float4 a, float4 b, float shoulder) {
-    const float tells = (darker_channel(a.xyz, b.xyz) - COLOUR_DARK) / (COLOUR_BRIGHT - COLOUR_DARK);
-    return shoulder > 0.0f ? LIMITED(tells, 0.0f, 1.0f) : 1.0f;
+    return shoulder > 0.0f ? ramp(darker_channel(a.xyz, b.xyz), COLOUR_DARK, COLOUR_BRIGHT) : 1.0f;
 }
 
 /* Mean difference a - b on the exposure scale over the pixels of a cell (every second one in x and y) that both

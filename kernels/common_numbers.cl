@@ -24,6 +24,12 @@ static inline float4 root4(float4 a) {
     return (float4)(ROOT(a.x), ROOT(a.y), ROOT(a.z), ROOT(a.w));
 }
 
+/* How far a is from `low` to `high`, 0..1: what counts not at all up to one limit, and wholly from another one on. */
+static inline float ramp(float a, float low, float high) {
+    const float share = (a - low) / (high - low);
+    return LIMITED(share, 0.0f, 1.0f);
+}
+
 /* The largest whole number that is not above a. */
 static inline int floor_int(float a) {
     const int whole = (int)a;

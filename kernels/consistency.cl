@@ -37,8 +37,7 @@ __kernel void consistency_trust(__global const float2 *flow, /* (grid.y, grid.x)
     const float2 e = (f + bilinear_flow(back, q, grid)) / tolerance;
     const float c = 1.0f / (1.0f + square2(e));
     const int column = LEAST(x / cells.z, cells.x - 1), row = LEAST(y / cells.z, cells.y - 1);
-    const float room = (consistency_area(flow, x, y, grid) - squeezed) / (1.0f - squeezed);
-    const float shown = LIMITED(room, 0.0f, 1.0f);
+    const float shown = ramp(consistency_area(flow, x, y, grid), squeezed, 1.0f);
     const bool excluded = mask[row * cells.x + column];
     trusted[at] = (float4)(f, excluded ? 0.0f : shown * c * c * c * c, excluded ? EXCLUDED : image[at]);
 }

@@ -14,8 +14,7 @@
 static inline float content_same(float3 d, float3 mean, float rest, float2 place, __global const float *moved,
                                  __global const float *other, int4 cells, float shoulder) {
     const float3 own = mean + d, others = own - d / GREATEST(rest, CONTENT_LITTLE);
-    const float dark = (darker_channel(own, others) - CONTENT_BLACK) / (CONTENT_SEEN - CONTENT_BLACK);
-    const float seen = shoulder > 0.0f ? LIMITED(dark, 0.0f, 1.0f) : 1.0f;
+    const float seen = shoulder > 0.0f ? ramp(darker_channel(own, others), CONTENT_BLACK, CONTENT_SEEN) : 1.0f;
     const float surely = seen * bilinear_scalar(other, place, cells);
     return 1.0f - GREATEST(surely, bilinear_scalar(moved, place, cells));
 }

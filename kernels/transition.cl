@@ -123,10 +123,9 @@ __kernel void transition_parallax(__global const float2 *flow,   /* chart grid, 
         const float2 to_b = canvas_position(chart_point(u + bilinear_flow(flow, u, grid), &chart), lonlat);
         const float met = GREATEST(transition_met(texture_a, place_a, p, to_a, border, lonlat, cells),
                                    transition_met(texture_b, place_b, p, to_b, border, lonlat, cells));
-        const float seen = (met - TRANSITION_PLAIN) / (TRANSITION_TEXTURED - TRANSITION_PLAIN);
-        const float share = LIMITED(seen, 0.0f, 1.0f);
-        parallax[at] = GREATEST(parallax[at], longest * share * share);
-        strain[at] = GREATEST(strain[at], bent * share * share);
+        const float seen = ramp(met, TRANSITION_PLAIN, TRANSITION_TEXTURED);
+        parallax[at] = GREATEST(parallax[at], longest * seen * seen);
+        strain[at] = GREATEST(strain[at], bent * seen * seen);
     }
 }
 
