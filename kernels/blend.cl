@@ -163,7 +163,7 @@ static inline int blend_shows(__global const pixel_stored *stored, __global cons
         return 0;
     __global const pixel_stored *line = blend_line(stored, layer, y);
     for (int x = left; x < right; ++x)
-        if (line[x].BLEND_ALPHA >= 0.5f * WHITE)
+        if (line[x].BLEND_ALPHA >= BLEND_VALID)
             return 1;
     return 0;
 }

@@ -56,6 +56,9 @@ EXPOSURE_RAISE(8)
 #define BLEND_STORED BLEND_TWO
 #endif
 
+/* Alpha from which on a pixel is the layer's, in stored units; there is nothing in between, as on the working grid. */
+#define BLEND_VALID (0.5f * WHITE)
+
 /* For what PoCL's compiler would leave as calls: around these all that is in vector registers is saved, and what is
    handed on by its address lies in memory, for each work item of a group. What is hardly ever needed stays a call. */
 #define BLEND_INLINE static inline __attribute__((always_inline))
@@ -144,7 +147,7 @@ static inline float4 blend_tap(__global const pixel_stored *stored, __global con
     if (x < 0 || y < 0 || x >= place.z || y >= place.w)
         return (float4)(0.0f);
     const float4 c = pixel_samples(blend_line(stored, layer, y)[x]);
-    return c.w >= 0.5f * WHITE ? (float4)(c.xyz, 1.0f) : (float4)(0.0f);
+    return c.w >= BLEND_VALID ? (float4)(c.xyz, 1.0f) : (float4)(0.0f);
 }
 
 /* PIXELS stored pixels side by side. */
@@ -163,7 +166,7 @@ BLEND_INLINE blend_samples blend_taps(__global const pixel_stored *stored, __glo
     if (x < 0 || x + PIXELS > place.z)
         return (blend_samples)(BLEND_LIST(BLEND_TAP));
     blend_samples c = blend_colours(blend_run(blend_line(stored, layer, y) + x));
-    const blend_int valid = c.FOURTHS >= 0.5f * WHITE;
+    const blend_int valid = c.FOURTHS >= BLEND_VALID;
     c.FOURTHS = (blend_real)(1.0f);
     return BLEND_EACH(valid) ? c : (blend_samples)(0.0f);
 }
@@ -178,6 +181,6 @@ static inline blend_int blend_valid(__global const pixel_stored *stored, __globa
 #define BLEND_KNOWN(n, i) (x + n >= 0 && x + n < place.z ? first[n].BLEND_ALPHA : (PIXEL)0)
 #define BLEND_INSIDE(n, i) first[n].BLEND_ALPHA
     if (x < 0 || x + PIXELS > place.z)
-        return (blend_real)(BLEND_LIST(BLEND_KNOWN)) >= 0.5f * WHITE;
-    return (blend_real)(BLEND_LIST(BLEND_INSIDE)) >= 0.5f * WHITE;
+        return (blend_real)(BLEND_LIST(BLEND_KNOWN)) >= BLEND_VALID;
+    return (blend_real)(BLEND_LIST(BLEND_INSIDE)) >= BLEND_VALID;
 }

@@ -78,7 +78,7 @@ static inline float4 blend_sample(__global const pixel_stored *stored, __global 
         blend_row(lines.c, &r2);
         blend_row(lines.d, &r3);
         const blend_four least = LEAST(LEAST(r0, r1), LEAST(r2, r3));
-        const int4 valid = convert_float4(least.BLEND_ALPHAS) >= 0.5f * WHITE;
+        const int4 valid = convert_float4(least.BLEND_ALPHAS) >= BLEND_VALID;
         if (valid.x & valid.y & valid.z & valid.w) {
             const float4 wx = cubic_taps(t.x, BLEND_SLOPE), wy = cubic_taps(t.y, BLEND_SLOPE);
             const float8 left = wy.x * blend_pair(r0.lo) + wy.y * blend_pair(r1.lo) + wy.z * blend_pair(r2.lo) +
@@ -124,7 +124,7 @@ BLEND_INLINE void blend_sample_all(__global const pixel_stored *stored, __global
         const blend_samples c1 = blend_sample_column(lines, 1, wy, &least);
         const blend_samples c2 = blend_sample_column(lines, 2, wy, &least);
         const blend_samples c3 = blend_sample_column(lines, 3, wy, &least);
-        if (!BLEND_SOME(blend_colours(least).FOURTHS < 0.5f * WHITE)) {
+        if (!BLEND_SOME(blend_colours(least).FOURTHS < BLEND_VALID)) {
             blend_samples sum = BLEND_EACH(wx.FIRSTS) * c0 + BLEND_EACH(wx.SECONDS) * c1 + BLEND_EACH(wx.THIRDS) * c2 +
                                 BLEND_EACH(wx.FOURTHS) * c3;
             sum = BLEND_LIT(sum, blend_colours(least));

@@ -230,6 +230,10 @@ static inline float2 grid_place(int x, int y, int4 from, int4 to) {
     return (float2)((x + 0.5f) * to.x / from.x, (y + 0.5f) * to.y / from.y);
 }
 
+/* Weights by which grids are halved, of the four pixels of a line around the two of which one is made: binomial, that is
+   1, 3, 3 and 1 eighths. */
+#define HALVING_TAPS {0.125f, 0.375f, 0.375f, 0.125f}
+
 /* Bilinear reading of a grid at position q, over the taps that lie on it; 0 where none does. */
 #define BILINEAR(name, type)                                                                                       \
     static inline type bilinear_##name(__global const type *values, float2 q, int4 grid) {                         \
@@ -243,13 +247,16 @@ BILINEAR(colour, float4)
 
 #define EXCLUDED 1e3f /* brightness, in what consistency.cl makes, of pixels that do not count */
 
+/* Bilinear mean of validity, 0 or 1, above which every tap that counts is valid: weights sum to 1 but for rounding. */
+#define ALL_VALID 0.999f
+
 /* A feature of flow.cl at pixel (x, y) displaced by f, bilinear; all 0 where a tap that counts is not valid. */
 static inline float4 feature_sample(__global const float4 *feature, int x, int y, float2 f, int4 grid) {
     const int2 whole = floor_int2(f);
     int4 at;
     const float4 w = grid_taps((int2)(x, y) + whole, f - convert_float2(whole), grid, &at);
     const float4 sum = w.x * feature[at.x] + w.y * feature[at.y] + w.z * feature[at.z] + w.w * feature[at.w];
-    return sum.w > 0.999f ? sum / sum.w : (float4)(0.0f);
+    return sum.w > ALL_VALID ? sum / sum.w : (float4)(0.0f);
 }
 
 /* A layer of the working grid at position q, bilinear; all 0 where a tap is missing. */
@@ -262,7 +269,7 @@ static inline float4 layer_sample(__global const float4 *layer, int4 box, float2
         __global const float4 *c = layer + first.y * box.z + first.x;
         const float4 upper = c[0] + t.x * (c[1] - c[0]), lower = c[box.z] + t.x * (c[box.z + 1] - c[box.z]);
         sum = upper + t.y * (lower - upper);
-        return sum.w > 0.999f ? sum : (float4)(0.0f);
+        return sum.w > ALL_VALID ? sum : (float4)(0.0f);
     }
     for (int j = 0; j < 2; ++j)
         for (int i = 0; i < 2; ++i) {
@@ -273,7 +280,7 @@ static inline float4 layer_sample(__global const float4 *layer, int4 box, float2
             if (at >= 0)
                 sum += (i ? t.x : 1.0f - t.x) * (j ? t.y : 1.0f - t.y) * layer[at];
         }
-    return sum.w > 0.999f ? sum : (float4)(0.0f);
+    return sum.w > ALL_VALID ? sum : (float4)(0.0f);
 }
 
 /* Where a layer is sampled for position q of the working grid. */

@@ -42,7 +42,7 @@ __kernel void consistency_trust(__global const float2 *flow, /* (grid.y, grid.x)
     trusted[at] = (float4)(f, excluded ? 0.0f : shown * c * c * c * c, excluded ? EXCLUDED : image[at]);
 }
 
-/* Halve: the mean flow, weighted by trust, the mean trust and the mean brightness; taps as in pyramid_reduce. */
+/* Halve: the mean flow, weighted by trust, the mean trust and the mean brightness. */
 __kernel void consistency_push(__global const float4 *trusted, /* (fine.y, fine.x) flow, trust, brightness */
                                int4 fine,                      /* width, height, wraps, 0 */
                                __global float4 *small,         /* (size.y, size.x), flow in px of the finest */
@@ -51,7 +51,7 @@ __kernel void consistency_push(__global const float4 *trusted, /* (fine.y, fine.
     const int x = get_global_id(0), y = get_global_id(1);
     if (x >= size.x || y >= size.y)
         return;
-    const float taps[4] = {0.125f, 0.375f, 0.375f, 0.125f};
+    const float taps[4] = HALVING_TAPS;
     float2 sum = (float2)(0.0f);
     float trust = 0.0f, brightness = 0.0f, counted = 0.0f, weight = 0.0f;
     for (int j = 0; j < 4; ++j)

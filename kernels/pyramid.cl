@@ -1,6 +1,6 @@
 /* Mask-normalised filters and pyramids: what lies outside a mask never enters a sum. */
 
-/* Halve an image: binomial (1 3 3 1) taps around each pair of pixels, so that coarse position = fine / 2. */
+/* Halve an image, by taps around each pair of pixels, so that coarse position = fine / 2. */
 __kernel void pyramid_reduce(__global const float *image, /* (fine.y, fine.x) */
                              __global const float *mask,  /* (fine.y, fine.x), 0 or 1 */
                              int4 fine,                   /* width, height, wraps, 0 */
@@ -11,7 +11,7 @@ __kernel void pyramid_reduce(__global const float *image, /* (fine.y, fine.x) */
     const int x = get_global_id(0), y = get_global_id(1);
     if (x >= size.x || y >= size.y)
         return;
-    const float taps[4] = {0.125f, 0.375f, 0.375f, 0.125f};
+    const float taps[4] = HALVING_TAPS;
     float sum = 0.0f, weight = 0.0f;
     for (int j = 0; j < 4; ++j)
         for (int i = 0; i < 4; ++i) {
