@@ -9,7 +9,7 @@ from collections.abc import Callable, Generator, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from functools import partial
-from itertools import combinations
+from itertools import combinations, compress
 from typing import Any
 
 import numpy as np
@@ -18,10 +18,10 @@ import numpy.typing as npt
 from hugin_abflow import (
     alignment,
     blend,
+    budget,
     coefficient,
     figures,
     flow,
-    memory,
     multiband,
     pairflow,
     reading,
@@ -32,16 +32,13 @@ from hugin_abflow import (
     working,
 )
 from hugin_abflow.blend import BlendLayer, Prepared
-from hugin_abflow.cells import SingleSource
-from hugin_abflow.chart import Chart
 from hugin_abflow.coefficient import Masks
-from hugin_abflow.errors import SettingsError
-from hugin_abflow.geometry import Pair, PairFlow
+from hugin_abflow.geometry import Pair
 from hugin_abflow.guides import Guide, by_pair
 from hugin_abflow.layer import Canvas, Layer
 from hugin_abflow.opencl import Device, DeviceMemoryError
 from hugin_abflow.progress import Progress
-from hugin_abflow.settings import FlowQuality, Settings
+from hugin_abflow.settings import Settings
 from hugin_abflow.working import Grid, WorkingLayer
 
 _log = logging.getLogger(__name__)
@@ -52,12 +49,6 @@ _unused_log = logging.getLogger("hugin_abflow.unused")
 _LEAST_OVERLAP = 64
 # Every so many rows and columns of a mask are looked at first.
 _SAMPLED = 16
-# Bytes that are to come for each working pixel of a layer: a field, an array of coefficients, offsets
-# and what they are made from; for each pixel of charts: flow both ways, and before that as it was found; and
-# of the largest, to solve it.
-_STEP_BYTES, _FLOW_BYTES, _FOUND_BYTES, _SOLVER_BYTES = 16 + 4 + 9, 16, 32, 250
-# What libraries take that are still being loaded (`_loading_ahead`).
-_LIBRARY_BYTES = 50 << 20
 # A weight that nothing brings above 0 (blend.cl lets hidden layers weigh something after all).
 _NEVER = -1e30
 # Below this a working canvas is too small to be worth another attempt.
@@ -132,46 +123,113 @@ def prepare(
     full = working.full_grid(canvas, layers)
     grid = working.working_grid(full, settings)
     reduced = reading.read(device, layers, grid, progress, settings)
-    masks = coefficient.masks(device, reduced, grid)
-    used = [i for i in range(len(reduced)) if not _redundant(i, reduced, masks)]
-    blended = [reduced[i] for i in used]
-    masks = masks.only(used)
-    order = {id(layer): index for index, layer in enumerate(layers)}
-    numbers = [order[id(one.layer)] for one in blended]  # the caller's, which guides have
-    pairs = _overlapping(device, blended, masks)
-    overlaps = coefficient.Overlaps(masks, [(pair.a, pair.b) for pair in pairs])
-    blended = saturation.with_whites(device, blended, pairs)
-    flow_overlaps = overlaps if settings.flow else ()
-    charts = pairflow.charts(flow_overlaps, masks.grid, grid, settings)
-    fast = partial(_work_of_quality, "fast", full, flow_overlaps, masks.grid, settings)
-    abreast = _check_memory(device, blended, _Work(charts, grid, settings), fast, abreast)
-    pair_guides = by_pair(guides if settings.guides else ())
-    flows, parallaxes, singles = list[PairFlow](), list[figures.Parallax](), list[SingleSource | None]()
-    if settings.flow:
-        flows, parallaxes, singles = pairflow.solve(
-            device, blended, pairs, charts, grid, progress, settings, pair_guides, numbers, abreast,
-            partial(relay.inferable, pairs, flow_overlaps, masks.grid),
-        )  # fmt: skip
+    used, unused = _parted(device, reduced, layers, grid)
+    flows, parallaxes, singles = _flow(device, used, full, grid, guides, settings, progress, abreast)
     with progress("align", 1) as advance:
         from_one = single.on_canvas(singles, [one.chart for one in flows], seam.seam_grid(grid))
-        aligned = alignment.align(device, blended, pairs, flows, from_one, masks, grid, settings)
+        blended, pairs = used.layers, used.pairs
+        aligned = alignment.align(device, blended, pairs, flows, from_one, used.masks, grid, settings)
         if _log.isEnabledFor(logging.INFO):
-            figures.report(blended, pairs, overlaps, parallaxes, seam.seam_grid(grid), aligned.whole)
-        del masks, overlaps, flow_overlaps, fast  # what comes takes the most memory
-        offsets, correction = multiband.none(grid, len(blended)), aligned.correction
-        if settings.exposure and pairs:
-            offsets = multiband.offsets(device, blended, aligned.fields, correction, grid, aligned.unlike)
-        final = [
-            BlendLayer(layer.layer, layer.box, field, reach, gain, offset)
-            for layer, field, reach, gain, offset in zip(
-                blended, aligned.fields, aligned.reaches, correction.gains, offsets.layers, strict=True
-            )
-        ]
+            figures.report(blended, pairs, used.overlaps, parallaxes, seam.seam_grid(grid), aligned.whole)
+        del used  # what comes takes the most memory: its masks make room
+        offsets = _offsets(device, blended, pairs, aligned, grid, settings)
+        final = _blend_layers(blended, aligned, offsets) + [_unblended(device, one) for one in unused]
         advance(1)
-    final += [_unblended(device, reduced[i]) for i in range(len(reduced)) if i not in used]
-    return Prepared(
-        tuple(final), full, grid, correction.grid, offsets.grid, correction.shoulder, aligned.unlike
+    gains = aligned.correction
+    return Prepared(tuple(final), full, grid, gains.grid, offsets.grid, gains.shoulder, aligned.unlike)
+
+
+@dataclass(frozen=True)
+class _Used:
+    """The layers that are blended, and where they overlap.
+
+    layers      each of which has an area of its own.
+    numbers     of each among the caller's layers: guides have these.
+    masks       of `layers`.
+    pairs       those of `layers` that overlap, and differ there.
+    """
+
+    layers: Sequence[WorkingLayer]
+    numbers: Sequence[int]
+    masks: Masks
+    pairs: Sequence[Pair]
+
+    @property
+    def overlaps(self) -> coefficient.Overlaps:
+        """Of `pairs`, on the masks' grid."""
+        return coefficient.Overlaps(self.masks, [(pair.a, pair.b) for pair in self.pairs])
+
+
+def _parted(
+    device: Device, reduced: Sequence[WorkingLayer], layers: Sequence[Layer], grid: Grid
+) -> tuple[_Used, list[WorkingLayer]]:
+    """The layers that are blended, and those that are not, since nothing is their own.
+
+    layers      the caller's, in the order that guides know.
+    """
+    masks = coefficient.masks(device, reduced, grid)
+    kept = [not _redundant(i, reduced, masks) for i in range(len(reduced))]
+    blended = list(compress(reduced, kept))
+    masks = masks.only(np.flatnonzero(kept).tolist())
+    pairs = _overlapping(device, blended, masks)
+    order = {id(layer): index for index, layer in enumerate(layers)}
+    numbers = [order[id(one.layer)] for one in blended]
+    used = _Used(saturation.with_whites(device, blended, pairs), numbers, masks, pairs)
+    return used, [one for one, its in zip(reduced, kept, strict=True) if not its]
+
+
+def _flow(
+    device: Device,
+    used: _Used,
+    full: Grid,
+    grid: Grid,
+    guides: Sequence[Guide],
+    settings: Settings,
+    progress: Progress,
+    most: int,
+) -> pairflow.Solution:
+    """Flow of all pairs, of at most `most` at a time, if there is the memory for that; nothing without flow.
+
+    Raises `SettingsError` where a limit of memory is too low.
+    """
+    overlaps = used.overlaps if settings.flow else ()
+    charts = pairflow.charts(overlaps, used.masks.grid, grid, settings)
+    fast = partial(budget.Work.of_quality, "fast", full, overlaps, used.masks.grid, settings)
+    abreast = budget.abreast(device, used.layers, budget.Work(charts, grid, settings), fast, most)
+    if not settings.flow:
+        return pairflow.Solution([], [], [])
+    return pairflow.solve(
+        device, used.layers, used.pairs, charts, grid, progress, settings,
+        by_pair(guides if settings.guides else ()), used.numbers, abreast,
+        partial(relay.inferable, used.pairs, overlaps, used.masks.grid),
+    )  # fmt: skip
+
+
+def _offsets(
+    device: Device,
+    layers: Sequence[WorkingLayer],
+    pairs: Sequence[Pair],
+    aligned: alignment.Aligned,
+    grid: Grid,
+    settings: Settings,
+) -> multiband.Offsets:
+    """What is added to each layer for low frequencies to agree; nothing if exposure is to stay as it is."""
+    if not (settings.exposure and pairs):
+        return multiband.none(grid, len(layers))
+    return multiband.offsets(device, layers, aligned.fields, aligned.correction, grid, aligned.unlike)
+
+
+def _blend_layers(
+    layers: Sequence[WorkingLayer], aligned: alignment.Aligned, offsets: multiband.Offsets
+) -> list[BlendLayer]:
+    """Each layer with all that its pixels are corrected by."""
+    found = zip(
+        layers, aligned.fields, aligned.reaches, aligned.correction.gains, offsets.layers, strict=True
     )
+    return [
+        BlendLayer(layer.layer, layer.box, field, reach, gain, offset)
+        for layer, field, reach, gain, offset in found
+    ]
 
 
 @contextmanager
@@ -241,71 +299,3 @@ def _overlapping(device: Device, layers: Sequence[WorkingLayer], masks: Masks) -
         if not working.same_where_both(device, layers[a], layers[b]):
             result.append(Pair(a, b))
     return result
-
-
-@dataclass(frozen=True)
-class _Work:
-    """What is calculated at working resolution. charts: on which flow is found; none if there is no flow."""
-
-    charts: Sequence[Chart]
-    grid: Grid
-    settings: Settings
-
-    def bytes(self, pixels: int, abreast: int = 1) -> int:
-        """What flow, and what is found from it, take.
-
-        pixels: of all layers. abreast: how many pairs' flow is found at a time.
-        """
-        finest = pairflow.finest(self.charts, self.grid, self.settings)
-        sizes = sorted(chart.width * chart.height for chart in finest)
-        at_last, meanwhile = _STEP_BYTES * pixels, _SOLVER_BYTES * sum(sizes[-abreast:])
-        return max(_FLOW_BYTES * sum(sizes) + at_last, _FOUND_BYTES * sum(sizes) + meanwhile)
-
-
-def _work_of_quality(
-    quality: FlowQuality,
-    full: Grid,
-    overlaps: Sequence[npt.NDArray[np.bool_]],
-    masks: Grid,
-    settings: Settings,
-) -> _Work:
-    """The work of another quality."""
-    settings = replace(settings, flow_quality=quality)
-    grid = working.working_grid(full, settings)
-    return _Work(pairflow.charts(overlaps, masks, grid, settings), grid, settings)
-
-
-def _check_memory(
-    device: Device,
-    layers: Sequence[WorkingLayer],
-    work: _Work,
-    fast: Callable[[], _Work],
-    most: int,
-) -> int:
-    """How many pairs' flow may be found at a time, `most` at most. A limit that is too low even for one is
-    refused: the working canvas must not depend on it.
-
-    fast        gives the work of `--flow-quality fast`.
-    """
-    settings = work.settings
-    taken = memory.resident() + device.own_memory + _LIBRARY_BYTES
-    pixels = sum(layer.box[2] * layer.box[3] for layer in layers)
-    limit = memory.limit(settings.max_memory)
-    for abreast in range(most, 0, -1):
-        needed = taken + work.bytes(pixels, abreast)
-        if needed <= limit:
-            break
-    _log.info("memory: about %s of %s at working resolution", memory.size(needed), memory.size(limit))
-    if needed <= limit:
-        return abreast
-    given, remedy = memory.shortage(settings.max_memory, needed)
-    what = "whose flow takes" if settings.flow else "which take"
-    said = f"{given} is too little for these layers, {what} about {memory.size(needed)}"
-    if settings.max_memory:
-        faster = fast()
-        share = faster.grid.width * faster.grid.height / (work.grid.width * work.grid.height)
-        taken -= round((1 - share) * sum(layer.pixels.nbytes for layer in layers))
-        would_do = taken + faster.bytes(round(share * pixels)) <= limit
-        raise SettingsError(f"{said}; {remedy}{', or choose --flow-quality fast' if would_do else ''}")
-    _log.warning("%s; going on with that", said)
-    return abreast

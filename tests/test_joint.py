@@ -22,7 +22,7 @@ from pictures import (
     texture,
 )
 
-from hugin_abflow import alignment, chart, coefficient, consistency, joint, merge, single
+from hugin_abflow import alignment, budget, chart, coefficient, consistency, merge, single
 from hugin_abflow.cells import SingleSource
 from hugin_abflow.errors import SettingsError
 from hugin_abflow.layer import Box, Canvas, Layer
@@ -319,8 +319,8 @@ def test_neither_threads_nor_memory_change_a_pixel(monkeypatch):
     expected = merged(layers, canvas)
     needed = {}
     # what the process holds by itself changes from run to run
-    monkeypatch.setattr(joint.memory, "resident", lambda: 100 << 20)
-    monkeypatch.setattr(joint._log, "info", lambda text, *values: needed.setdefault(text, values))
+    monkeypatch.setattr(budget.memory, "resident", lambda: 100 << 20)
+    monkeypatch.setattr(budget._log, "info", lambda text, *values: needed.setdefault(text, values))
     for other in ({"threads": 1}, {"threads": 2, "band_rows": 7}, {"max_memory": 4 << 30}):
         np.testing.assert_array_equal(merged(layers, canvas, **other), expected)
     ((reckoned, _),) = (values for text, values in needed.items() if text.startswith("memory"))

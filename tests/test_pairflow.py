@@ -12,9 +12,20 @@ import pytest
 from pictures import merged, one_device
 from scipy import ndimage
 
-from hugin_abflow import chart, consistency, flow, guidance, joint, opencl, pairflow, quality, relay, single
+from hugin_abflow import (
+    budget,
+    chart,
+    consistency,
+    flow,
+    guidance,
+    joint,
+    opencl,
+    pairflow,
+    quality,
+    relay,
+    single,
+)
 from hugin_abflow.cells import SingleSource
-from hugin_abflow.errors import SettingsError
 from hugin_abflow.guides import Guide
 from hugin_abflow.layer import Canvas, Layer
 from hugin_abflow.merge import merge_layers
@@ -93,46 +104,6 @@ def test_motion_of_a_tenth_of_the_canvas_is_searched(
     assert asked == [pytest.approx(CANVAS.width / (20 if coarse else 10), rel=0.01)]
 
 
-@pytest.mark.usefixtures(small.__name__)
-def test_memory_is_reckoned_for_charts_as_fine_as_they_get(monkeypatch: pytest.MonkeyPatch) -> None:
-    """For the solver by the largest of them."""
-    reckoned = []
-    monkeypatch.setattr(joint.memory, "resident", lambda: 0)
-    for name, bytes_ in (("fast", 0), ("fast", 10_000), ("best", 0), ("best", 10_000)):
-        monkeypatch.setattr(joint, "_SOLVER_BYTES", bytes_)
-        with pytest.raises(SettingsError, match=r"take?s? about \S+ MiB") as told:
-            merged(layers(61), CANVAS, flow_quality=name, working_pixels=45_451, max_memory=1 << 20)
-        reckoned.append(float(str(told.value).split("about ")[1].split()[0]))
-        assert "--flow-quality" not in str(told.value)  # a MiB is too little for that, too
-    few, fast, same, best = reckoned
-    assert 0 <= same - few < 2 and best - same == pytest.approx(4 * (fast - few), abs=8)
-    assert fast - few > 20
-    monkeypatch.setattr(joint, "_FOUND_BYTES", 10_000)
-    with pytest.raises(SettingsError, match=r"take?s? about \S+ MiB") as told:
-        merged(layers(61), CANVAS, flow_quality="fast", working_pixels=45_451, max_memory=1 << 20)
-    assert float(str(told.value).split("about ")[1].split()[0]) > fast
-
-
-@pytest.mark.usefixtures(small.__name__)
-@pytest.mark.parametrize("name", ["normal", "best"])
-def test_less_quality_is_advised_where_that_would_do(monkeypatch: pytest.MonkeyPatch, name: str) -> None:
-    """Where `fast` itself is not refused."""
-    monkeypatch.setattr(joint.memory, "resident", lambda: 0)
-    monkeypatch.setattr(joint, "_SOLVER_BYTES", 20_000)
-    least = {}
-    for one in ("fast", name):
-        with pytest.raises(SettingsError, match="about") as told:
-            merged(layers(61), CANVAS, flow_quality=one, working_pixels=45_451, max_memory=1 << 20)
-        least[one] = float(str(told.value).split("about ")[1].split()[0])
-    assert least[name] > 1.2 * least["fast"]
-    for share, advised in ((0.9, False), (1.1, True)):
-        limit = int(share * least["fast"] * (1 << 20))
-        with pytest.raises(SettingsError, match=r"give \d+\w") as told:
-            merged(layers(61), CANVAS, flow_quality=name, working_pixels=45_451, max_memory=limit)
-        assert str(told.value).endswith(", or choose --flow-quality fast") == advised
-    assert merged(layers(61), CANVAS, flow_quality="fast", working_pixels=45_451, max_memory=limit).any()
-
-
 def _three() -> list[Layer]:
     """Of which each two overlap, and differ."""
     rng = np.random.default_rng(5)
@@ -170,9 +141,9 @@ def test_two_pairs_are_worked_on_at_a_time_where_memory_suffices(
     most: int,
 ) -> None:
     """They are the largest two that are reckoned with; nobody is refused for want of memory for two."""
-    monkeypatch.setattr(joint.memory, "resident", lambda: 0)
+    monkeypatch.setattr(budget.memory, "resident", lambda: 0)
     monkeypatch.setattr(Device, "own_memory", 0)  # a graphics card's counts besides
-    monkeypatch.setattr(joint, "_SOLVER_BYTES", 20_000)
+    monkeypatch.setattr(budget, "_SOLVER_BYTES", 20_000)
     sizes, draw = list[int](), pairflow.charts
 
     def spy_charts(*given: Any) -> list[chart.Chart]:
@@ -187,8 +158,8 @@ def test_two_pairs_are_worked_on_at_a_time_where_memory_suffices(
     bytes_ = {"roomy": 2 * two, "tight": (one + two) // 2, "too low": one // 2}[limit]
     lanes.clear()
     if limit == "too low":  # not given by the user, so it goes on
-        monkeypatch.setattr(joint.memory, "limit", lambda given: bytes_)
-    with caplog.at_level("INFO", "hugin_abflow.joint"):
+        monkeypatch.setattr(budget.memory, "limit", lambda given: bytes_)
+    with caplog.at_level("INFO", "hugin_abflow.budget"):
         given = 0 if limit == "too low" else bytes_
         found = merged(_three(), CANVAS, threads=threads, max_memory=given)
     assert np.array_equal(found, expected)

@@ -1,0 +1,121 @@
+"""What the working resolution takes, and what is done where that is too much."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from pictures import merged, noise, one_device
+
+from hugin_abflow import budget, quality
+from hugin_abflow.budget import Work
+from hugin_abflow.errors import SettingsError
+from hugin_abflow.layer import Canvas, Layer
+from hugin_abflow.settings import Settings
+
+CANVAS = Canvas.plane(301, 151)
+MIB = 1 << 20
+
+pytestmark = pytest.mark.usefixtures(one_device.__name__)
+
+
+def layers() -> list[Layer]:
+    """Two that share 61 columns, in which they differ."""
+    return [
+        Layer.from_array(name, noise(151, 181, seed=seed), left)
+        for name, seed, left in (("a", 1, 0), ("b", 2, 120))
+    ]
+
+
+@pytest.fixture
+def small(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Canvases as small as ours are large enough for coarse charts."""
+    monkeypatch.setattr(quality, "_LEAST_PIXELS", dict.fromkeys(quality._LEAST_PIXELS, 10_000))
+
+
+def work(sizes: Sequence[int], **settings: Any) -> Work:
+    """On charts of so many pixels, which are not refined."""
+    charts: Any = [SimpleNamespace(width=pixels, height=1, coarse=1) for pixels in sizes]
+    grid: Any = SimpleNamespace(width=1000, height=1000)
+    return Work(charts, grid, Settings(flow_quality="fast", **settings))
+
+
+def reckoned(monkeypatch: pytest.MonkeyPatch, its: Work, most: int) -> int:
+    """How many pairs at a time there is memory for, beside what is taken already, in a process of nothing."""
+    monkeypatch.setattr(budget.memory, "resident", lambda: 0)
+    device: Any = SimpleNamespace(own_memory=0)
+    layer: Any = SimpleNamespace(box=(0, 0, 100, 100), pixels=np.zeros((100, 100, 4), np.float32))
+    return budget.abreast(device, [layer], its, lambda: work([1]), most)
+
+
+def test_the_larger_of_both_counts() -> None:
+    """Flow while it is found, with the largest charts' solvers, or all that is made from it."""
+    its = work([100, 300, 200])
+    one = budget._FOUND_BYTES * 600 + budget._SOLVER_BYTES * 300
+    assert its.bytes(0) == one
+    assert its.bytes(0, abreast=2) == one + budget._SOLVER_BYTES * 200
+    assert its.bytes(1_000_000) == budget._FLOW_BYTES * 600 + budget._STEP_BYTES * 1_000_000
+    assert work([]).bytes(7) == budget._STEP_BYTES * 7
+
+
+def test_as_many_pairs_at_a_time_as_the_limit_allows(monkeypatch: pytest.MonkeyPatch) -> None:
+    sizes = [100_000] * 3
+    for pairs in (1, 2, 3):
+        needed = budget._LIBRARY_BYTES + work(sizes).bytes(10_000, pairs)
+        assert reckoned(monkeypatch, work(sizes, max_memory=needed), 3) == pairs
+        assert reckoned(monkeypatch, work(sizes, max_memory=needed), 2) == min(pairs, 2)
+
+
+def test_a_limit_that_is_too_low_is_refused_if_the_user_gave_it(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    with pytest.raises(SettingsError, match=r"too little for these layers, whose flow takes about"):
+        reckoned(monkeypatch, work([100_000], max_memory=MIB), 2)
+    with pytest.raises(SettingsError, match=r"too little for these layers, which take about"):
+        reckoned(monkeypatch, work([], max_memory=MIB, flow=False), 2)
+    monkeypatch.setattr(budget.memory, "limit", lambda given: MIB)
+    assert reckoned(monkeypatch, work([100_000]), 2) == 1
+    assert caplog.messages[-1].endswith("; going on with that")
+
+
+@pytest.mark.usefixtures(small.__name__)
+def test_memory_is_reckoned_for_charts_as_fine_as_they_get(monkeypatch: pytest.MonkeyPatch) -> None:
+    """For the solver by the largest of them."""
+    reckoned = []
+    monkeypatch.setattr(budget.memory, "resident", lambda: 0)
+    for name, bytes_ in (("fast", 0), ("fast", 10_000), ("best", 0), ("best", 10_000)):
+        monkeypatch.setattr(budget, "_SOLVER_BYTES", bytes_)
+        with pytest.raises(SettingsError, match=r"take?s? about \S+ MiB") as told:
+            merged(layers(), CANVAS, flow_quality=name, working_pixels=45_451, max_memory=1 << 20)
+        reckoned.append(float(str(told.value).split("about ")[1].split()[0]))
+        assert "--flow-quality" not in str(told.value)  # a MiB is too little for that, too
+    few, fast, same, best = reckoned
+    assert 0 <= same - few < 2 and best - same == pytest.approx(4 * (fast - few), abs=8)
+    assert fast - few > 20
+    monkeypatch.setattr(budget, "_FOUND_BYTES", 10_000)
+    with pytest.raises(SettingsError, match=r"take?s? about \S+ MiB") as told:
+        merged(layers(), CANVAS, flow_quality="fast", working_pixels=45_451, max_memory=1 << 20)
+    assert float(str(told.value).split("about ")[1].split()[0]) > fast
+
+
+@pytest.mark.usefixtures(small.__name__)
+@pytest.mark.parametrize("name", ["normal", "best"])
+def test_less_quality_is_advised_where_that_would_do(monkeypatch: pytest.MonkeyPatch, name: str) -> None:
+    """Where `fast` itself is not refused."""
+    monkeypatch.setattr(budget.memory, "resident", lambda: 0)
+    monkeypatch.setattr(budget, "_SOLVER_BYTES", 20_000)
+    least = {}
+    for one in ("fast", name):
+        with pytest.raises(SettingsError, match="about") as told:
+            merged(layers(), CANVAS, flow_quality=one, working_pixels=45_451, max_memory=1 << 20)
+        least[one] = float(str(told.value).split("about ")[1].split()[0])
+    assert least[name] > 1.2 * least["fast"]
+    for share, advised in ((0.9, False), (1.1, True)):
+        limit = int(share * least["fast"] * (1 << 20))
+        with pytest.raises(SettingsError, match=r"give \d+\w") as told:
+            merged(layers(), CANVAS, flow_quality=name, working_pixels=45_451, max_memory=limit)
+        assert str(told.value).endswith(", or choose --flow-quality fast") == advised
+    assert merged(layers(), CANVAS, flow_quality="fast", working_pixels=45_451, max_memory=limit).any()
