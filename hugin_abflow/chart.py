@@ -27,6 +27,12 @@ _WRAP_MULTIPLE = 128
 _CHUNK = 4
 # Brightness that is added before the logarithm: about the dark noise of a photo, full scale is 1.
 _FLOOR = 0.05
+# Squared extents of an overlap are alike if they differ by less than this share of the largest one: which way
+# it reaches least or most is chance then.
+_ALIKE = 0.02
+# An overlap has no centre if the mean of its directions, unit vectors, is shorter than this across its axis:
+# it goes all round.
+_CENTRED = 0.02
 
 
 @dataclass(frozen=True)
@@ -128,15 +134,15 @@ def _axes(points: npt.NDArray[np.float64], weights: npt.NDArray[np.float64]) -> 
     scatter = (points * weights[:, None]).T @ points
     values, vectors = np.linalg.eigh(scatter)
     z = vectors[:, 0]
-    if values[1] - values[0] < 0.02 * values[2]:  # as wide as long: of all axes beside it the most upright
-        free = 3 if values[2] - values[0] < 0.02 * values[2] else 2
+    if values[1] - values[0] < _ALIKE * values[2]:  # as wide as long: of all axes beside it the most upright
+        free = 3 if values[2] - values[0] < _ALIKE * values[2] else 2
         upright = vectors[:, :free] @ vectors[2, :free]
         length = np.linalg.norm(upright)
         z = upright / length if length > 0.1 else z  # none is upright where it lies around a pole
     z = z * (1.0 if z[np.argmax(np.abs(z))] > 0 else -1.0)
     mean = points.T @ weights
     y = mean - z * (z @ mean)
-    if np.linalg.norm(y) < 0.02 * weights.sum():  # a ring has no centre
+    if np.linalg.norm(y) < _CENTRED * weights.sum():  # a ring has no centre
         y = vectors[:, 2] - z * (z @ vectors[:, 2])
     if np.linalg.norm(y) < 1e-6:
         y = np.array([0.0, 1.0, 0.0]) if abs(z[1]) < 0.9 else np.array([1.0, 0.0, 0.0])

@@ -94,7 +94,7 @@ def solve(
     unknown: (height, width), cells where what is seen tells nothing of exposure, and no difference weighs.
     """
     cells, inside, differences = measured.grid, measured.inside, measured.differences
-    area = np.maximum(cells.row_widths, 0.02)[:, None]
+    area = cells.bounded_widths[:, None]
     number = np.zeros(inside.shape, np.int32)  # of a layer's cell among the unknowns
     count = int(np.count_nonzero(inside))
     number[inside] = np.arange(count)

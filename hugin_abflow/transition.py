@@ -54,8 +54,6 @@ _SIGMA = 1.0
 _SWEEPS, _FIRST_SWEEPS, _DEEPER_SWEEPS = 20, 100, 30
 _RELAXATION = 1.8
 _DEPTHS = (0.25, 0.5, 0.75)
-# Cells of a sphere are reckoned with as no narrower than this part of one at the equator.
-_NARROWEST = 0.02
 
 Values = npt.NDArray[np.float32]
 
@@ -199,7 +197,7 @@ def links(price: npt.NDArray[np.float64], union: Mask, cells: Grid) -> tuple[Val
     rows = np.arange(cells.height)
     if cells.spherical:
         _, across, latitude, down = cells.lonlat
-        heights = down / (across * _narrowing(cells))
+        heights = down / (across * cells.bounded_widths)
         widths = across / down * np.maximum(np.cos(latitude - (rows + 1) * down), 0.0)
     else:
         shape = cells.region.height / cells.height * cells.width / cells.region.width
@@ -224,16 +222,10 @@ def wells(
 
     bent    b |grad f|^2. uneven: 0..1. Both are (height, width) on any grid over the same region.
     """
-    area = grid.width / cells.width * grid.height / cells.height * _narrowing(cells)
+    area = grid.width / cells.width * grid.height / cells.height * cells.bounded_widths
     alike = 1 - _means(uneven, cells)
     prices: Values = (((2 * strain) ** 2 + _means(bent, cells)) * area[:, None] * alike).astype(np.float32)
     return prices
-
-
-def _narrowing(cells: Grid) -> npt.NDArray[np.float64]:
-    """How wide cells are, by row, beside one at the equator, but never nothing."""
-    widths: npt.NDArray[np.float64] = np.maximum(cells.row_widths, _NARROWEST)
-    return widths
 
 
 def relax(device: Device, shares: Shares, system: tuple[Buffer, ...], depth: float, sweeps: int) -> None:

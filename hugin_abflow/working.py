@@ -44,6 +44,10 @@ CLIPPED = 0.98
 # OpenCL type and full-scale value of each depth; half is widened on the host.
 PIXEL = {"uint8": ("uchar", 255.0), "uint16": ("ushort", 65535.0), "float32": ("float", 1.0)}
 
+# The least `Grid.bounded_widths`, of a pixel's width at the equator: beside a pole rows are narrower, down to
+# nothing.
+_NARROWEST = 0.02
+
 Place = tuple[int, int, int, int]  # left, top, width, height on a grid
 
 
@@ -99,6 +103,12 @@ class Grid:
     def row_widths(self) -> npt.NDArray[np.float64]:
         """How wide the pixels of each row are, beside those at the equator; 1 on a plane."""
         widths: npt.NDArray[np.float64] = np.cos(self.latitudes)
+        return widths
+
+    @property
+    def bounded_widths(self) -> npt.NDArray[np.float64]:
+        """`row_widths`, but never next to nothing: for equations over cells, which are divided by it."""
+        widths: npt.NDArray[np.float64] = np.maximum(self.row_widths, _NARROWEST)
         return widths
 
     @property

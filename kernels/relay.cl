@@ -4,6 +4,10 @@
 /* Deviations of brightness from its mean are limited to this, so that none outweighs the others. */
 #define RELAY_MOST 0.3f
 
+/* How flow fits is next to unknown if brightness is known, both here and where flow leads, in less than this share of
+   the pixels that are looked at for a cell: as many as the cell has. */
+#define RELAY_LITTLE 0.2f
+
 /* Brightness of the pair's other layer where flow leads from pixel p; EXCLUDED where it is not known. */
 static inline float relay_seen(__global const float4 *other, int2 p, float2 flow, int4 grid) {
     const float2 q = (float2)(p.x, p.y) + flow;
@@ -70,7 +74,7 @@ __kernel void relay_cells(__global const float4 *found, /* (grid.y, grid.x) from
     const float4 own = found[at];
     const bool shown = own.w != 0.0f && own.w < EXCLUDED && other[at].w != 0.0f;
     cells[y * size.x + x] = (float4)(own.xy, shown ? own.z : -1.0f,
-                                     known < 0.2f * cell * cell ? -1.0f : fit * fit * fit * fit);
+                                     known < RELAY_LITTLE * cell * cell ? -1.0f : fit * fit * fit * fit);
 }
 
 /* Moves position u of a chart to where flow leads from there, in place; returns the weight of that: trust times fit, 0
