@@ -26,11 +26,15 @@ from hugin_abflow.working import Grid, Place, device_dtype, device_rows, pixel_o
 
 _log = logging.getLogger(__name__)
 
-# Bands of about this many output pixels, where the settings leave the choice and memory allows it.
-_BAND_PIXELS, _BAND_PIXELS_ON_CARD = 1 << 20, 1 << 22
+# Output pixels of a band, about, where the settings leave the choice and memory allows it.
+_BAND_PIXELS = 1 << 20
+# The same on graphics cards, which start slowly.
+_BAND_PIXELS_ON_CARD = 1 << 22
+# Rows of a band, at least.
 _LEAST_ROWS = 4
-# What files keep of each layer between two reads, and what is allocated beside that which is reckoned.
+# Rows that files keep of each layer between two reads.
 _STRIP_ROWS = 64
+# Bytes that are allocated beside those which are reckoned.
 _SLACK = 48 << 20
 # Bytes of a strip up to which bands end where strips do, although they hold some rows more then.
 _WHOLE_STRIP = 2 << 20

@@ -32,9 +32,13 @@ LEAST_CELLS = 20
 # Chart pixels between start and return of a flow that is consistent.
 CONSISTENT = 1.0
 
-# A photo shows all of a thing if so many cells of it, and this share of those at the other photo's border,
-# lie at its border, beyond which the other photo goes on. Cells from a border that still lie at it.
-_FEW_AT_BORDER, _SHARE_AT_BORDER, _BORDER = 2, 0.15, 2
+# A photo shows all of a thing if hardly any of its cells lie at the photo's border, beyond which the other
+# photo goes on: no more than so many.
+_FEW_AT_BORDER = 2
+# And so many more, as a share of those that lie at the other photo's border.
+_SHARE_AT_BORDER = 0.15
+# Cells from a border that still lie at it.
+_BORDER = 2
 
 
 @dataclass(frozen=True)

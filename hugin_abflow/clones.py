@@ -41,13 +41,20 @@ from hugin_abflow.working import Grid, cells_under, connected
 _CONTRAST = 3.0
 # Squared difference, summed over r, g, b, from which on two cells show different things.
 _DIFFERS = 0.02
-# Cells between his places, at least, and at most across and down; people keep to the ground.
-_NEAR, _ACROSS, _DOWN = 2, 48, 6
-# The least sum that tells of somebody, and the least of him, in cells of the equator's size.
-_TOLD, _LEAST = 0.5, 8.0
-# The share of what differs at one place, or at both, that has to be found at the other, and that of its cells
-# in which both are alike: two people may wear the same trousers.
-_MOSTLY, _ALIKE = 0.6, 0.6
+# Cells between his places, at least.
+_NEAR = 2
+# Cells between them across, at most.
+_ACROSS = 48
+# Cells between them down, at most: people keep to the ground.
+_DOWN = 6
+# The least sum that tells of somebody.
+_TOLD = 0.5
+# The least of him, in cells of the equator's size.
+_LEAST = 8.0
+# The share of what differs at one place, or at both, that has to be found at the other.
+_MOSTLY = 0.6
+# The share of the cells of what is found in which both are alike: two people may wear the same trousers.
+_ALIKE = 0.6
 # The share of a look that may be found as far away again: what repeats stands still.
 _REPEATS = 0.6
 # The share of one of his places that may be in the other for a cut between them, lest that goes through him.

@@ -43,9 +43,9 @@ _UNSEEN = 0.003
 # that small ones are exactly 0.
 NEGLIGIBLE = 1e-3
 
-# Shoulders of the exposure scale that are tried for integer images, and by how much better than the first,
-# which keeps white, another one has to explain the differences.
+# Shoulders of the exposure scale that are tried for integer images; the first one keeps white.
 _SHOULDERS = (1.0, 0.75, 0.5, 0.25)
+# The part of what the first one leaves unexplained that another one may leave for it to be taken.
 _BETTER = 0.8
 # Misfit, of full scale, that halves the trust in a cell.
 _MISFIT = 0.05

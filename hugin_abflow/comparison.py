@@ -12,29 +12,53 @@ from hugin_abflow.working import Grid, connected
 # Of some columns of the seam grid, (height, width, 10): MEAN to SHARE. Masks are of the same cells.
 Comparison = npt.NDArray[np.float64]
 
-# Of a cell: the mean of the layers' difference in r, g, b, the largest mean square of these, each layer's
-# variance, those of blocks, in which noise is less, and their covariance, and the share of the cell that
-# tells (kernels/seam.cl, seam_difference).
-MEAN, SQUARE, VARIANCES, COARSE, COVARIANCE, SHARE = (
-    np.s_[..., :3], np.s_[..., 3], np.s_[..., 4:6], np.s_[..., 6:8], np.s_[..., 8], np.s_[..., 9],
-)  # fmt: skip
+# What a comparison has of each cell (kernels/seam.cl, seam_difference), by its last axis.
+MEAN = np.s_[..., :3]  # of the layers' difference, in r, g, b
+SQUARE = np.s_[..., 3]  # the mean square of that difference, of the channel in which it is largest
+VARIANCES = np.s_[..., 4:6]  # of what each of both layers shows
+COARSE = np.s_[..., 6:8]  # the same of means of blocks of pixels, in which noise is less
+COVARIANCE = np.s_[..., 8]  # of the two layers, of these blocks
+SHARE = np.s_[..., 9]  # of the cell that tells: what both layers show, and neither clips
 
-# Mask over which differences are averaged: texture that is a little off is no reason to cut; and how many
-# times as far others count.
-_SIGMA, _REACH = 1.0, 3
-# Layers show unrelated things: what they differ by in all frequencies, at least, its square's share of the
-# sum of their variances (1 of what has nothing in common), and how many times one's is the other's (1 of one
-# texture that is not aligned); and how much of the smoother one, in all such cells that touch, may be in the
-# other as well (1 of what is the same and less sharp: photos of which one was out of focus, or shaken). So
-# many cells tell that by themselves, fewer as all such of both layers do.
-_UNRELATED, _OF_VARIANCES, _VARIANCE_RATIO, _RELATED, _ENOUGH = 0.06, 0.7, 1.5, 0.7, 64
-# Layers show the same things in another light: what they differ by, at least, in how many cells that touch.
-_STRONG, _LEAST = 0.15, 16
-# The share of these, at least, around which, by means over _WIDE cells, what layers show is correlated by
-# more than _SAME. And of those on their rim that show more than noise, of full scale, the share, at most,
-# that is not by _RIM_SAME: the edge of a shadow is in one layer alone.
-_MOST, _WIDE, _SAME = 0.7, 3.0, 0.8
-_CONTRAST, _FEW, _RIM_SAME = 0.01, 0.2, 0.6
+# Sigma, in cells, of the Gaussian by which differences are averaged: texture that is a little off is no
+# reason to cut.
+_SIGMA = 1.0
+# Sigmas from the middle to the end of any Gaussian here.
+_REACH = 3
+
+# Layers may show things that have nothing in common in cells that are `apart`: where the next three hold.
+# They differ in all frequencies by more than this, the root of the mean square, of full scale.
+_UNRELATED = 0.06
+# That mean square is more than this share of the sum of their variances: 1 of what has nothing in common.
+_OF_VARIANCES = 0.7
+# The larger variance is more than so many times the smaller one: 1 of one texture that is not aligned.
+_VARIANCE_RATIO = 1.5
+# Those that are apart, and touch, show unrelated things if no more than this share of what the smoother layer
+# shows there is in the other one as well: 1 of what is the same and less sharp, as in a photo that was out of
+# focus, or shaken.
+_RELATED = 0.7
+# So many cells that touch tell that by themselves; fewer are taken for what all such of both layers are.
+_ENOUGH = 64
+
+# Layers may show the same things in another light in cells that are `strong`: where their mean difference is
+# more than this in any channel, of full scale.
+_STRONG = 0.15
+# Strong cells that touch, at least, for that to be asked.
+_LEAST = 16
+# The share of them in which what layers show has to be correlated: then it is the same.
+_MOST = 0.7
+# Correlation from which on it is.
+_SAME = 0.8
+# Sigma, in cells, of the means by which that correlation is found.
+_WIDE = 3.0
+# Of the cells on their rim the share, at most, in which it is not correlated: the edge of a shadow is in one
+# layer alone.
+_FEW = 0.2
+# Correlation from which on it is, on the rim.
+_RIM_SAME = 0.6
+# Deviation, of full scale, up to which what a layer shows in a cell may be noise, and does not count for a
+# rim.
+_CONTRAST = 0.01
 
 
 def smoothed(found: Comparison, cells: Grid, sigma: float = _SIGMA) -> Comparison:

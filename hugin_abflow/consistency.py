@@ -33,17 +33,21 @@ _TOLERANCE = 2.2
 # What a near thing hides in the other photo has no place there. Flow squeezes it between its neighbours, and
 # is consistent all the same. A pixel has no trust if flow leaves no more than this share of its area.
 _SQUEEZED = 0.6
-# The level whose mean tells how much is trusted around a pixel, and the mean that is enough: less is found on
-# islands and lines on which wrong flows happen to lead back.
-_AROUND, _ENOUGH = 2, 0.3
+# The level of the pyramid, 0 the finest, whose mean tells how much is trusted around a pixel.
+_AROUND = 2
+# The mean that is enough: less is found on islands and lines on which wrong flows happen to lead back.
+_ENOUGH = 0.3
 # Weight of a pixel's own flow where its trust is a half, against that of one neighbour's; else it counts by
 # the odds of its trust. With less, thin things lose theirs; with more, what is wrong is spread.
 _OWN = 16.0
 # Difference of log brightness between neighbours that halves what is carried from one to the other.
 _EDGE = 0.08
-# Sweeps per level, and how far each goes (successive over-relaxation); on levels of fewer pixels than this
-# nothing is told apart.
-_SWEEPS, _RELAXATION, _LEAST_PIXELS = 4, 1.5, 64
+# Sweeps per level.
+_SWEEPS = 4
+# How far each sweep goes: 1 to the mean, more beyond it (successive over-relaxation).
+_RELAXATION = 1.5
+# Pixels of a level from which on it is swept: on smaller ones nothing is told apart.
+_LEAST_PIXELS = 64
 
 
 @dataclass(frozen=True)

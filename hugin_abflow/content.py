@@ -23,13 +23,17 @@ import numpy.typing as npt
 from hugin_abflow.opencl import Buffer, Device
 from hugin_abflow.working import Grid, Place, any_around
 
-# Residuals up to which layers surely show the same, and from which on surely not.
-ALIKE, _OTHER = 0.06, 0.15
+# Residual, of full scale, up to which layers surely show the same.
+ALIKE = 0.06
+# Residual, of full scale, from which on they surely do not.
+_OTHER = 0.15
 # Cells of the Gaussians that places around are averaged with, the widest first.
 _SIGMAS = (16.0, 8.0, 4.0, 2.0)
 # Places around are enough if they are this share of what is averaged; if less, the next wider ones count in
-# part. The share from which on, in any width, what they tell is sure; if less, what is there counts in part.
-_ENOUGH, _SURE = 0.05, 0.1
+# part.
+_ENOUGH = 0.05
+# The share from which on, in any width, what they tell is sure; if less, what is there counts in part.
+_SURE = 0.1
 # Sigmas to the end of a Gaussian.
 _REACH = 3
 

@@ -18,11 +18,14 @@ Points = npt.NDArray[np.float64]
 _FITS = tuple(np.geomspace(0.2, 0.005, 20).tolist())
 # Radians: what moves less does not move.
 _NO_MOTION = 1e-6
-# Fewer points say nothing about the move, more say no more.
-_LEAST, _MOST = 200, 20_000
-# The cosine of the angle by which motion may differ from that of still things, and the share that has to be
-# still for the move to be known, and for motion to be taken for parallax.
-_ALONG, _MOSTLY = 0.7, 0.8
+# Fewer points than this say nothing about the move.
+_LEAST = 200
+# More points than this, or about twice as many, say no more.
+_MOST = 20_000
+# The cosine of the angle by which motion may differ from that of still things.
+_ALONG = 0.7
+# The share that has to be still for the move to be known, and for motion to be taken for parallax.
+_MOSTLY = 0.8
 
 
 def move(u: Points, v: Points) -> Points:

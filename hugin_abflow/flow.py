@@ -50,9 +50,10 @@ class FlowParameters:
 _ROW_GROUP = 64
 # Planes of a board: BOARD_PLANES of kernels/common.cl.
 _PLANES = 22
-# Pixels of a grid up to which a graphics card relaxes it by one work-group a way, so that it is started once;
-# and columns of such a group, which has as many rows as there can be.
-_SMALL, _SMALL_COLUMNS = 1 << 14, 16
+# Pixels of a grid up to which a graphics card relaxes it by one work-group a way, so that it is started once.
+_SMALL = 1 << 14
+# Columns of such a group, which has as many rows as there can be.
+_SMALL_COLUMNS = 16
 # Bytes of a board up to which both ways are solved at a time: what does not stay in a CPU's cache is slower.
 _TOGETHER = 1 << 23
 

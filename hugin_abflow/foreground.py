@@ -39,10 +39,14 @@ from hugin_abflow.working import connected
 
 # Chart pixels by which flow may differ from cell to cell within a surface.
 _ALIKE = 0.75
-# Cells of a surface that is behind things, and its share of what both photos show.
-_WIDE, _SHARE = 40, 0.15
-# Chart pixels by which a thing's flow differs from that of what is behind it, at least and in its median.
-_APART, _FAR = 4.0, 6.0
+# Cells that a surface has, at least, for it to be behind things.
+_WIDE = 40
+# The share of what both photos show that it has, at least.
+_SHARE = 0.15
+# Chart pixels by which flow differs in each cell of a thing from that of what is behind it, at least.
+_APART = 4.0
+# The same for the median of the thing's cells.
+_FAR = 6.0
 # Strain from which on a thing is taken whole.
 _STRAIN = 0.08
 # Cells that a thing's outline is smoothed by.

@@ -32,16 +32,21 @@ from hugin_abflow.working import Grid
 _ROUNDS = ((0.1, 4.0), (1.0, 3.0), (100.0, 2.5))
 # The same, slower and stricter: what lies far from it is no exposure but something that only one layer shows.
 _STRICT = ((0.01, 4.0), (0.03, 2.5), (0.3, 1.6), (3.0, 1.2), (100.0, 1.0))
-# Where differences weigh hardly more than smoothness, gains are smooth, and blocks of so many cells across
-# share one: nearly all of a round's time goes into eliminating unknowns.
-_ROUGH, _BLOCK = 3.0, 2
+# Cells across a block that shares one gain in rough rounds: nearly all of a round's time goes into
+# eliminating unknowns.
+_BLOCK = 2
+# Weight of the differences up to which a round is rough: they weigh hardly more than smoothness there, so
+# that gains are smooth anyway.
+_ROUGH = 3.0
 # Weight of a clipped cell against smoothness: what it tells is a bound, of a brightness that nobody knows.
 _BOUND = 0.1
 # Weight of the smoothness of the difference of two layers' gains, for steps into and within cells that tell
 # nothing; that of each gain's own is 1.
 _TOGETHER = 10.0
-# The correction fades out over this share of the canvas's width; a trend hardly does.
-_FADE, _TREND_FADE = 0.12, 1.0
+# The share of the canvas's width over which the correction fades out.
+_FADE = 0.12
+# The same in all strict rounds but the last, which follow a trend: that hardly fades.
+_TREND_FADE = 1.0
 
 # Of the layers' cells, as the unknowns of `solve`.
 _Numbers = npt.NDArray[np.signedinteger[Any]]

@@ -88,8 +88,11 @@ class Coverage:
 def holes(covered: npt.NDArray[np.bool_], wraps: bool) -> list[Hole]:
     """What is not covered and does not reach the border, but for slits of less than three pixels.
 
-    covered     (height, width); wraps: whether its columns are periodic. Of a hole that lies across the
-                border of such columns the right end is beyond the width, of one that begins there both are.
+    covered     (height, width).
+    wraps       whether its columns are periodic. Then each hole is there once, and has its columns side by
+                side: those that continue beyond the last column are counted on from there. So the right end
+                of a hole across the border is beyond the width, and one that begins at column 0 has its left
+                end at the width.
     """
     if covered.all():
         return []

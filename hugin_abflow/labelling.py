@@ -20,9 +20,12 @@ import scipy
 _LARGE = 10_000
 # Nodes on each side of a cut of blocks that it may be moved to.
 _BAND = 16
-# Capacities are integers; prices are around 1. A node's four links are together less than what it takes for
-# it to keep a label that it may not have.
-_UNIT, _MOST, _MUST = 1000, 2**27, 2**30
+# Capacity of a price of 1: capacities are integers, and prices are around 1.
+_UNIT = 1000
+# The largest capacity of a price: a node's four links have together less than _MUST.
+_MOST = 2**27
+# The capacity by which a node never keeps a label that it may not have.
+_MUST = 2**30
 
 Labels = npt.NDArray[np.intp]  # (nodes,)
 

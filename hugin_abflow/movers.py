@@ -37,9 +37,11 @@ from hugin_abflow.chart import Chart
 from hugin_abflow.decision import Refused
 from hugin_abflow.working import connected
 
-# By how much flow has to miss parallax: chart pixels at the canvas's centre, and times the third quartile of
-# what all flow of the overlap misses it by; lenses and their places are not known exactly.
-_APART, _SPREADS = 3.0, 5.0
+# By how much flow has to miss parallax, in chart pixels at the canvas's centre.
+_APART = 3.0
+# The same, times the third quartile of what all flow of the overlap misses it by: lenses and their places are
+# not known exactly. The larger of both is the limit.
+_SPREADS = 5.0
 # The share of a motion that has to lead elsewhere: a near thing's edge may be matched anywhere along itself,
 # and misses parallax, but goes its way.
 _ELSEWHERE = 0.5
@@ -48,9 +50,13 @@ _WEAK = 0.3
 # The share of a thing's cells that have to miss it so far, and be shown by both photos: of a near thing an
 # edge may, where flow errs.
 _CLEAR = 0.125
-# Mean deviation of differences of log brightness from their median, without the thing's own flow, and times
-# that of what is around, as far as so many cells: plain walls and floors are matched with anything.
-_DIFFERS, _MORE, _RING = 0.12, 2.0, 4
+# By how much the photos have to differ in a thing's place without its own flow: mean deviation of differences
+# of log brightness from their median. Plain walls and floors are matched with anything.
+_DIFFERS = 0.12
+# The same, times what they differ by around the thing.
+_MORE = 2.0
+# Cells from a thing up to which others are around it.
+_RING = 4
 # Of a mask, between pixels: all of them show something.
 _SHOWN = 0.999
 

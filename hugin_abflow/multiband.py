@@ -30,8 +30,10 @@ from hugin_abflow.working import Grid, Place, WorkingLayer
 
 # The shorter side is halved down to this many pixels: the lowest frequencies change over along all of it.
 _LEAST_SIDE = 4
-# Widths of the spline that rows are smoothed with: below it hardly does anything; columns of a turn.
-_LEAST_SPREAD, _MOST_SPREAD = 0.7, 1 / 3
+# The least width, in columns, of the spline by which rows are smoothed: with less it hardly does anything.
+_LEAST_SPREAD = 0.7
+# Its largest width, as a share of all columns: beside a pole it would have no end.
+_MOST_SPREAD = 1 / 3
 # Of a grid that is none.
 _NONE = (0, 0, 0, 0)
 

@@ -48,8 +48,10 @@ _PROCESSORS: tuple[tuple[str, str, Set[str]], ...] = (
 # Where PoCL and pyopencl keep things, in a folder for caches.
 _CACHES = ("pocl/kcache", "pytools")
 
-# The ends of the names of what PoCL compiled, and seconds after which none is still being written.
-_PROGRAMS, _WRITTEN = (".so", ".bc"), 60.0
+# The ends of the names of what PoCL compiled.
+_PROGRAMS = (".so", ".bc")
+# Seconds after which none of that is still being written.
+_WRITTEN = 60.0
 
 # Where temporary files may be, beside where TMPDIR says.
 _PLACES = ("/tmp", "/var/tmp")

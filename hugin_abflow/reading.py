@@ -16,9 +16,10 @@ from hugin_abflow.working import Grid, Reduction, WorkingLayer
 
 # Parts, for each core, where cores are more than layers: so that all are done at a time.
 _PARTS = 4
-# The share of the memory that rows being read may take, and how often each is there: decoded, kept for the
-# next ones, joined with these, on the device.
-_SHARE, _COPIES = 0.25, 4
+# The share of the memory that rows being read may take.
+_SHARE = 0.25
+# How often each row is there: decoded, kept for the next ones, joined with these, on the device.
+_COPIES = 4
 
 
 def read(

@@ -25,15 +25,20 @@ from hugin_abflow.cells import grown, neighbours
 from hugin_abflow.labelling import Graph, Labels, energy, least
 from hugin_abflow.working import Grid, connected
 
-# Residual of low frequencies, of full scale, that makes a region one layer's, and that of its outskirts.
-# Where that of all frequencies reaches the first there are outskirts as well.
-_STRONG, _WEAK = 0.2, 0.045
-# From the first less this to it and this more, a cell counts from not at all to wholly as strong.
+# Residual of low frequencies, of full scale, by which a cell is strong: enough of these make a region, which
+# is taken from one layer. Cells in which that of all frequencies is as much are outskirts.
+_STRONG = 0.2
+# From so much less to so much more than that, a cell counts from not at all to wholly as strong.
 _DOUBT = 0.05
-# Where layers differ in texture as well as in brightness, less is enough: the residual up to which a cell
-# counts not at all, and from which wholly; and its share of that of all frequencies, which is low, and high,
-# where a cell does not count: more is what exposures leave, less what is not quite aligned, or noise.
-_FAINT, _TEXTURED = (0.08, 0.14), (0.55, 0.6, 0.7, 0.8)
+# Residual of low frequencies, of full scale, from which on a cell belongs to the outskirts of a region.
+_WEAK = 0.045
+# Where layers differ in texture as well as in brightness, less is enough: the residual of low frequencies, of
+# full scale, up to which a cell counts not at all, and from which on wholly.
+_FAINT = (0.08, 0.14)
+# The share that this residual has of that of all frequencies there: a cell counts wholly between the inner
+# two, not at all beyond the outer two. More is what exposures leave, less what is not quite aligned, or
+# noise.
+_TEXTURED = (0.55, 0.6, 0.7, 0.8)
 # The share of a region that such cells have at least: somebody fills his.
 _FILLED = 0.06
 # Strong cells, of the equator's size, that a region has at least: fewer are an edge that is a pixel off.
@@ -41,9 +46,11 @@ _LEAST = 4.5
 # Cells from a region up to which what is unrelated belongs to it: farther away it is no part of somebody, but
 # what one photo shows less sharp.
 _FAR = 32
-# The residual from which on a cut is seen hardly the more, and that which counts as it is: a short cut
-# through a face was dearer than a long one through a dark coat, which left the face alone.
-_SEEN, _AS_IT_IS = 0.2, 0.15
+# Residual of all frequencies, of full scale, from which on a cut is seen hardly the more: a short cut through
+# a face was dearer than a long one through a dark coat, which left the face alone.
+_SEEN = 0.2
+# The one for which a cut costs as much as without that rule: with less it is dearer, with more cheaper.
+_AS_IT_IS = 0.15
 # No layer is taken where it is not.
 _FORBIDDEN = 1e4
 # The share of a region's cells that a layer has for it to be taken from there, whole.

@@ -46,8 +46,10 @@ _OWN = 0.3
 # Pairs that are less reliable than this take composed flow that is more so, where there is any. (In rendered
 # rooms, whose parallax is known, .9 spoilt some that were right.)
 _DOUBTED = 0.8
-# Below this nothing of a pair's own flow is left, if others are sure in such a part of the overlap.
-_REFUTED, _COVERED = 0.33, 0.3
+# Of pairs that are less reliable than this nothing of their own flow is left, if others are sure enough.
+_REFUTED = 0.33
+# The part of the overlap in which others have to be sure for that.
+_COVERED = 0.3
 # The share of an overlap that others have to know, and its own flow does not, to be asked where it is not
 # doubted.
 _MISSED = 0.15
@@ -55,16 +57,19 @@ _MISSED = 0.15
 _SURE = 0.1
 # Rounds of the fixed point, each of which goes half of the way.
 _ROUNDS = 8
-# Composed flow counts if it has such a weight in so many cells.
-_LEAST_WEIGHT, _LEAST_CELLS = 0.05, 4
+# Weight that composed flow has to have in a cell for that to count.
+_LEAST_WEIGHT = 0.05
+# Cells that count, at least, for composed flow to tell something.
+_LEAST_CELLS = 4
 # Sigma, in working pixels, around a control point in which it holds flow that agrees with its move.
 _HELD = 64.0
 # Third layers that are asked about a pair, those with the largest overlaps: where many overlap each other,
 # all triangles would be too many.
 _MOST = 4
-# How much larger than a small overlap those of a third layer have to be, for its flow to be inferred, and how
-# much of it they have to show.
-_MUCH, _ALL = 3.0, 0.95
+# How many times as large as a small overlap those of a third layer have to be for its flow to be inferred.
+_MUCH = 3.0
+# The share of that overlap that they have to show.
+_ALL = 0.95
 
 Values = npt.NDArray[np.float64]
 Key = tuple[int, int]

@@ -34,21 +34,29 @@ _EVERY = 8
 _ENOUGH = 30
 # Levels of 8 bits from the brightest down to white, at most: between is overshoot, of sampling.
 _OVERSHOOT = 12
-# So many levels below white there are fewer pixels, by this factor.
-_APART, _DISTINCT = 6, 3.0
-# The least share of a layer that is white, and what part of that may be brighter.
-_SHARE, _BEYOND = 0.003, 1 / 8
+# Levels of 8 bits from white down to where there are clearly fewer pixels.
+_APART = 6
+# How many times as many pixels of white there have to be.
+_DISTINCT = 3.0
+# The least share of a layer that is white.
+_SHARE = 0.003
+# The part of what is white that may be brighter.
+_BEYOND = 1 / 8
 # Levels of 8 bits below white that are white.
 _NEAR = 2.0
 # Nothing darker is white: exposures are not corrected by so much.
 _LEAST = 64
-# Of what may be full scale of floats, what hardly any values exceed: less than CLIPPED, as nobody knows that
-# they are white; and what values are taken for at most.
-_TOP, _MOST = 0.95, 1.2
+# What the floats that hardly any others exceed are taken for, of full scale: less than CLIPPED, as nobody
+# knows that they are white.
+_TOP = 0.95
+# What floats are taken for at most, of full scale.
+_MOST = 1.2
 # What is darker than this, of full scale, is noise.
 _DARK = 0.02
-# By how much another photo has to show brighter what is clipped here, at least, and in how much of it.
-_BRIGHTER, _PART = 1.1, 0.03
+# How many times as bright another photo has to show what is clipped here.
+_BRIGHTER = 1.1
+# The part of it that has to be so.
+_PART = 0.03
 
 
 @dataclass(frozen=True)

@@ -39,23 +39,28 @@ from hugin_abflow.working import Grid, any_around, shared_cells
 _CELL = 8
 # Without flow.
 _FINE_CELL = 4
-# Price of a cut, in cells: what is cut off must be favoured by the softmax over this depth, times t / r; of
-# large regions over this share of their size.
-_CUT, _CUT_SHARE = 10.0, 0.25
+# Price of a cut, in cells: what is cut off must be favoured by the softmax over this depth, times t / r.
+_CUT = 10.0
+# The same of large regions, as a share of their size.
+_CUT_SHARE = 0.25
 # The same without flow, where the softmax has little to say: overlaps are some hundred cells wide.
 _FINE_CUT = 120.0
 # Residual of layers that agree, without flow: of two cuts that nobody sees the shorter one is taken.
 _SHORTER = 0.005
 # The share of an overlap in which layers that are not aligned may show different things, at most.
 _FEW = 0.5
-# Price of a cell that is clipped, and is not in another layer, as of a residual that nothing favours; and by
-# how much, of full scale, that may be darker: what is white here and darker there is something else.
-_CLIPPED, _DARKER = 0.5, 0.05
+# Price of a cell that is clipped, and is not in another layer that is as bright: as of a residual that
+# nothing favours.
+_CLIPPED = 0.5
+# By how much, of full scale, that layer may be darker: what is white here and darker there is something else.
+_DARKER = 0.05
 # What is left of a layer's weight where it yields: a pixel that no other layer can fill stays opaque.
 _TRACE = 1e-12
 # How many times as much as a cut it may cost to take a region from one layer that has most of it, which shows
-# things once and whole: of what single.py and shadows.py found, and of any other.
-_SINGLE_FACTOR, _WHOLE_FACTOR = 2.0, 1.65
+# things once and whole.
+_WHOLE_FACTOR = 1.65
+# The same of regions that single.py and shadows.py found.
+_SINGLE_FACTOR = 2.0
 
 
 def seam_grid(grid: Grid) -> Grid:

@@ -19,10 +19,14 @@ from hugin_abflow.pyramid import on_level
 
 Grid = tuple[int, int, int, int]  # (width, height, wraps, 0), as the kernels take it
 
-# SEARCH_MARGIN and SEARCH_RADIUS of kernels/search.cl.
-_MARGIN, _LARGEST_RADIUS = 16, 4
-# Columns that a work item takes: the float8 of kernels/search.cl, and FLOW_CHUNK of kernels/flow.cl.
-_CHUNK, _MEDIAN_CHUNK = 8, 4
+# SEARCH_MARGIN of kernels/search.cl.
+_MARGIN = 16
+# SEARCH_RADIUS of kernels/search.cl.
+_LARGEST_RADIUS = 4
+# Columns that a work item takes in kernels/search.cl: one float8.
+_CHUNK = 8
+# Columns that a work item of the median takes: FLOW_CHUNK of kernels/flow.cl.
+_MEDIAN_CHUNK = 4
 
 
 @dataclass(frozen=True)

@@ -15,9 +15,11 @@ FlowQuality = Literal["fast", "normal", "best"]
 LargeMotion = Literal["auto", "on", "off"]
 
 _WORKING_PIXELS: dict[FlowQuality, int] = {"fast": 500_000, "normal": 2_100_000, "best": 6_300_000}
-# Kernels count the 22 floats that a board (kernels/common.cl) has of each pixel of a chart in 32 bits, and
-# its rows are some hundredths longer than the chart's.
-_LEAST_WORKING_PIXELS, MOST_WORKING_PIXELS = 1024, 90_000_000
+# Of `Settings.working_pixels`, at least.
+_LEAST_WORKING_PIXELS = 1024
+# The same, at most: kernels count the 22 floats that a board (kernels/common.cl) has of each pixel of a chart
+# in 32 bits, and its rows are some hundredths longer than the chart's.
+MOST_WORKING_PIXELS = 90_000_000
 MOST_MEMORY = 1 << 50  # of `Settings.max_memory`
 
 

@@ -16,15 +16,25 @@ from hugin_abflow.cells import Mask, centres, grown
 from hugin_abflow.gains import Difference, Measured
 from hugin_abflow.working import Grid
 
-# Weight of a cell that counts: one that is cut by an outline may weigh more, but is not even. The exposure
-# scale over which a cell and those beside it are; its unit is a factor of e.
-_TRUSTED, _EVEN = 0.3, 0.25
-# Cells that a place has, at least, and up to how many from it others are around it.
-_LEAST, _AROUND = 6, 4
-# By how much more or less layers differ in a place than in most cells around, on the exposure scale; the part
-# of that which the layer without a shadow may change by there; and what the colour that differs least does of
-# that which differs most: somebody in a coat has another colour than what is behind him.
-_JUMP, _MOST, _ALONE, _GREY = 0.3, 0.7, 0.3, 0.4
+# Weight of a cell, 0..1, from which on it counts. (One that an outline cuts may weigh more, but is not even.)
+_TRUSTED = 0.3
+# How far what layers differ by may spread over a cell and those beside it for it to be even, on the exposure
+# scale, whose unit is a factor of e.
+_EVEN = 0.25
+# Even cells that touch, at least, for them to be a place.
+_LEAST = 6
+# Cells from a place up to which others are around it.
+_AROUND = 4
+# By how much more, or less, layers differ in a place of shadow than in cells around it, on the exposure
+# scale.
+_JUMP = 0.3
+# The share of these cells of which that has to be so.
+_MOST = 0.7
+# The part of that by which the layer without a shadow may change there.
+_ALONE = 0.3
+# The colour that differs least has to differ by this part of what the one that differs most does: somebody in
+# a coat has another colour than what is behind him.
+_GREY = 0.4
 # Cells by which places are grown: those that an outline cuts are not even, nor those beside them.
 _GROWN = 2
 

@@ -50,10 +50,16 @@ _LEAST_PARALLAX = 2.0
 _BENT = 0.25
 # Cells of the finest grid over which parallax and strain are averaged.
 _SIGMA = 1.0
-# Sweeps of over-relaxation on each grid, and on the coarsest before there is a well and while it gets deeper.
-_SWEEPS, _FIRST_SWEEPS, _DEEPER_SWEEPS = 20, 100, 30
+# Sweeps on each grid, at last with all of the well's depth.
+_SWEEPS = 20
+# How far each sweep goes: 1 to the least of a cell's parabola, more beyond it (over-relaxation).
 _RELAXATION = 1.8
+# Sweeps on the coarsest grid before there is a well.
+_FIRST_SWEEPS = 100
+# Parts of the well's depth that follow there, one after the other.
 _DEPTHS = (0.25, 0.5, 0.75)
+# Sweeps for each of these.
+_DEEPER_SWEEPS = 30
 
 Values = npt.NDArray[np.float32]
 

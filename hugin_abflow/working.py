@@ -26,9 +26,13 @@ from hugin_abflow.progress import Advance
 from hugin_abflow.projection import Projection, directions
 from hugin_abflow.settings import Settings
 
-# Rows of a layer that are decoded and uploaded at a time, and their bytes: many take memory, few more calls,
-# for which many cores have to wait.
-_ROWS, _ROWS_FOR_CARD, _BYTES = 64, 256, 8 << 20
+# Rows of a layer that are decoded and uploaded at a time, at most: many take memory, few more calls, for
+# which many cores have to wait.
+_ROWS = 64
+# The same for graphics cards.
+_ROWS_FOR_CARD = 256
+# Bytes of such rows, at most.
+_BYTES = 8 << 20
 
 # Strips of a layer that a part has at least.
 _PART_STRIPS = 8
