@@ -36,9 +36,11 @@ _NEARLY = 0.9
 _STRENGTH = 12.0
 # Where white need not be shown: the softmax's weights span more than that where things shift.
 _FULL_STRENGTH = 24.0
-# What is clipped as far as this, and no layer shows that clips less, has to be shown, though white; what is
-# clipped less than that yields by no more than _STRENGTH. From so many working pixels on strength is full.
-_WHITE, _FAR = 0.5, 128.0
+# The clipped share of a cell from which on it has to be shown, though white, if no layer shows it that clips
+# less.
+_WHITE = 0.5
+# Working pixels from such cells on which strength is full: next to them it is _STRENGTH.
+_FAR = 128.0
 # The least that a layer shows of a cell for others to lose all of it: less may be noise.
 _SHOWN = 0.03
 # A layer clips less than another if this part of what both show clipped, together, is the other one's alone.

@@ -21,7 +21,7 @@ __kernel void highlights_share(__global const float4 *layer, /* (box.w, box.z) r
             const float4 c = layer[y * box.z + x] / white;
             const float brightest = GREATEST(c.x, GREATEST(c.y, c.z));
             const float valid = c.w > 0.0f ? 1.0f : 0.0f;
-            sum += valid * LIMITED((brightest - nearly) / (surely - nearly), 0.0f, 1.0f);
+            sum += valid * ramp(brightest, nearly, surely);
             n += valid;
         }
     share[cy * cells.x + cx] = n > 0.0f ? sum / n : 0.0f;
@@ -36,8 +36,7 @@ __kernel void highlights_reduce(__global float4 *field,           /* (box.w, box
     const int x = get_global_id(0), y = get_global_id(1);
     if (x >= box.z || y >= box.w)
         return;
-    const float2 ratio = (float2)((float)cells.x / border.x, (float)cells.y / border.y);
-    const float2 place = (float2)(x + box.x + 0.5f, y + box.y + 0.5f) * ratio;
+    const float2 place = (float2)(x + box.x + 0.5f, y + box.y + 0.5f) * grid_ratio(border, cells);
     const float logarithm = bilinear_scalar(logarithms, place, cells);
     if (logarithm > 0.0f) /* hardly anywhere: elsewhere nothing is read or written */
         field[y * box.z + x].w *= exponential(-logarithm);
