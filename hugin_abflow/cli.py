@@ -33,7 +33,7 @@ EXIT_CODES = {
     ExitCode.USAGE: "the command line is wrong",
     ExitCode.PROJECT: "the project cannot be read, makes no panorama, or is about a photo of another size",
     ExitCode.LAYERS_MISSING: "layers or photos are missing",
-    ExitCode.LAYERS_MISMATCH: "the layers do not belong together (size, depth or channels)",
+    ExitCode.LAYERS_MISMATCH: "the layers, or the photos, do not belong together (size, depth or channels)",
     ExitCode.IMAGE_READ: "a layer or photo cannot be decoded",
     ExitCode.OUTPUT: "the panorama cannot be written",
     ExitCode.NONA: "nona is missing, or failed",

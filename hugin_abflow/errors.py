@@ -17,7 +17,7 @@ class ExitCode(IntEnum):
     USAGE = 2  # the command line itself is wrong (click's own code)
     PROJECT = 3  # the .pto file cannot be read or makes no panorama
     LAYERS_MISSING = 4  # layers or photos are not there
-    LAYERS_MISMATCH = 5  # layers do not belong together
+    LAYERS_MISMATCH = 5  # layers, or photos, do not belong together
     IMAGE_READ = 6  # an image cannot be decoded
     OUTPUT = 7  # the panorama cannot be written
     NONA = 8  # nona is missing or failed
@@ -82,7 +82,7 @@ class PhotoMissingError(AbflowError):
 
 
 class LayersMismatchError(AbflowError):
-    """Layers differ in canvas size, depth or channel count."""
+    """Layers differ in canvas size, depth or channel count, or photos in depth or channel count."""
 
     exit_code = ExitCode.LAYERS_MISMATCH
 

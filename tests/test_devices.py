@@ -100,7 +100,7 @@ def test_an_unknown_device_names_what_there_is(shelf: list[SimpleNamespace], wan
         Device(wanted)
     message = str(caught.value)
     assert f"--device {wanted}" in message
-    assert all(f"{i}: {d.name.strip()}" in message for i, d in enumerate(shelf))
+    assert all(f"{i} ({d.name.strip()})" in message for i, d in enumerate(shelf))
     assert caught.value.exit_code == ExitCode.DEVICE
 
 
