@@ -194,10 +194,10 @@ def test_a_region_comes_from_one_layer_and_an_overlap_from_both(
     least."""
     monkeypatch.setattr(seam, "_WHOLE_FACTOR", np.inf)
     grid = plane(240, 96)
-    pictures = np.full((2, 96, 240, 4), 0.5, np.float32)
+    pictures = np.full((2, 96, 240, 4), 0.1, np.float32)
     pictures[..., 3] = 1
     pictures[1, 16:80, 40:200, :3] = 0.9
-    pictures[1, :, 110:130, :3] = 0.5  # where a cut costs next to nothing
+    pictures[1, :, 110:130, :3] = 0.1  # where a cut costs next to nothing
     layers = [on_device(device, one) for one in pictures]
     left = np.where(np.arange(240) < 118, 0.95, 0.05).astype(np.float32)[None].repeat(96, 0)
     fields = []
