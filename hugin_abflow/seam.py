@@ -43,7 +43,7 @@ _FINE_CELL = 4
 _CUT = 10.0
 # The same of large regions, as a share of their size.
 _CUT_SHARE = 0.25
-# The same without flow, where the softmax has little to say: overlaps are some hundred cells wide, and the cut
+# _CUT without flow, where the softmax has little to say: overlaps are some hundred cells wide, and the cut
 # that is seen least may lie anywhere in them.
 _FINE_CUT = 400.0
 # Residual of layers that agree, without flow: of two cuts that nobody sees the shorter one is taken.
