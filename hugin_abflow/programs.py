@@ -14,6 +14,7 @@ from pathlib import Path
 
 from hugin_abflow.errors import OutputError, ProgramFailedError, ProgramMissingError
 from hugin_abflow.scratch import part_beside, put
+from hugin_abflow.signals import deferred
 
 _log = logging.getLogger(__name__)
 
@@ -50,8 +51,25 @@ def started(
     Raises `ProgramMissingError`, and `ProgramFailedError` if it cannot be run.
     """
     _log.info("%s", shlex.join(command))
+    process: subprocess.Popen[str] | None = None
     try:
-        process = subprocess.Popen(
+        with deferred():
+            process = _open(command, folder, stdin, stderr)
+        yield process
+    except BaseException:
+        if process:
+            _stop(process)
+        raise
+    finally:
+        if process:
+            with process:  # closes the pipes and waits
+                pass
+
+
+def _open(command: Sequence[str], folder: Path | None, stdin: int, stderr: int) -> subprocess.Popen[str]:
+    """Start a program, as `started` does."""
+    try:
+        return subprocess.Popen(
             command,
             cwd=folder,
             stdin=stdin,
@@ -67,12 +85,6 @@ def started(
         raise ProgramFailedError(
             f"{command[0]} cannot be run: {error.strerror}; look at its file and at the folders in PATH"
         ) from None
-    with process:  # closes the pipes and waits
-        try:
-            yield process
-        except BaseException:
-            _stop(process)
-            raise
 
 
 def run(command: Sequence[str], folder: Path, asked: str = "") -> str:

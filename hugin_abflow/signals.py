@@ -15,6 +15,8 @@ _NAMES = ("SIGINT", "SIGTERM", "SIGHUP")  # Windows has no SIGHUP
 _ENDING = [getattr(signal, name) for name in _NAMES if hasattr(signal, name)]
 _Handler = Callable[[int, FrameType | None], None] | signal.Handlers
 _installed: dict[int, _Handler] = {}  # while `interruptible`
+_deferring = False  # while `deferred`
+_told = False  # of a signal meanwhile
 
 
 @contextmanager
@@ -26,7 +28,11 @@ def interruptible() -> Iterator[None]:
     last = -float("inf")
 
     def interrupt(number: int, frame: FrameType | None) -> None:
+        global _told
         nonlocal last
+        if _deferring:
+            _told = True
+            return
         if time.monotonic() - last < 2.0:
             return  # an impatient second Ctrl-C would break off the tidying up
         last = time.monotonic()
@@ -44,6 +50,24 @@ def interruptible() -> Iterator[None]:
         _installed.clear()
         for number in changed:
             signal.signal(number, before[number])
+
+
+@contextmanager
+def deferred() -> Iterator[None]:
+    """Raise what a signal raises at the end of the ``with`` block: what is made in it, as a process, would be
+    lost if it were broken off before it has a name. Unlike `held`, what is started gets the signals.
+    """
+    global _deferring, _told
+    if threading.current_thread() is not threading.main_thread():
+        yield  # signals are raised in the main thread alone
+        return
+    _deferring, _told = True, False
+    try:
+        yield
+    finally:
+        _deferring = False
+    if _told:
+        raise KeyboardInterrupt
 
 
 @contextmanager

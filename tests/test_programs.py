@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import os
+import signal
+import subprocess
 from pathlib import Path
 
 import pytest
 
 from hugin_abflow.errors import ProgramFailedError, ProgramMissingError
 from hugin_abflow.programs import run, started
+from hugin_abflow.signals import interruptible
 
 pytestmark = pytest.mark.skipif(os.name == "nt", reason="the programs are shell scripts")
 
@@ -57,3 +60,20 @@ def test_it_does_not_outlive_an_exception(enfuse: Path) -> None:
     with pytest.raises(KeyboardInterrupt), started(["enfuse"]) as program:
         raise KeyboardInterrupt
     assert program.returncode < 0
+
+
+def test_it_does_not_outlive_a_signal_while_it_starts(enfuse: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """That comes when it runs already, and nobody has its name yet."""
+    enfuse.write_text("#!/bin/sh\nexec sleep 60\n")
+    begun: list[subprocess.Popen[str]] = []
+
+    class Interrupted(subprocess.Popen[str]):
+        def __init__(self, *arguments: object, **options: object) -> None:
+            super().__init__(*arguments, **options)  # type: ignore[call-overload]
+            begun.append(self)
+            signal.raise_signal(signal.SIGTERM)
+
+    monkeypatch.setattr(subprocess, "Popen", Interrupted)
+    with pytest.raises(KeyboardInterrupt), interruptible(), started(["enfuse"]):
+        pass
+    assert begun[0].returncode == -signal.SIGTERM

@@ -76,6 +76,18 @@ def test_handlers_of_drivers_give_way_to_those_of_a_run() -> None:
     assert handler_of(signal.SIGTERM) == signal.SIG_DFL
 
 
+def test_deferred_signals_come_at_the_end() -> None:
+    done = []
+    with pytest.raises(KeyboardInterrupt), signals.interruptible():
+        with signals.deferred():
+            signal.raise_signal(signal.SIGTERM)
+            done.append("block")
+        done.append("more")
+    with signals.interruptible(), signals.deferred():
+        done.append("no signal")
+    assert done == ["block", "no signal"]
+
+
 def test_handlers_of_programs_that_use_the_library_stay() -> None:
     theirs = [set_beside_python(number) for number in ENDING]
     with signals.held():
