@@ -15,8 +15,7 @@ _NAMES = ("SIGINT", "SIGTERM", "SIGHUP")  # Windows has no SIGHUP
 _ENDING = [getattr(signal, name) for name in _NAMES if hasattr(signal, name)]
 _Handler = Callable[[int, FrameType | None], None] | signal.Handlers
 _installed: dict[int, _Handler] = {}  # while `interruptible`
-_deferring = False  # while `deferred`
-_told = False  # of a signal meanwhile
+_waiting: list[int] | None = None  # signals that came while `deferred`; None: none has to wait
 
 
 @contextmanager
@@ -28,10 +27,9 @@ def interruptible() -> Iterator[None]:
     last = -float("inf")
 
     def interrupt(number: int, frame: FrameType | None) -> None:
-        global _told
         nonlocal last
-        if _deferring:
-            _told = True
+        if _waiting is not None:
+            _waiting.append(number)
             return
         if time.monotonic() - last < 2.0:
             return  # an impatient second Ctrl-C would break off the tidying up
@@ -54,20 +52,22 @@ def interruptible() -> Iterator[None]:
 
 @contextmanager
 def deferred() -> Iterator[None]:
-    """Raise what a signal raises at the end of the ``with`` block: what is made in it, as a process, would be
-    lost if it were broken off before it has a name. Unlike `held`, what is started gets the signals.
+    """Have signals of `interruptible` wait for the end of the ``with`` block: what is made in it, as a
+    process, would be lost if it were broken off before it has a name. Unlike `held`, what is started gets
+    the signals.
     """
-    global _deferring, _told
+    global _waiting
     if threading.current_thread() is not threading.main_thread():
         yield  # signals are raised in the main thread alone
         return
-    _deferring, _told = True, False
+    came: list[int] = []
+    _waiting = came
     try:
         yield
     finally:
-        _deferring = False
-    if _told:
-        raise KeyboardInterrupt
+        _waiting = None
+        if came:
+            signal.raise_signal(came[0])
 
 
 @contextmanager

@@ -88,6 +88,18 @@ def test_deferred_signals_come_at_the_end() -> None:
     assert done == ["block", "no signal"]
 
 
+def test_a_second_signal_after_a_deferred_one_breaks_nothing_off() -> None:
+    tidied = False
+    with pytest.raises(KeyboardInterrupt), signals.interruptible():
+        try:
+            with signals.deferred():
+                signal.raise_signal(signal.SIGINT)
+        finally:
+            signal.raise_signal(signal.SIGINT)
+            tidied = True
+    assert tidied
+
+
 def test_handlers_of_programs_that_use_the_library_stay() -> None:
     theirs = [set_beside_python(number) for number in ENDING]
     with signals.held():
