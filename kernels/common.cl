@@ -290,6 +290,13 @@ static inline float2 layer_position(float2 q, float3 d, float4 lonlat) {
     return canvas_position(canvas_point(q, lonlat) + d, lonlat);
 }
 
+/* The same, at the end of the shorter way around: longitudes jump where they go once around. */
+static inline float2 layer_near(float2 q, float3 d, float4 lonlat) {
+    float2 there = layer_position(q, d, lonlat);
+    there.x -= whole_turns(there.x - q.x, canvas_turn(lonlat));
+    return there;
+}
+
 /* What an aligned layer shows for working pixel p; false where it shows nothing. */
 static inline bool layer_shown(__global const float4 *layer, __global const float4 *field, int4 box, int2 p,
                                int4 border, float4 lonlat, float4 *c) {

@@ -97,8 +97,7 @@ __kernel void geometry_within(__global float4 *field, /* (box.w, box.z), in plac
     if (square3(own.xyz) == 0.0f)
         return;
     const float2 q = (float2)(x + box.x + 0.5f, y + box.y + 0.5f);
-    float2 there = layer_position(q, own.xyz, lonlat);
-    there.x -= whole_turns(there.x - q.x, canvas_turn(lonlat));
+    const float2 there = layer_near(q, own.xyz, lonlat);
     const float2 size = (float2)(border.x, border.y), least = 0.5f * q + 0.25f, most = 0.5f * (q + size) - 0.25f;
     float2 inside = there;
     if (!border.z)

@@ -138,9 +138,7 @@ __kernel void seam_shown(__global const float4 *layer, /* (box.w, box.z) */
                 continue;
             const float2 q = (float2)(x + 0.5f, y + 0.5f);
             const float3 d = field[at].xyz;
-            float2 way = layer_position(q, d, lonlat) - q;
-            way.x -= whole_turns(way.x, canvas_turn(lonlat));
-            const float length = ROOT(square2(way));
+            const float length = ROOT(square2(layer_near(q, d, lonlat) - q));
             const float part = length > SEAM_BEYOND ? 1.0f - SEAM_BEYOND / length : 0.0f;
             all_of_it = all_of_it && layer_sample(layer, box, layer_position(q, part * d, lonlat), border).w != 0.0f;
         }
