@@ -25,8 +25,8 @@ _STEP_BYTES = 16 + 4 + 9
 _FLOW_BYTES = 16
 # The same until flow is filled: with trust and brightness.
 _FOUND_BYTES = 32
-# Bytes for each pixel of a chart while its flow is found: of the largest charts, as many as are worked on at
-# once.
+# Bytes for each pixel of a chart while its flow is found, if the search for large motion takes no more: of
+# the largest charts, as many as are worked on at once.
 _SOLVER_BYTES = 250
 # Bytes that libraries take which are still being loaded meanwhile.
 _LIBRARY_BYTES = 50 << 20
@@ -63,9 +63,15 @@ class Work:
         pixels: of all layers. abreast: how many pairs' flow is found at a time.
         """
         finest = pairflow.finest(self.charts, self.grid, self.settings)
-        sizes = sorted(chart.width * chart.height for chart in finest)
-        while_found = _FOUND_BYTES * sum(sizes) + _SOLVER_BYTES * sum(sizes[-abreast:])
-        return max(_FLOW_BYTES * sum(sizes) + _STEP_BYTES * pixels, while_found)
+        size = sum(chart.width * chart.height for chart in finest)
+        solvers = sorted(map(self._solver_bytes, self.charts, finest))
+        while_found = _FOUND_BYTES * size + sum(solvers[-abreast:])
+        return max(_FLOW_BYTES * size + _STEP_BYTES * pixels, while_found)
+
+    def _solver_bytes(self, drawn: Chart, finest: Chart) -> int:
+        """What a pair's flow takes while it is found on one chart and ends up on another."""
+        searched = pairflow.search_room(drawn, self.grid, self.settings)
+        return max(_SOLVER_BYTES * finest.width * finest.height, searched)
 
 
 def abreast(

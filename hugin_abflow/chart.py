@@ -20,8 +20,8 @@ from hugin_abflow.working import Grid, WorkingLayer
 
 # Chart pixels around the overlap, so that flow is smooth across its border.
 _MARGIN = 16
-# Widths of charts that wrap are multiples of this, so that they halve exactly seven times: on every level of
-# the pyramid of a chart whose shorter side is below 1536 px.
+# Widths of charts that wrap are multiples of this, so that they halve exactly seven times: flow.py halves
+# them six times, which a shorter side of less than 1536 px asks for.
 _WRAP_MULTIPLE = 128
 # Pixels of a row that a work item takes: CHART_CHUNK of kernels/chart.cl.
 _CHUNK = 4

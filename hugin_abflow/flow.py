@@ -193,12 +193,20 @@ def _refine(
     return median if warps % 2 else flows
 
 
-def levels(image: Level, parameters: FlowParameters) -> int:
-    """How many levels the flow of an image has."""
-    shorter, count = min(image.grid[:2]), 1
-    while shorter >= 2 * parameters.coarsest:
-        shorter, count = shorter // 2, count + 1
+def levels(grid: Grid, parameters: FlowParameters) -> int:
+    """How many levels the flow of images on a grid has. None that wraps is of odd width: pixels of one colour
+    would meet there.
+    """
+    width, shorter, count = grid[0], min(grid[:2]), 1
+    while shorter >= 2 * parameters.coarsest and not (grid[2] and width % 4):
+        width, shorter, count = width // 2, shorter // 2, count + 1
     return count
+
+
+def search_room(reach: float, grid: Grid, parameters: FlowParameters) -> int:
+    """Bytes that the search of `solve` takes at most: of images on a grid, for motion of up to `reach` px."""
+    count, how = levels(grid, parameters), parameters.search
+    return search.most_room(reach, count, grid, how, finest=parameters.decide_on)
 
 
 def finest_features(device: Device, image: Level, parameters: FlowParameters) -> Buffer:
@@ -338,13 +346,13 @@ def solve(
     decision.py tells what of motion beyond warping's reach is kept.
     """
     parameters = parameters or FlowParameters()
-    count = start.level + 1 if start else levels(a, parameters)
+    count = start.level + 1 if start else levels(a.grid, parameters)
     reach = parameters.reach * max(a.grid[:2]) if reach is None else reach
     searched: dict[int, int] = {}
     if reach > 0 and not start:
         common = np.count_nonzero(a.mask.get() * b.mask.get())
         reach = min(reach, parameters.overlap * math.sqrt(common))
-        searched = search.reaches(reach, count, parameters.search, finest=parameters.decide_on)
+        searched = search.reaches(reach, count, a.grid, parameters.search, finest=parameters.decide_on)
     pyramids = [pyramid.build(device, image, count + 1) for image in (a, b)]
     refused: list[Refused] = []
     flows: list[Buffer] = []  # without what a search found, and with it, as long as both may be taken

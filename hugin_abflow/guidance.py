@@ -152,7 +152,7 @@ def _rivals(
 ) -> list[_Rivals]:
     """In both directions, copies of the flow as it is, and the flow that starts where guides send it."""
     solver = FlowParameters()
-    level = min(len(parameters.pulls), flow.levels(images[0], solver)) - 1
+    level = min(len(parameters.pulls), flow.levels(images[0].grid, solver)) - 1
     old = [device.copy(one) for one in flows]  # what wins is put into them
     springs = [_Springs(device, images[0], *pair, parameters) for pair in zip(old, directed, strict=True)]
     start = Start(

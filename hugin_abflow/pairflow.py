@@ -64,6 +64,20 @@ def finest(drawn: Sequence[Chart], grid: Grid, settings: Settings) -> Sequence[C
     return fine if quality.refined(settings.flow_quality, grid.width * grid.height, pixels) else drawn
 
 
+def reach(drawn: Chart, grid: Grid, settings: Settings) -> float:
+    """Px of a chart up to which motion is searched."""
+    if settings.large_motion == "off":
+        return 0.0
+    width = (grid.canvas_width or grid.region.width) * grid.width / grid.region.width
+    return _REACH * width / drawn.coarse
+
+
+def search_room(drawn: Chart, grid: Grid, settings: Settings) -> int:
+    """Bytes that the search for large motion takes, at most, of a pair that is `drawn` so."""
+    parameters = quality.flow_parameters(settings.flow_quality, settings.large_motion)
+    return flow.search_room(reach(drawn, grid, settings), drawn.border, parameters)
+
+
 class Solution(NamedTuple):
     """What is found of all pairs, in their order.
 
@@ -212,7 +226,8 @@ class _Solver:
         parameters = quality.flow_parameters(settings.flow_quality, settings.large_motion)
         images = self._images(pair, its_chart)
         bearings = its_chart.projection.bearings if its_chart.projection else None
-        solved = flow.solve(device, *images, parameters, reach=self._reach(its_chart), bearings=bearings)
+        furthest = reach(its_chart, self.grid, settings)
+        solved = flow.solve(device, *images, parameters, reach=furthest, bearings=bearings)
         found = (solved.forward, solved.backward)
         guides, held = self._guides(pair, its_chart), tuple[guidance.Values, ...]()
         if guides:
@@ -253,14 +268,6 @@ class _Solver:
         first, second = self.numbers[pair.a], self.numbers[pair.b]
         its_guides = self.guides.get((min(first, second), max(first, second)), ())
         return guidance.on_chart(its_guides, first, its_chart, self.grid)
-
-    def _reach(self, its_chart: Chart) -> float:
-        """Px of a chart up to which motion is searched."""
-        if self.settings.large_motion == "off":
-            return 0.0
-        grid = self.grid
-        width = (grid.canvas_width or grid.region.width) * grid.width / grid.region.width
-        return _REACH * width / its_chart.coarse
 
     def _images(self, pair: Pair, its_chart: Chart) -> tuple[Level, Level]:
         """What both layers of a pair show on a chart."""

@@ -9,7 +9,7 @@ from beside it where that fits better (Barnes et al., "PatchMatch", 2009).
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -27,6 +27,10 @@ _LARGEST_RADIUS = 4
 _CHUNK = 8
 # Columns that a work item of the median takes: FLOW_CHUNK of kernels/flow.cl.
 _MEDIAN_CHUNK = 4
+# Bytes for each pixel of the finest level that costs may take, and what they may take in any case: else
+# motion is looked for on coarser levels.
+_ROOM = 200
+_LEAST_ROOM = 48 << 20
 
 
 @dataclass(frozen=True)
@@ -109,18 +113,60 @@ def filtered(
     return result
 
 
-def reaches(reach: float, levels: int, parameters: SearchParameters, finest: int = 0) -> dict[int, int]:
+def reaches(
+    reach: float, levels: int, grid: Grid, parameters: SearchParameters, finest: int = 0
+) -> dict[int, int]:
     """On which levels, of `levels`, how many of their px are tried, for motion of up to `reach` px of the
     finest; none but the first is finer than `finest`.
+
+    grid    of the finest level.
     """
     if reach <= 0:
         return {}
+
+    def tried(level: int, furthest: int) -> dict[int, int]:
+        return {level: min(math.ceil(reach / 2**level), furthest)}
+
+    def fits(its: Mapping[int, int]) -> bool:
+        return room(its, grid) <= _enough_room(grid)
+
     first = min(levels - 1, max(0, math.ceil(math.log2(max(reach, 1) / parameters.coarse))))
-    return {
-        level: min(math.ceil(reach / 2**level), furthest)
-        for level, furthest in zip(range(first, -1, -1), parameters.furthest, strict=False)
-        if level >= min(first, finest)
-    }
+    # on a chart around two far corners, which are small, motion is: fine levels would do
+    while first < levels - 1 and not fits(tried(first, parameters.furthest[0])):
+        first += 1
+    result = tried(first, parameters.furthest[0])
+    for level, furthest in zip(range(first - 1, finest - 1, -1), parameters.furthest[1:], strict=False):
+        if fits(tried(level, furthest)):
+            result |= tried(level, furthest)
+    return result
+
+
+def room(tried: Mapping[int, int], grid: Grid) -> int:
+    """Bytes that `exhaustive` takes for costs where on each level so many px are tried: the most of them.
+
+    grid    of the finest level.
+    """
+    most = 0
+    for level, largest in tried.items():
+        width, height = (-(-side // 2**level) for side in grid[:2])
+        most = max(most, 2 * 4 * height * (2 * largest + 1) ** 2 * _pitch((width, height, 0, 0)))
+    return most
+
+
+def _enough_room(grid: Grid) -> int:
+    """Bytes that costs may take as long as there are coarser levels."""
+    return max(_ROOM * grid[0] * grid[1], _LEAST_ROOM)
+
+
+def most_room(reach: float, levels: int, grid: Grid, parameters: SearchParameters, finest: int = 0) -> int:
+    """Bytes that `exhaustive` takes for costs, at most, on the levels of `reaches`: for motion of up to
+    `reach` px, or of any less.
+    """
+    if reach <= 0:
+        return 0
+    all_of_it = room(reaches(reach, levels, grid, parameters, finest), grid)
+    less = room({0: math.ceil(min(reach, parameters.coarse))}, grid)
+    return max(all_of_it, min(less, _enough_room(grid)))
 
 
 def exhaustive(
@@ -134,7 +180,7 @@ def exhaustive(
     size = grid[:2]
     reach = min(largest, size[0] // 2), min(largest, size[1] // 2)
     count = (2 * reach[0] + 1) * (2 * reach[1] + 1)
-    # one way after the other in the same memory: no part of the flow needs as much
+    # one way after the other in the same memory
     room = [device.empty((grid[1], count, _pitch(grid))) for _ in range(2)]
     found, distinct = [], []
     for here, there, flow in ((a, b, flows[0]), (b, a, flows[1])):

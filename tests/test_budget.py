@@ -38,9 +38,11 @@ def small(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def work(sizes: Sequence[int], **settings: Any) -> Work:
     """On charts of so many pixels, which are not refined."""
-    charts: Any = [SimpleNamespace(width=pixels, height=1, coarse=1) for pixels in sizes]
+    charts: Any = [
+        SimpleNamespace(width=pixels, height=1, coarse=1, border=(pixels, 1, 0, 0)) for pixels in sizes
+    ]
     grid: Any = SimpleNamespace(width=1000, height=1000)
-    return Work(charts, grid, Settings(flow_quality="fast", **settings))
+    return Work(charts, grid, Settings(flow_quality="fast", large_motion="off", **settings))
 
 
 def reckoned(monkeypatch: pytest.MonkeyPatch, its: Work, most: int) -> int:
@@ -59,6 +61,13 @@ def test_the_larger_of_both_counts() -> None:
     assert its.bytes(0, abreast=2) == one + budget._SOLVER_BYTES * 200
     assert its.bytes(1_000_000) == budget._FLOW_BYTES * 600 + budget._STEP_BYTES * 1_000_000
     assert work([]).bytes(7) == budget._STEP_BYTES * 7
+
+
+def test_a_search_that_takes_more_than_the_solver_counts(monkeypatch: pytest.MonkeyPatch) -> None:
+    its, most = work([100, 300, 200]), {100: 90_000, 300: 0, 200: 80_000}
+    monkeypatch.setattr(budget.pairflow, "search_room", lambda drawn, *_: most[drawn.width])
+    assert its.bytes(0) == budget._FOUND_BYTES * 600 + 90_000
+    assert its.bytes(0, abreast=3) == budget._FOUND_BYTES * 600 + 90_000 + 80_000 + budget._SOLVER_BYTES * 300
 
 
 def test_as_many_pairs_at_a_time_as_the_limit_allows(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -85,11 +94,12 @@ def test_a_limit_that_is_too_low_is_refused_if_the_user_gave_it(
 def test_memory_is_reckoned_for_charts_as_fine_as_they_get(monkeypatch: pytest.MonkeyPatch) -> None:
     """For the solver by the largest of them."""
     reckoned = []
+    small_memory: Any = {"large_motion": "off", "working_pixels": 45_451, "max_memory": 1 << 20}
     monkeypatch.setattr(budget.memory, "resident", lambda: 0)
     for name, bytes_ in (("fast", 0), ("fast", 10_000), ("best", 0), ("best", 10_000)):
         monkeypatch.setattr(budget, "_SOLVER_BYTES", bytes_)
         with pytest.raises(SettingsError, match=r"take?s? about \S+ MiB") as told:
-            merged(layers(), CANVAS, flow_quality=name, working_pixels=45_451, max_memory=1 << 20)
+            merged(layers(), CANVAS, flow_quality=name, **small_memory)
         reckoned.append(float(str(told.value).split("about ")[1].split()[0]))
         assert "--flow-quality" not in str(told.value)  # a MiB is too little for that, too
     few, fast, same, best = reckoned
@@ -97,7 +107,7 @@ def test_memory_is_reckoned_for_charts_as_fine_as_they_get(monkeypatch: pytest.M
     assert fast - few > 20
     monkeypatch.setattr(budget, "_FOUND_BYTES", 10_000)
     with pytest.raises(SettingsError, match=r"take?s? about \S+ MiB") as told:
-        merged(layers(), CANVAS, flow_quality="fast", working_pixels=45_451, max_memory=1 << 20)
+        merged(layers(), CANVAS, flow_quality="fast", **small_memory)
     assert float(str(told.value).split("about ")[1].split()[0]) > fast
 
 

@@ -358,16 +358,35 @@ def test_twin_of_window_by_hand() -> None:
         assert found[10, 15] == pytest.approx(total / weight)
 
 
-def test_levels_of_the_search() -> None:
+def test_levels_of_the_search(monkeypatch: pytest.MonkeyPatch) -> None:
     """The finest on which reach is at most 9 px, or the coarsest there is, and the one below it."""
-    how = search.SearchParameters(coarse=9.0, furthest=(10, 7))
-    assert search.reaches(0, 6, how) == {}
-    assert search.reaches(9, 6, how) == {0: 9}
-    assert search.reaches(9.1, 6, how) == {1: 5, 0: 7}
-    assert search.reaches(70, 6, how) == {3: 9, 2: 7}
-    assert search.reaches(200, 3, how) == {2: 10, 1: 7}
-    assert search.reaches(18, 6, how, finest=1) == {1: 9}
-    assert search.reaches(3, 6, how, finest=1) == {0: 3}
+    how, grid = search.SearchParameters(coarse=9.0, furthest=(10, 7)), (120, 90, 0, 0)
+    assert search.reaches(0, 6, grid, how) == {}
+    assert search.reaches(9, 6, grid, how) == {0: 9}
+    assert search.reaches(9.1, 6, grid, how) == {1: 5, 0: 7}
+    assert search.reaches(70, 6, grid, how) == {3: 9, 2: 7}
+    assert search.reaches(200, 3, grid, how) == {2: 10, 1: 7}
+    assert search.reaches(18, 6, grid, how, finest=1) == {1: 9}
+    assert search.reaches(3, 6, grid, how, finest=1) == {0: 3}
+    monkeypatch.setattr(search, "_LEAST_ROOM", 0)  # as of charts that take more
+    grid = (1200, 900, 0, 0)
+    assert search.reaches(9, 6, grid, how) == {2: 3}
+    assert search.reaches(40, 6, grid, how) == {3: 5, 2: 7}
+    assert search.reaches(200, 1, grid, how) == {0: 10}
+
+
+@given(
+    st.floats(0, 300), st.floats(0, 1), st.integers(1, 7), st.integers(24, 3000), st.integers(24, 3000),
+    st.integers(0, 2),
+)  # fmt: skip
+def test_no_search_takes_more_room_than_is_reckoned(
+    reach: float, part: float, levels: int, width: int, height: int, finest: int
+) -> None:
+    """However much less motion there is."""
+    how, grid = search.SearchParameters(), (width, height, 0, 0)
+    tried = search.reaches(part * reach, levels, grid, how, finest)
+    assert search.room(tried, grid) <= search.most_room(reach, levels, grid, how, finest)
+    assert all(level >= min(finest, max(tried)) for level in tried)
 
 
 def test_what_kernels_do_not_hold_is_refused() -> None:

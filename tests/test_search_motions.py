@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from typing import Any
+
 import numpy as np
 import pytest
 from scipy import ndimage
 
-from hugin_abflow import flow, quality
+from hugin_abflow import flow, quality, search
 from hugin_abflow.flow import FlowParameters
 from hugin_abflow.opencl import Buffer, Device
 from hugin_abflow.pyramid import Level
@@ -171,3 +174,27 @@ def test_a_narrow_overlap_shows_all_of_its_motion(device: Device) -> None:
     seen = (x >= 21) & (x < 33)  # what a shows there, b shows too
     assert np.median(forward.get()[seen][:, 0]) == pytest.approx(-4.5, abs=0.15)
     assert np.median(backward.get()[(x >= 16) & (x < 28)][:, 0]) == pytest.approx(4.5, abs=0.15)
+
+
+def test_small_overlaps_of_a_large_chart_take_no_more_memory_than_is_reckoned(
+    device: Device, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Two corners allow for little motion, which a fine level would do for; that is of the whole chart."""
+    monkeypatch.setattr(search, "_LEAST_ROOM", 1 << 20)
+    costs, taken = search.costs, [0]
+
+    def watched(*arguments: Any, room: Sequence[Buffer], **_: Any) -> Buffer:
+        taken.append(sum(one.nbytes for one in room))
+        return costs(*arguments, room)
+
+    monkeypatch.setattr(search, "costs", lambda *given: watched(*given[:-1], room=given[-1]))
+    brightness, parameters = texture(40, 371, 217), FlowParameters()
+    y, x = np.mgrid[0:217, 0:371]
+    spots = ((x < 14) & (y < 10)) | ((x >= 357) & (y >= 207))
+    above = y < x * 217 / 371
+    a, b = (on_device(device, brightness, (mask | spots).astype(float)) for mask in (above, ~above))
+    flow.solve(device, a, b, parameters, reach=60)
+    assert 0 < max(taken) <= flow.search_room(60, (371, 217, 0, 0), parameters) < 200 * 371 * 217 + (1 << 20)
+    taken.clear()
+    flow.solve(device, a, a, parameters, reach=60)  # all of it
+    assert 0 < max(taken) <= flow.search_room(60, (371, 217, 0, 0), parameters)
