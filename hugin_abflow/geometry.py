@@ -129,7 +129,7 @@ def _displacement(
         other = pair.b if index == pair.a else pair.a
         device.run(
             "geometry", "geometry_add", chunks, coefficients[other], layers[other].box, layer.pixels,
-            layer.box, grid.border, grid.lonlat, pair.starting_on(other), pair.chart.border,
+            layer.box, grid.lonlat, pair.starting_on(other), pair.chart.border,
             pair.chart.transform, number == 0, field,
         )  # fmt: skip
     return field

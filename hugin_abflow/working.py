@@ -325,12 +325,11 @@ class Reduction:
 
     def read(self, first: int, end: int, advance: Advance) -> None:
         """Decode one of `parts`; `advance` counts rows of the layer. For several threads, each part once."""
-        _, _, full, small = self._ratio
         width, pixels = self._box[2], self._pixels
         options, white = pixel_options(self._layer)
         for row in range(first, end, self._band):
             rows = min(self._band, end - row)
-            start, stop = self._begins(row), -(-(self._top + row + rows) * full // small) - self._place[1]
+            start, stop = self._begins(row), self._ends(row + rows)
             rows_read = device_rows(self._layer, start, stop)
             if self._checked:
                 self._check(rows_read, start, row, row + rows)
@@ -346,15 +345,23 @@ class Reduction:
 
     def result(self) -> WorkingLayer:
         """The layer, of which all parts were read."""
-        if self._checked and not self._rows:
-            # too flat for a row of the grid: the order of such layers must not be the caller's
-            self._checksum = crc32(device_rows(self._layer, 0, self._layer.box.height).data)
+        if self._checked:
+            height = self._layer.box.height
+            first, last = (self._begins(0), self._ends(self._rows)) if self._rows else (height, height)
+            for start, stop in ((0, first), (last, height)):  # under no whole row of the grid
+                if start < stop:
+                    self._sum(device_rows(self._layer, start, stop), start)
         return WorkingLayer(self._layer, self._box, self._pixels, self._checksum)
 
     def _begins(self, row: int) -> int:
         """The layer's row in which a row of its box on the grid begins."""
         _, _, full, small = self._ratio
         return (self._top + row) * full // small - self._place[1]
+
+    def _ends(self, row: int) -> int:
+        """The layer's row that follows on all that lie under those of its box on the grid before `row`."""
+        _, _, full, small = self._ratio
+        return -(-(self._top + row) * full // small) - self._place[1]
 
     def _counted(self, row: int) -> int:
         """How many rows of the layer come before one of its box on the grid: none, or all, at its ends."""
@@ -369,7 +376,11 @@ class Reduction:
         stored: rows of the layer from its row `start` on.
         """
         first, last = max(start, self._counted(row)), min(start + len(stored), self._counted(end))
-        its = sum(crc32(stored[y - start].data, y) for y in range(first, last))
+        self._sum(stored[first - start : max(first, last) - start], first)
+
+    def _sum(self, stored: np.ndarray, start: int) -> None:
+        """Have the checksum tell of rows of the layer from its row `start` on."""
+        its = sum(crc32(row.data, y) for y, row in enumerate(stored, start))
         with self._checking:
             self._checksum = (self._checksum + its) % 2**32
 

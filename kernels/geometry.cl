@@ -47,7 +47,7 @@ __kernel void geometry_add(__global const float *blend_j,   /* (box_j.w, box_j.z
                            __global const float4 *layer_k,  /* (box_k.w, box_k.z) r, g, b, valid */
                            int4 box_k,                      /* place on the working grid; run size, its columns
                                                                by GEOMETRY_CHUNK, rounded up */
-                           int4 border, float4 lonlat,      /* working grid */
+                           float4 lonlat,                   /* working grid */
                            __global const float2 *flow,     /* chart grid, px: F_jk */
                            int4 grid, float16 chart,        /* chart */
                            int first,                       /* 1: nothing is in the field yet */

@@ -74,7 +74,7 @@ def test_add_equals_its_twin(device: Device, name: str, first: int) -> None:
     chart_grid = (found.width, found.height, int(found.wraps), 0)
     device.run(
         "geometry", "geometry_add", (13, 19),
-        device.upload(blend), box_j, device.upload(layer), box, grid.border, grid.lonlat,
+        device.upload(blend), box_j, device.upload(layer), box, grid.lonlat,
         device.upload(flow), chart_grid, found.transform, first, out,
     )  # fmt: skip
     expected = twin.geometry_add(

@@ -144,6 +144,19 @@ def test_a_layer_without_a_row_of_the_grid_is_counted_too(device: Device) -> Non
     assert seen == [3] and result.checksum
 
 
+@pytest.mark.parametrize("row", [0, 46])
+def test_checksums_tell_rows_that_no_row_of_the_grid_covers(device: Device, row: int) -> None:
+    """Rows 100 to 147 of a canvas, of which rows 102 to 144 lie under whole rows of the grid."""
+    grid = grid_over(Box(0, 0, 300, 300), 100, 100)
+    rows = np.full((47, 1, 4), 255, np.uint8)
+    sums = set()
+    for value in (20, 57):
+        rows[row, :, :3] = value
+        layer = Layer.from_array("a", rows.copy(), 100, 100)
+        sums.add(working.reduce_layer(device, layer, grid, nothing).checksum)
+    assert len(sums) == 2
+
+
 def test_checksums_tell_bands_that_are_exchanged(device: Device) -> None:
     pixels = random_pixels(2, 40, 128, np.uint8, 3, 0)
     grid = grid_over(Box(0, 0, 40, 128), 40, 128)
