@@ -86,6 +86,7 @@ class Prepared:
     full        the canvas's grid at full resolution; grid, gain_grid, offset_grid: those of the layers'
                 fields, gains and offsets.
     shoulder    of the exposure scale (colour.py).
+    unit        of floats, the value that counts as full scale there (unit.py).
     unlike      where layers show different things, by which offsets were made; None: nowhere.
     """
 
@@ -95,6 +96,7 @@ class Prepared:
     gain_grid: Grid
     offset_grid: Grid
     shoulder: float
+    unit: float = 1.0
     unlike: Unlike | None = None
 
 
@@ -230,8 +232,8 @@ def _bands(
                 "blend", "blend_band", groups, store.rows, touched, len(used), fields.values, gains.values,
                 offsets.values, longitudes, latitudes, full.border, full.lonlat, grid.border,
                 prepared.gain_grid.border, prepared.offset_grid.border, (part.left, part.top, *size),
-                (region.left, region.top), prepared.shoulder, int(settings.interpolation == "nearest"),
-                share, marks, marks.shape[-1], out, options=options,
+                (region.left, region.top), prepared.shoulder, prepared.unit,
+                int(settings.interpolation == "nearest"), share, marks, marks.shape[-1], out, options=options,
             )  # fmt: skip
             yield _stored(out.get(), first.dtype)
 

@@ -29,6 +29,7 @@ from hugin_abflow import (
     saturation,
     seam,
     single,
+    unit,
     working,
 )
 from hugin_abflow.blend import BlendLayer, Prepared
@@ -123,6 +124,7 @@ def prepare(
     full = working.full_grid(canvas, layers)
     grid = working.working_grid(full, settings)
     reduced = reading.read(device, layers, grid, progress, settings)
+    full_scale = unit.scale_floats(device, reduced)
     used, unused = _parted(device, reduced, layers, grid)
     flows, parallaxes, singles = _flow(device, used, full, grid, guides, settings, progress, abreast)
     with progress("align", 1) as advance:
@@ -136,7 +138,9 @@ def prepare(
         final = _blend_layers(blended, aligned, offsets) + [_unblended(device, one) for one in unused]
         advance(1)
     gains = aligned.correction
-    return Prepared(tuple(final), full, grid, gains.grid, offsets.grid, gains.shoulder, aligned.unlike)
+    return Prepared(
+        tuple(final), full, grid, gains.grid, offsets.grid, gains.shoulder, full_scale, aligned.unlike
+    )
 
 
 @dataclass(frozen=True)

@@ -77,11 +77,11 @@ BLEND_INLINE blend_correction blend_corrected(const blend_corrections *from, __g
     return result;
 }
 
-static inline blend_samples blend_correct(blend_samples c, blend_correction by, float shoulder) {
+static inline blend_samples blend_correct(blend_samples c, blend_correction by, float shoulder, float unit) {
     c = BLEND_RAISE(c, by.rise, WHITE, shoulder);
     if (INTEGER)
         return c + by.offset;
-    const blend_samples light = GREATEST(c, (blend_samples)(0.0f)), v = c + (light + EXPOSURE_FLOOR) * by.offset;
+    const blend_samples light = GREATEST(c, (blend_samples)(0.0f)) + unit * EXPOSURE_FLOOR, v = c + light * by.offset;
     return v < 0.0f && c >= 0.0f ? (blend_samples)(0.0f) : v;
 }
 
@@ -230,6 +230,7 @@ __kernel void blend_band(
     int4 band,                           /* its place: left, top, width, height; run size: columns / PIXELS, rows */
     int2 origin,                         /* the region's place on the canvas */
     float shoulder,                      /* of the exposure scale */
+    float unit,                          /* floats: their value that counts as full scale there */
     int nearest,                         /* 1: nearest-neighbour sampling */
     float share,                         /* of all weight, below which a layer is hidden */
     __global const uint *marks, int words, /* from blend_mark */
@@ -300,7 +301,7 @@ __kernel void blend_band(
                 /* a sample that falls outside its layer counts smoothly less */
                 w *= c.FOURTHS * c.FOURTHS;
                 const blend_correction correction = blend_corrected(&corrections, layers + k);
-                c = blend_correct(c, correction, shoulder);
+                c = blend_correct(c, correction, shoulder, unit);
                 corrected |= correction.some & (w > 0.0f);
                 start = BLEND_EACH(all.FOURTHS == 0.0f) ? c : start; /* the next, if that weighs nothing */
                 blend_samples part = (c - start) * BLEND_EACH(w);
@@ -322,7 +323,7 @@ __kernel void blend_band(
         if (!BLEND_SOME(fresh))
             continue;
         const blend_correction correction = blend_corrected(&corrections, layers + k);
-        v = BLEND_EACH(fresh) ? blend_correct(own, correction, shoulder) : v;
+        v = BLEND_EACH(fresh) ? blend_correct(own, correction, shoulder, unit) : v;
         corrected |= fresh & correction.some;
         alone &= !fresh;
     }

@@ -103,7 +103,7 @@ def test_a_band_of_three_layers_equals_its_twin(
     places = [(3, 0, 50, 37), (0, 5, full.width, 34), (21, 2, 40, 30)]
     boxes = [(2, 0, 31, 24), (0, 3, 48, 22), (12, 1, 26, 20)]
     band, origin, share = (2, 1, width, 36), (1301, 77), 0.05
-    shoulder = 0.0 if dtype == np.float32 else 0.75
+    shoulder, unit = (0.0, 0.3) if dtype == np.float32 else (0.75, 1.0)
     fields = [field_of(7 + i, grid, box, 1.5) for i, box in enumerate(boxes)]
     fields[2][..., 3] *= 0.02
     gains: list[np.ndarray | None] = [None]
@@ -164,14 +164,14 @@ def test_a_band_of_three_layers_equals_its_twin(
         device.run(
             "blend", "blend_band", (-(-width // together), band[3]), rows, touched, 3, lines, factors,
             summands, *axes, full.border, full.lonlat, grid.border, cells.border, halves.border, band, origin,
-            shoulder, nearest, share, device.upload(given.astype(np.uint32)), 1, out, options=options,
+            shoulder, unit, nearest, share, device.upload(given.astype(np.uint32)), 1, out, options=options,
         )  # fmt: skip
         made.append(out.get())
     assert np.array_equal(*made)  # what is not marked changes nothing
     raised = [(spans[0], offsets[0]), None, (spans[1], offsets[1])]
     expected = twin.blend_band(
         stored, places, marked_fields, boxes, gains, raised, full.border, full.lonlat, grid.border,
-        cells.border, halves.border, band, origin, shoulder, nearest, share, white,
+        cells.border, halves.border, band, origin, shoulder, unit, nearest, share, white,
     )  # fmt: skip
     result, beyond = np.split(made[0], [36])
     assert not beyond.any()

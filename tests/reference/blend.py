@@ -92,12 +92,14 @@ def position(x: Array, y: Array, displacement: Array, scale: Numbers, lonlat: Nu
     return there_x - turn * np.rint((there_x - x) / turn), there_y
 
 
-def correct(colour: Array, gain: Array, offset: Array, white: float, shoulder: float) -> Array:
+def correct(
+    colour: Array, gain: Array, offset: Array, white: float, shoulder: float, unit: float = 1.0
+) -> Array:
     """Colour in stored units with its exposure corrected, then raised; floats by their logarithms."""
     c = np.where(gain == 0, colour, exposure_shift(colour / white, gain, shoulder) * white)
     if white != 1:
         return c + white * offset
-    raised = c + (np.maximum(c, 0) + EXPOSURE_FLOOR) * (np.exp(offset) - 1)
+    raised = c + (np.maximum(c, 0) + unit * EXPOSURE_FLOOR) * (np.exp(offset) - 1)
     return np.where(offset == 0, c, np.where(c >= 0, np.maximum(raised, 0), raised))
 
 
@@ -152,6 +154,7 @@ def blend_band(
     band: Sequence[int],
     origin: Sequence[int],
     shoulder: float,
+    unit: float,
     nearest: int,
     share: float,
     white: float,
@@ -183,7 +186,7 @@ def blend_band(
         own = take(opaque_, place, columns, rows)
         colour = sample(opaque_, place, *position(x, y, f[..., :3], scale, lonlat), border, nearest, white)
         colour = np.where(f[..., :3].any(-1, keepdims=True), colour, own)
-        looks = [correct(c[..., :3], exposure, raised, white, shoulder) for c in (own, colour)]
+        looks = [correct(c[..., :3], exposure, raised, white, shoulder, unit) for c in (own, colour)]
         some = ((exposure != 0) | (raised != 0)).any(-1)
         seen.append((own[..., 3] > 0, looks, f[..., 3], colour[..., 3], some))
     count = sum(layer[0].astype(int) for layer in seen)
