@@ -22,6 +22,12 @@ OF_THE_RUN = frozenset(
     }
 )  # fmt: skip
 
+# Parameters of which only one may be given, and what is said of both.
+_RIVALS = (
+    ("quiet", "verbose", "-q and -v contradict each other"),
+    ("resume", "force", "--resume and --force contradict each other"),
+    ("prefix", "layers", "--prefix and --layers both name the layers; give one of them"),
+)
 # Parameters that say what is made of which files; `stitch.show_project` puts them into its commands.
 _OF_FILES = frozenset(
     {"output", "prefix", "layers", "remap", "keep_layers", "compression", "jpeg_quality"}
@@ -33,11 +39,11 @@ def choose(
 ) -> dict[str, Any]:
     """All options of a command by their parameters.
 
-    arguments   of the command line.
+    arguments   of the command line. What they say against an option of the file, that says nothing.
     file        of settings; None: there is none.
     alone       the file may say something about the run as a whole.
 
-    Raises `ConfigError` for what the file should not say.
+    Raises `ConfigError` for what the file should not say, and `click.UsageError` for the arguments.
     """
     values = {} if file is None else read_config(file, *_known(command))
     names = long_names(command)
@@ -49,12 +55,39 @@ def choose(
         )
     defaults = {str(names[name].name): value for name, value in values.items()}
     try:
-        with command.make_context(command.name, list(arguments), default_map=defaults) as context:
-            return dict(context.params)
+        params, given = _parsed(command, arguments, defaults)
+        overruled = {rival for name in given for rival in _rivals(name, params)} - given
+        params, _ = _parsed(command, arguments, {k: v for k, v in defaults.items() if k not in overruled})
+        for one, other, both in _RIVALS:
+            if params.get(one) and params.get(other):
+                raise click.UsageError(both)
     except click.UsageError as error:
         if file is None:
             raise
         raise ConfigError(f"{file}: {error.format_message()}") from None
+    return params
+
+
+def _parsed(
+    command: click.Command, arguments: Sequence[str], defaults: Mapping[str, Any]
+) -> tuple[dict[str, Any], set[str]]:
+    """All options by their parameters, and which of these the command line gives; a flag that it takes back
+    is not given.
+    """
+    with command.make_context(command.name, list(arguments), default_map=dict(defaults)) as context:
+        typed = click.core.ParameterSource.COMMANDLINE
+        given = {name for name in context.params if context.get_parameter_source(name) is typed}
+        return dict(context.params), {name for name in given if context.params[name]}
+
+
+def _rivals(name: str, params: Mapping[str, Any]) -> set[str]:
+    """The parameters that say something against one."""
+    rivals = {two[two[0] == name] for *two, _ in _RIVALS if name in two}
+    if name in ("prefix", "layers") and params["remap"] == "always":
+        rivals.add("remap")
+    if name == "remap" and params["remap"] == "always":
+        rivals |= {"prefix", "layers"}
+    return rivals
 
 
 def for_several(values: Mapping[str, Any], why: str) -> None:

@@ -100,7 +100,7 @@ _information = partial(click.option, cls=Option, group="Information")
     help="Quality of JPEG, and of jpeg in TIFF. [default: the project's]",
 )
 @_result(
-    "--no-metadata",
+    "--no-metadata/--metadata",
     is_flag=True,
     help="Write no camera, date and place of the first photo, and nothing that tells viewers of 360-degree "
     "panoramas how to show it.",
@@ -128,7 +128,11 @@ _information = partial(click.option, cls=Option, group="Information")
     help="Make the layers with nona. auto: only if they are missing or older than the project or its photos, "
     "or some cannot be opened, have no alpha or are of another canvas.",
 )
-@_layers("--keep-layers", is_flag=True, help="Keep the layers that nona made, beside the project.")
+@_layers(
+    "--keep-layers/--no-keep-layers",
+    is_flag=True,
+    help="Keep the layers that nona made, beside the project.",
+)
 @_blending(
     "--merge",
     type=click.Choice(get_args(MergeMode)),
@@ -177,7 +181,7 @@ _information = partial(click.option, cls=Option, group="Information")
     f"[default: {_DEFAULTS.flow_magnitude:g}]",
 )
 @_blending(
-    "--no-flow",
+    "--no-flow/--flow",
     is_flag=True,
     show_default=False,  # click would write False
     help="Do not bring the photos together by optical flow: cut where it shows least, and blend across the "
@@ -315,20 +319,16 @@ def command(projects: tuple[Path, ...], **given: Any) -> ExitCode:
         for text in config_texts(command, chosen or {Path(): (first, _chosen(first))}):
             print_result(text)
         return ExitCode.OK
-    tasks = {project: _options(**values) for project, (_, values) in chosen.items()}
+    keywords = {project: _options(**values) for project, (_, values) in chosen.items()}
     if len(found) > 1:
-        for its_options in tasks.values():
-            for_several(its_options, f"there are {len(found)}")
-        refuse_same_output({project: its_options["prefix"] for project, its_options in tasks.items()})
-    if given["dry_run"]:
-        spoken = {project: words(command, values) for project, (_, values) in chosen.items()}
-        return show({project: {**tasks[project], "options": spoken[project]} for project in tasks})
+        for its in keywords.values():
+            for_several(its, f"there are {len(found)}")
+        refuse_same_output({project: its["prefix"] for project, its in keywords.items()})
     remember = resume or force or len(found) > 1 or any(map(is_folder, projects))
-    return run(
-        [Task(project, options, remember and not force, remember) for project, options in tasks.items()],
-        how,
-        lone=len(found) == 1,
-    )
+    tasks = [Task(project, its, remember and not force, remember) for project, its in keywords.items()]
+    if given["dry_run"]:
+        return show(tasks, {project: words(command, values) for project, (_, values) in chosen.items()})
+    return run(tasks, how, lone=len(found) == 1)
 
 
 def _chosen(file: Path | None, alone: bool = True) -> dict[str, Any]:
@@ -364,10 +364,6 @@ def _run_options(
     **others: Any,
 ) -> tuple[bool, bool, bool, Run]:
     """What the options say about the run as a whole: --recursive, --resume, --force, and how it is done."""
-    if quiet and verbose:
-        raise click.UsageError("-q and -v contradict each other")
-    if resume and force:
-        raise click.UsageError("--resume and --force contradict each other")
     arguments = click.get_current_context().meta[ARGUMENTS]
     return recursive, resume, force, Run(jobs, report, log, quiet, verbose, arguments, profile, scheduler)
 
@@ -393,8 +389,6 @@ def _options(
     **others: Any,
 ) -> dict[str, Any]:
     """The keywords of `merge_project` that the command's options mean; `others` are such by themselves."""
-    if prefix is not None and layers:
-        raise click.UsageError("--prefix and --layers both name the layers; give one of them")
     settings = Settings(
         merge=merge,
         softmax_sharpness=softmax_sharpness,

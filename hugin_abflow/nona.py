@@ -45,6 +45,7 @@ from hugin_abflow.programs import LAST_LINES, ending, last_lines, move_whole, st
 from hugin_abflow.progress import Progress, silent
 from hugin_abflow.project import Plan, PlannedImage, file_key
 from hugin_abflow.scratch import is_file, work_folder
+from hugin_abflow.tifftags import is_edited
 
 log = logging.getLogger("hugin_abflow.nona")
 
@@ -141,8 +142,14 @@ def planned_layers(plan: Plan, remap: Remap) -> tuple[Found | None, Sequence[Pla
         return None, plan.images
     unusable, stale = found.unusable(plan), found.stale(plan)
     if (unusable or stale) and _can_make(plan):
+        edited = [file for file in found.in_order() if is_edited(file)]
         if unusable:
             log.warning("%s: all layers are made again", unusable)
+        elif edited:
+            log.warning(
+                "%s was changed by another program, but %s is older than the project or its photo: layers "
+                "are made again (--remap never takes them as they are)", edited[0], stale[0],
+            )  # fmt: skip
         else:
             log.info("%s is older than the project or its photo: layers are made again", stale[0])
         return None, plan.images
@@ -401,6 +408,12 @@ def _keep(plan: Plan, prefix: str, made: dict[int, Path]) -> dict[int, Path]:
             raise OutputError(
                 f"{final} has no alpha channel: it is no layer, and none takes its place; move it, or rename "
                 "the project"
+            )
+    for final in finals.values():
+        if is_edited(final):
+            raise OutputError(
+                f"{final} was changed by another program than nona, and no layer takes its place; move it, "
+                "leave out --keep-layers, or take the layers as they are (--remap never)"
             )
     for index, path in made.items():
         final = finals[index]

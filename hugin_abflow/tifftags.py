@@ -24,6 +24,8 @@ SUBFILE_TYPE, X_RESOLUTION, Y_RESOLUTION, X_POSITION, Y_POSITION = 254, 282, 283
 FULL_WIDTH, FULL_HEIGHT = 33300, 33301
 MAIN, EXIF, GPS = 0, 34665, 34853  # directories, by the tag in the main one that points to them
 ASCII, SHORT, LONG, RATIONAL, UNDEFINED = 2, 3, 4, 5, 7  # TIFF types
+# Software, DateTime, Artist, XMP, Photoshop's own, EXIF: editors and exiftool write some of these, nona none.
+_EDITORS = frozenset({305, 306, 315, 700, 34377, EXIF})
 _NUMBERS = {3: "H", 4: "I", 5: "II", 9: "i", 10: "ii", 11: "f", 12: "d", 16: "Q"}  # TIFF type -> struct
 _RATIONALS = (5, 10)
 _IFD8 = 18
@@ -101,6 +103,15 @@ def read_places(path: Path) -> list[Place]:
             return [_place(_numbers(file, layout, start)) for start in _directories(file, layout, first)]
     except (OSError, struct.error, OverflowError, ValueError) as error:
         raise ImageReadError(f"{path} is not a readable TIFF file ({error}); make the layer again") from None
+
+
+def is_edited(path: Path) -> bool:
+    """Whether another program than nona wrote a TIFF, or changed it; False for what is no TIFF file."""
+    try:
+        with path.open("rb") as file:
+            return bool(_EDITORS & _entries(file, *_read_header(file))[0].keys())
+    except (OSError, struct.error, OverflowError, ValueError):
+        return False
 
 
 def read_directories(file: BinaryIO) -> dict[int, dict[int, Value]]:

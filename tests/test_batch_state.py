@@ -15,7 +15,7 @@ import tifffile
 from conftest import age, names_in
 from shoots import HEIGHT, WIDTH, write_project
 
-from hugin_abflow import outputs
+from hugin_abflow import cli, outputs
 from hugin_abflow.batch import state, task
 from hugin_abflow.batch.record import Record
 from hugin_abflow.batch.task import Task, perform
@@ -62,6 +62,31 @@ def make(shoot: Path, monkeypatch: pytest.MonkeyPatch) -> Make:
         return perform(Task(folder / "tiny.pto", keywords, resume, remember=True), Deaf())
 
     return run
+
+
+def test_dry_run_leaves_out_what_holds(make: Make, shoot: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """By the options of the run; with --force, and of one project without --resume, it is made."""
+    options = {**cli_options(), "settings": Settings()}
+    make(**options)
+    holds = "# tiny.pto: tiny.tif: made before, still holds (--force: anew)\n"
+    for arguments, shown in (
+        ([str(shoot)], True),
+        (["--resume", str(shoot / "tiny.pto")], True),
+        ([str(shoot / "tiny.pto")], False),
+        (["--force", str(shoot)], False),
+        (["--seam", "off", str(shoot)], False),
+    ):
+        assert cli.main(["--dry-run", *arguments]) == 0
+        said = capsys.readouterr().out
+        assert (said == holds) == shown and ("hugin-abflow -o" in said or "--seam off" in said) != shown
+
+
+def cli_options() -> dict[str, Any]:
+    """Keywords of `stitch_project` as the command line has them where nothing is said."""
+    return {
+        "prefix": None, "layers": None, "keep_layers": False, "compression": None, "jpeg_quality": None,
+        "metadata": True,
+    }  # fmt: skip
 
 
 def test_what_holds_is_skipped_and_recorded_as_it_was(make: Make, shoot: Path) -> None:

@@ -1,4 +1,4 @@
-"""Files that are named as layers would be, and are none: photos, layers of another canvas."""
+"""Files that are named as layers would be, and are none: photos, layers of another canvas, edited ones."""
 
 from __future__ import annotations
 
@@ -9,14 +9,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 import tifffile
-from conftest import photo_pixels, to_make
+from conftest import age, photo_pixels, remap, to_make
 from layer_files import write_layer
 
 from hugin_abflow.errors import LayersMismatchError, OutputError
 from hugin_abflow.found import candidates
 from hugin_abflow.merge import refuse_input
 from hugin_abflow.nona import open_layers
-from hugin_abflow.project import file_key, read_plan
+from hugin_abflow.project import Plan, file_key, read_plan
+from hugin_abflow.tifftags import ASCII, EXIF, MAIN, UNDEFINED, Value, add_directories, is_edited
 
 pytestmark = pytest.mark.usefixtures("temporary")
 
@@ -134,3 +135,59 @@ def test_a_picture_is_not_replaced_by_a_layer_that_is_kept(make_project, nona):
     ):
         pass
     assert {path.name: path.read_bytes() for path in plan.folder.iterdir()} == before
+
+
+# ------------------------------------------------------------------------------------ edited layers
+
+
+@pytest.fixture
+def edited(make_project) -> Plan:
+    """A project that was saved since nona made its three layers, of which an editor wrote the second."""
+    plan = read_plan(make_project())
+    remap(plan, "pano")
+    add_directories(plan.folder / "pano0001.tif", {MAIN: {305: Value(ASCII, b"GIMP 2.10\0")}})
+    for index in range(3):
+        age(plan.folder / f"pano{index:04d}.tif", 60)
+    return plan
+
+
+@pytest.mark.parametrize("request_", [{}, {"remap": "always"}])
+def test_an_edited_layer_is_not_replaced_by_one_that_is_kept(edited, nona, request_):
+    """Whoever painted its alpha would lose that."""
+    before = {path.name: path.read_bytes() for path in edited.folder.iterdir()}
+    with (
+        pytest.raises(OutputError, match=r"pano0001\.tif was changed by another program"),
+        open_layers(edited, keep_layers=True, **request_),
+    ):
+        pass
+    assert {path.name: path.read_bytes() for path in edited.folder.iterdir()} == before
+
+
+def test_it_is_told_if_it_is_not_used(edited, nona, temporary, caplog):
+    with open_layers(edited) as layers:
+        assert all(temporary in layer.file.parents for layer in layers)
+    assert "pano0001.tif was changed by another program" in caplog.text
+    caplog.clear()
+    with open_layers(edited, remap="never") as layers:
+        assert all(layer.file.parent == edited.folder for layer in layers)
+    assert "another program" not in caplog.text
+
+
+def test_others_are_made_beside_it(edited, nona):
+    (edited.folder / "pano0002.tif").unlink()
+    for path in (edited.file, *(image.photo for image in edited.images)):
+        age(path, 120)
+    with open_layers(edited, keep_layers=True) as layers:
+        assert all(layer.file.parent == edited.folder for layer in layers)
+    assert is_edited(edited.folder / "pano0001.tif")
+
+
+def test_what_nona_writes_was_not_edited(edited, tmp_path):
+    files = [edited.folder / f"pano{index:04d}.tif" for index in range(3)]
+    assert [is_edited(file) for file in files] == [False, True, False]
+    add_directories(files[0], {EXIF: {36864: Value(UNDEFINED, b"0230")}})
+    assert is_edited(files[0])
+    for data in (b"", b"II*\0", b"no TIFF at all"):
+        (tmp_path / "x").write_bytes(data)
+        assert not is_edited(tmp_path / "x")
+    assert not is_edited(tmp_path / "none")

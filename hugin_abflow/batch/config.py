@@ -35,7 +35,7 @@ def read_config(file: Path, kinds: Mapping[str, str], paths: Iterable[str]) -> d
     another kind.
     """
     try:
-        values = tomllib.loads(file.read_text("utf-8"))
+        values = tomllib.loads(file.read_text("utf-8-sig"))
     except OSError as error:
         raise ConfigError(f"{file} cannot be read: {error.strerror}; check --config") from None
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:

@@ -8,7 +8,6 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from hugin_abflow import trace
 from hugin_abflow.batch.cluster import Cluster
@@ -16,7 +15,7 @@ from hugin_abflow.batch.display import Display, choose_display, open_log
 from hugin_abflow.batch.pool import Alone, Pool
 from hugin_abflow.batch.record import Record
 from hugin_abflow.batch.report import print_table, write_report
-from hugin_abflow.batch.task import Task
+from hugin_abflow.batch.task import Task, left_alone
 from hugin_abflow.errors import AbflowError, ExitCode, OutputError, SameOutputError
 from hugin_abflow.scratch import is_special
 from hugin_abflow.stitch import show_project
@@ -143,13 +142,18 @@ def _announced(tasks: Iterable[Task | None], running: set[Path], display: Displa
             yield waiting.pop(project)
 
 
-def show(options: Mapping[Path, Mapping[str, Any]]) -> ExitCode:
-    """Print on stdout what would be done with each project and its keywords of `stitch_project`."""
+def show(tasks: Iterable[Task], words: Mapping[Path, Sequence[str]]) -> ExitCode:
+    """Print on stdout what would be done for each task. words: of its project, options of our own."""
     codes = []
     with messages(logging.WARNING):
-        for project, keywords in options.items():
+        for one in tasks:
             try:
-                print_result("\n".join(show_project(project, **keywords)))
+                if left := left_alone(one):
+                    names = ", ".join(file.name for file in left)
+                    print_result(f"# {one.project.name}: {names}: made before, still holds (--force: anew)")
+                else:
+                    options = words[one.project]
+                    print_result("\n".join(show_project(one.project, **one.options, options=options)))
                 codes.append(ExitCode.OK)
             except AbflowError as error:
                 complain(str(error))

@@ -112,6 +112,13 @@ def perform(task: Task, listener: Listener, level: int = logging.WARNING, turn: 
     return record
 
 
+def left_alone(task: Task) -> list[Path]:
+    """The outputs that `perform` leaves as they are, since they still hold; none: it makes them."""
+    record = Record(task.project.absolute())
+    state = _state(task, record) if task.resume else None
+    return record.files if state and state.restore(record) else []
+
+
 def _state(task: Task, record: Record) -> State | None:
     """What is remembered of the project; tells `record` of the inputs. None where one of them cannot be read,
     of which `stitch_project` tells.
