@@ -25,7 +25,7 @@ from hugin_abflow.options import ARGUMENTS, Command, Compression, NewFile, Numbe
 from hugin_abflow.scratch import is_folder
 from hugin_abflow.settings import FlowQuality, LargeMotion, MergeMode, Settings
 from hugin_abflow.signals import interruptible
-from hugin_abflow.terminal import complain, print_result, say
+from hugin_abflow.terminal import complain, print_result, say, system_error
 
 EXIT_CODES = {
     ExitCode.OK: "every panorama was written",
@@ -293,7 +293,8 @@ def command(projects: tuple[Path, ...], **given: Any) -> ExitCode:
     config: Path | None = given["config"]
     places = [*projects, given["watch"]] if given["watch"] else list(projects)
     if not places and not given["print_config"]:
-        raise click.UsageError("Missing argument 'PROJECT...'.")
+        named = " --layers takes all files that follow it; name the project first." if given["layers"] else ""
+        raise click.UsageError(f"Missing argument 'PROJECT...'.{named}")
     if projects and given["watch"]:
         raise click.UsageError("--watch names the folder; leave out PROJECT")
     if given["dry_run"] and given["watch"]:
@@ -423,7 +424,7 @@ def _run(arguments: Sequence[str] | None) -> int:
     except OSError as error:
         if isinstance(error.__context__, KeyboardInterrupt):
             return ExitCode.INTERRUPTED  # with a terminal that is gone, which click would write to
-        complain(str(error))
+        complain(system_error(error))
         return ExitCode.FAILED
     except click.ClickException as error:
         complain(f"{error.format_message()}\nTry '{PROGRAM} --help'.")

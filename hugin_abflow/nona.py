@@ -28,6 +28,7 @@ from hugin_abflow.errors import (
     ProjectError,
     SettingsError,
 )
+from hugin_abflow.formats import foreign_format
 from hugin_abflow.found import (
     Found,
     Remap,
@@ -48,6 +49,10 @@ from hugin_abflow.scratch import is_file, work_folder
 from hugin_abflow.tifftags import is_edited
 
 log = logging.getLogger("hugin_abflow.nona")
+
+# Bytes of a project's name with which those of its layers begin while they are made: file systems take 255,
+# and numbers and endings follow.
+_LONGEST_NAME = 200
 
 _STEPS = ("remapping ", "saving ")  # what nona -v says at the end of a photo's loading and remapping
 _LOADING = "loading "  # and at its beginning
@@ -337,7 +342,7 @@ def _project_for_nona(plan: Plan, folder: Path) -> Path:
 
 def _prefix(plan: Plan, folder: Path) -> str:
     """Where nona makes layers; named in UTF-8, without which OpenImageIO reads nothing."""
-    name = plan.stem.encode(errors="replace").decode()
+    name = plan.stem.encode(errors="replace")[:_LONGEST_NAME].decode(errors="ignore")
     return str(folder / plan.layer_prefix(name))
 
 
@@ -360,6 +365,11 @@ def _failure(
     images = [image for image in images if named_in_unicode(image.photo)]  # else they cannot be opened here
     if "did not find a matching file type" in said:
         for image in images:
+            if foreign := foreign_format(image.photo):
+                return ImageReadError(
+                    f"{image.photo} is {foreign}, which Hugin does not read; convert it to JPEG or TIFF, and "
+                    "align the project with that"
+                )
             if image_size(image.photo) is None:
                 return ImageReadError(
                     f"{image.photo} is no image that can be read; copy it from the camera again"

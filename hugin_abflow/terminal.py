@@ -37,6 +37,11 @@ def complain(text: str, program: str = PROGRAM) -> None:
     say(f"{program}: error: {text}")
 
 
+def warn(text: str, program: str = PROGRAM) -> None:
+    """Print a warning to stderr, outside of what logs messages."""
+    say(label(logging.WARNING, program) + text)
+
+
 def print_path(path: Path) -> None:
     """Print a result to stdout."""
     print_result(os.fspath(path))
@@ -75,6 +80,13 @@ def is_bug(error: Exception) -> bool:
     return not isinstance(error, AbflowError | MemoryError | OSError)
 
 
+def system_error(error: OSError) -> str:
+    """What the system says of an error; of the only one without a name of a file, what to do."""
+    if isinstance(error, FileNotFoundError) and error.filename is None:  # os.getcwd
+        return "the current folder is no longer there; go to one that is"
+    return str(error)
+
+
 def explain(task: str, error: Exception) -> tuple[str, ExitCode]:
     """What went wrong in a task and what to do about it, and the exit code for it."""
     if isinstance(error, AbflowError):
@@ -83,7 +95,7 @@ def explain(task: str, error: Exception) -> tuple[str, ExitCode]:
         remedy = "close other programs, or make the panorama smaller in Hugin"
         return f"{task}: not enough memory; {remedy}", ExitCode.FAILED
     if isinstance(error, OSError):
-        return f"{task}: {error}", ExitCode.FAILED
+        return f"{task}: {system_error(error)}", ExitCode.FAILED
     return (
         f"{task}: {type(error).__name__}: {error}\n"
         f"This is a bug in {PROGRAM}; please report it with what the same command prints with -v."

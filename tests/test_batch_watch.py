@@ -54,6 +54,23 @@ def test_project_comes_up_once_it_has_settled(tmp_path: Path) -> None:
     assert after(saved, 1) == ["a.pto", "b.pto"]
 
 
+def test_a_folder_that_is_gone_is_told_once_and_looked_for_again(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = tmp_path / "card"
+    write_project(folder / "a.pto")
+    saved = start(folder)
+    assert after(saved, 4) == ["a.pto"] and capsys.readouterr().err == ""
+    for back in (False, True):
+        folder.rename(tmp_path / "gone")
+        assert after(saved, 3) == []
+        assert capsys.readouterr().err == (
+            f"hugin-abflow: warning: {folder} is no longer there, or closed to you; it is looked for again\n"
+        )
+        (tmp_path / "gone").rename(folder)
+        assert after(saved, 5) == [] and capsys.readouterr().err == "", back
+
+
 def test_project_that_is_still_being_saved_waits(tmp_path: Path) -> None:
     saved = start(tmp_path)
     for part in range(6):

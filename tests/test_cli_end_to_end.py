@@ -143,6 +143,22 @@ def test_project_that_is_none(folder: Path, capsys: pytest.CaptureFixture[str]) 
     assert code == ExitCode.PROJECT and "photo.pto" in message
 
 
+def test_project_that_layers_have_swallowed(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    code, message = broken(folder, ["--layers", "tiny.pto"], capsys)
+    assert code == ExitCode.USAGE and "name the project first" in message
+
+
+@pytest.mark.skipif(os.name == "nt", reason="Windows removes no folder that is in use")
+def test_current_folder_that_is_gone(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "gone").mkdir()
+    monkeypatch.chdir(tmp_path / "gone")
+    (tmp_path / "gone").rmdir()
+    assert cli.main(["tiny.pto"]) == ExitCode.FAILED
+    assert "current folder is no longer there; go to one that is" in capsys.readouterr().err
+
+
 def test_project_that_is_not_there(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     code, message = broken(folder, [str(folder / "gone.pto")], capsys)
     assert code == ExitCode.PROJECT and "gone.pto" in message

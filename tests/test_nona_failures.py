@@ -36,6 +36,25 @@ def test_photo_is_none(make_project, nona):
         pass
 
 
+@pytest.mark.parametrize(
+    ("begins", "kind"), [(b"RIFF\0\0\0\0WEBPVP8 ", "WebP"), (b"\0\0\0\x18ftypheic", "HEIF")]
+)
+def test_photo_of_a_format_that_hugin_does_not_read(make_project, nona, begins, kind):
+    """It may be sound: nobody needs to copy it again."""
+    plan = read_plan(make_project())
+    photo = plan.images[1].photo
+    photo.write_bytes(begins + bytes(300))
+    with pytest.raises(ImageReadError, match=rf"{photo} is {kind}, .*convert it to JPEG"), open_layers(plan):
+        pass
+
+
+def test_a_project_with_a_name_as_long_as_file_systems_take(make_project, nona):
+    project = make_project()
+    plan = read_plan(project.rename(project.with_name("ö" * 125 + "a.pto")))
+    with open_layers(plan) as layers:
+        assert len(layers) == 3
+
+
 def test_photo_that_must_not_be_read(make_project, nona, as_nobody):
     """Nona names it as the project does."""
     plan = read_plan(make_project())

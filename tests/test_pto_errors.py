@@ -103,6 +103,13 @@ def test_what_is_no_project_at_all(data: bytes) -> None:
     assert caught.value.line == 0
 
 
+def test_a_picture_is_told_as_such() -> None:
+    """Photos are dropped on the program, too."""
+    with pytest.raises(PtoError, match=r"a\.jpg: found 'JPEG', expected a project; name the \.pto") as caught:
+        pto.loads(b"\xff\xd8\xff\xe0\0\x10JFIF\0", "a.jpg")
+    assert caught.value.line == 0
+
+
 def test_utf16_is_refused_by_its_nul_bytes() -> None:
     with pytest.raises(PtoError, match="NUL") as caught:
         pto.loads(HUGIN.decode().encode("utf-16"))

@@ -53,7 +53,7 @@ def read_config(file: Path, kinds: Mapping[str, str], paths: Iterable[str]) -> d
 
 
 def write_config(values: Mapping[str, Any]) -> str:
-    """The text of a file that gives these options; those that say nothing are left out."""
+    """The text of a file that gives these options; those that say nothing are named in a comment."""
     plain = {
         name: [str(one) for one in value]
         if isinstance(value, list | tuple)
@@ -63,7 +63,8 @@ def write_config(values: Mapping[str, Any]) -> str:
         for name, value in values.items()
         if value is not None and value != ()
     }
-    return tomli_w.dumps(plain)
+    silent = ", ".join(name for name in values if name not in plain)
+    return tomli_w.dumps(plain) + (f"# not given: {silent}\n" if silent else "")
 
 
 def _suggestion(name: str, known: Iterable[str]) -> str:

@@ -13,6 +13,8 @@ from pathlib import Path
 from hugin_abflow.batch.queue import projects_in
 from hugin_abflow.errors import AbflowError
 from hugin_abflow.project import read_plan
+from hugin_abflow.scratch import is_folder
+from hugin_abflow.terminal import warn
 
 # Seconds for which a project and its photos must have stayed as they are.
 _SETTLED = 3.0
@@ -25,12 +27,17 @@ def watch(
 ) -> Iterator[Path | None]:
     """Projects under `folder` that were saved, or whose photos came or changed, once they stay as they are;
     those that are there in the beginning too. None when there is nothing at the moment; ask again
-    after a while. Never ends.
+    after a while. Never ends; a folder that is gone may come back, which is told once.
     """
     seen: dict[Path, tuple[Sign, float]] = {}  # what each looked like, and since when
     done: dict[Path, Sign] = {}
+    told = False
     while True:
         now = clock()
+        gone = not is_folder(folder)
+        if gone and not told:
+            warn(f"{folder} is no longer there, or closed to you; it is looked for again")
+        told = gone
         for project in projects_in(folder, recursive):
             sign = _sign(project)
             if project not in seen or seen[project][0] != sign:

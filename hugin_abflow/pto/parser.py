@@ -11,6 +11,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from hugin_abflow.errors import ProjectError, PtoError
+from hugin_abflow.formats import picture_format
 from hugin_abflow.pto import grammar
 from hugin_abflow.pto.fields import Line
 from hugin_abflow.pto.lines import (
@@ -54,6 +55,8 @@ def loads(data: bytes, file: str = "<bytes>") -> Project:
     p-line and an image.
     """
     nul = data.find(b"\0")
+    if nul >= 0 and (kind := picture_format(data)):
+        raise PtoError(file, 0, kind, "a project; name the .pto that Hugin saved, not a picture")
     if nul >= 0:
         line = len(data[: nul + 1].splitlines())
         raise PtoError(file, line, "\0", "a .pto text in an 8-bit encoding such as UTF-8, without NUL bytes")
