@@ -24,7 +24,7 @@ from hugin_abflow.holes import Coverage
 from hugin_abflow.images import ENDINGS, ImageWriter, check_target, use_threads
 from hugin_abflow.kept import in_use, kept_device
 from hugin_abflow.layer import Canvas, Layer, check_canvas, check_layers
-from hugin_abflow.metadata import describe
+from hugin_abflow.metadata import describe, is_photo
 from hugin_abflow.nona import open_layers
 from hugin_abflow.opencl import Device
 from hugin_abflow.pano_trafo import images_of, read_guides
@@ -275,6 +275,10 @@ def _check_early(plan: Plan, settings: Settings, output: Path | str | None, comp
     else:
         target = Path(output)
         refuse_input(target, [plan.file, *plan.photos])
+    if is_photo(target):
+        raise OutputError(
+            f"{target} is a photo: its EXIF tells an exposure time; choose another name with -o, or remove it"
+        )
     check_target(target, compression)
     if settings.device is not None:
         choose(settings.device, settings.threads)

@@ -6,6 +6,7 @@ import logging
 import math
 from collections.abc import Callable
 from importlib import metadata as packages
+from pathlib import Path
 
 from hugin_abflow import pto
 from hugin_abflow.exif import Metadata, comment, comment_of, read_exif, text
@@ -19,6 +20,7 @@ PROGRAM = "hugin-abflow"
 _log = logging.getLogger(__name__)
 
 _SOFTWARE, _USER_COMMENT = 305, 37510
+_EXPOSURE_TIME = 33434
 # What EXIF must have: versions of Exif and Flashpix, width and height, 150 dpi as enblend writes it.
 _VERSIONS = {36864: Value(UNDEFINED, b"0232"), 40960: Value(UNDEFINED, b"0100")}
 _SIZE = (40962, 40963)
@@ -101,6 +103,11 @@ def describe(plan: Plan) -> Metadata:
     }
     chosen[GPS] = dict(found.get(GPS, {}))
     return Metadata(chosen, gpano(plan.canvas, len(plan.images)))
+
+
+def is_photo(path: Path) -> bool:
+    """Whether EXIF tells how a single photo was taken: that of panoramas, ours and Hugin's, does not."""
+    return is_file(path) and _EXPOSURE_TIME in read_exif(path).get(EXIF, {})
 
 
 def summary(plan: Plan) -> list[str]:

@@ -15,6 +15,7 @@ from pictures import one_device
 from test_exif import shown
 
 from hugin_abflow import cli
+from hugin_abflow.errors import OutputError
 from hugin_abflow.exif import comment_of
 from hugin_abflow.layer import Box, Canvas
 from hugin_abflow.merge import merge_project
@@ -127,6 +128,24 @@ def test_summary_of_a_projection_whose_height_we_do_not_know(make_project: Proje
 
 
 # Files
+
+
+def test_a_photo_of_another_project_is_not_replaced(
+    exiftool: str, nona: str, one_device: None, make_project: ProjectMaker
+) -> None:
+    """A panorama is, its own or one that it has made, though EXIF of its first photo was copied."""
+    project = shot(exiftool, make_project(panorama=CANVAS.format("")))
+    other = project.with_name("IMG_7.tif")
+    other.write_bytes((project.parent / "photo 0.tif").read_bytes())
+    before = other.read_bytes()
+    with pytest.raises(
+        OutputError, match=r"IMG_7\.tif is a photo: .* choose another name with -o, or remove"
+    ):
+        merge_project(project, output=other)
+    assert other.read_bytes() == before
+    other.unlink()
+    for _ in range(2):
+        assert merge_project(project, output=other) == other
 
 
 @pytest.mark.parametrize("ending", [".tif", ".jpg", ".png"])
