@@ -86,7 +86,7 @@ class Prepared:
     full        the canvas's grid at full resolution; grid, gain_grid, offset_grid: those of the layers'
                 fields, gains and offsets.
     shoulder    of the exposure scale (colour.py).
-    unit        of floats, the value that counts as full scale there (unit.py).
+    unit        of floats, the value that counts as full scale of what they are coded as (unit.py).
     unlike      where layers show different things, by which offsets were made; None: nowhere.
     """
 

@@ -124,7 +124,7 @@ def prepare(
     full = working.full_grid(canvas, layers)
     grid = working.working_grid(full, settings)
     reduced = reading.read(device, layers, grid, progress, settings)
-    full_scale = unit.scale_floats(device, reduced)
+    full_scale = unit.code_floats(device, reduced)
     used, unused = _parted(device, reduced, layers, grid)
     flows, parallaxes, singles = _flow(device, used, full, grid, guides, settings, progress, abreast)
     with progress("align", 1) as advance:

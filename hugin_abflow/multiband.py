@@ -45,7 +45,7 @@ class Offsets:
     """What is added to each layer, on its place (left, top, width, height) on `grid`.
 
     Float32 (height, width, 4): r, g, b of full scale and an unused 0; for floats, what is added to their
-    logarithms (exposure_scale of common.cl). None: nothing.
+    logarithms (exposure_scale of common.cl), of their roots. None: nothing.
     """
 
     grid: Grid

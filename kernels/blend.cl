@@ -45,7 +45,7 @@ static inline blend_samples blend_read(blend_lines lines, blend_between at) {
 }
 
 /* How pixels are corrected: what odds are multiplied by, less 1, then what is added, for floats to the
-   logarithms of exposure_scale; where there is something. */
+   logarithms of exposure_scale, of their roots; where there is something. */
 typedef struct {
     blend_samples rise, offset;
     blend_int some;
@@ -77,12 +77,15 @@ BLEND_INLINE blend_correction blend_corrected(const blend_corrections *from, __g
     return result;
 }
 
+/* Floats are corrected as they are coded at working resolution, by their roots (unit.cl). */
 static inline blend_samples blend_correct(blend_samples c, blend_correction by, float shoulder, float unit) {
-    c = BLEND_RAISE(c, by.rise, WHITE, shoulder);
     if (INTEGER)
-        return c + by.offset;
-    const blend_samples light = GREATEST(c, (blend_samples)(0.0f)) + unit * EXPOSURE_FLOOR, v = c + light * by.offset;
-    return v < 0.0f && c >= 0.0f ? (blend_samples)(0.0f) : v;
+        return BLEND_RAISE(c, by.rise, WHITE, shoulder) + by.offset;
+    blend_samples v = sqrt(GREATEST(c, (blend_samples)(0.0f)));
+    v += v * by.rise;
+    v += (v + EXPOSURE_FLOOR * sqrt(unit)) * by.offset;
+    v = GREATEST(v, (blend_samples)(0.0f));
+    return c < 0.0f || (by.rise == 0.0f && by.offset == 0.0f) ? c : v * v;
 }
 
 /* atan2: a few terms of the series do where x is positive and the angle small, as it nearly always is. */
@@ -230,7 +233,7 @@ __kernel void blend_band(
     int4 band,                           /* its place: left, top, width, height; run size: columns / PIXELS, rows */
     int2 origin,                         /* the region's place on the canvas */
     float shoulder,                      /* of the exposure scale */
-    float unit,                          /* floats: their value that counts as full scale there */
+    float unit,                          /* floats: the value that counts as full scale of what they are coded as */
     int nearest,                         /* 1: nearest-neighbour sampling */
     float share,                         /* of all weight, below which a layer is hidden */
     __global const uint *marks, int words, /* from blend_mark */

@@ -318,7 +318,7 @@ static inline bool layer_pair(__global const float4 *layer_a, __global const flo
 
 /* The scale on which exposure differences are smooth fields, c in 0..1 of full scale: log odds of shoulder * c.
    Integer images: 1 where the camera's curve levels off towards white, less where it runs straight into it.
-   Floats: 0, which is log. The floor keeps dark noise, and what is nearly white, calm where differences are
+   Floats, which are coded by their roots: 0, which is log. The floor keeps dark noise, and what is nearly white, calm where differences are
    measured. */
 #define EXPOSURE_FLOOR 0.02f
 
@@ -348,11 +348,10 @@ static inline float3 exposure_shift(float3 c, float3 gain, float shoulder) {
     return exposure_raise3(c, exponential4(gain.xyzz).xyz - 1.0f, 1.0f, shoulder);
 }
 
-/* A colour as a difference of it is seen: integer images are coded so already, floats are linear light. */
+/* A colour as a difference of it is seen. */
 static inline float3 exposure_look(float3 c, float3 gain, float shoulder) {
     c = exposure_shift(c, gain, shoulder);
-    c = GREATEST(c, (float3)(0.0f));
-    return shoulder > 0.0f ? c : (float3)(ROOT(c.x), ROOT(c.y), ROOT(c.z));
+    return GREATEST(c, (float3)(0.0f));
 }
 
 /* Where a grid of gains, which are smooth, has that of a cell's centre. */

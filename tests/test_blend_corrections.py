@@ -14,7 +14,7 @@ from hugin_abflow.opencl import Device
 
 
 def test_gains_of_floats_are_factors_and_none_is_exact(device: Device) -> None:
-    """Correction is (c + floor) exp(g) - floor; where the gain is 0 pixels stay as they are."""
+    """Of their roots, hence exp(2 g); where the gain is 0 pixels stay as they are."""
     full = plane()
     grid = full.resized(40, 27)
     pixels = stored_pixels(21, 77, 53, np.float32, 3, 1)
@@ -24,7 +24,7 @@ def test_gains_of_floats_are_factors_and_none_is_exact(device: Device) -> None:
     assert np.array_equal(out[:, :38], pixels[:, :38])
     assert np.array_equal(out[..., [0, 2, 3]], pixels[..., [0, 2, 3]])
     right = out[:, 60:, 1]
-    assert np.allclose(right, pixels[:, 60:, 1] * math.exp(0.5), rtol=1e-5, atol=1e-6)
+    assert np.allclose(right, pixels[:, 60:, 1] * math.exp(1), rtol=1e-5, atol=1e-6)
 
 
 @pytest.mark.parametrize("channels", [1, 3])
@@ -48,7 +48,7 @@ def test_an_offset_raises_by_levels_and_none_is_exact(device: Device, channels: 
 
 
 def test_offsets_of_floats_are_factors(device: Device) -> None:
-    """(c + floor) exp(offset) - floor, not below 0; what is below 0 moves by the floor's share alone."""
+    """The root becomes (root + floor) exp(offset) - floor, not below 0; what is below 0 stays."""
     full = plane()
     grid = full.resized(40, 27)
     pixels = stored_pixels(21, 77, 53, np.float32, 3, 1)
@@ -59,8 +59,9 @@ def test_offsets_of_floats_are_factors(device: Device) -> None:
         out = merged(device, [blend_layer(device, pixels, 0, 0, full, grid, offset=offset)], full, grid)
         for k in (0, 1):
             c = pixels[..., k].astype(float)
-            expected = c + (np.maximum(c, 0) + common.EXPOSURE_FLOOR) * (math.exp(value) - 1)
-            expected = np.where(c >= 0, np.maximum(expected, 0), expected)
+            root = np.sqrt(np.maximum(c, 0))
+            raised = np.maximum(root + (root + common.EXPOSURE_FLOOR) * (math.exp(value) - 1), 0) ** 2
+            expected = np.where(c >= 0, raised, c)
             assert np.allclose(out[..., k], expected, rtol=1e-5, atol=1e-6)
         assert (out[..., 0] < 0).any()
         assert np.array_equal(out[..., 2:], pixels[..., 2:])

@@ -95,12 +95,13 @@ def position(x: Array, y: Array, displacement: Array, scale: Numbers, lonlat: Nu
 def correct(
     colour: Array, gain: Array, offset: Array, white: float, shoulder: float, unit: float = 1.0
 ) -> Array:
-    """Colour in stored units with its exposure corrected, then raised; floats by their logarithms."""
-    c = np.where(gain == 0, colour, exposure_shift(colour / white, gain, shoulder) * white)
+    """Stored colour with its exposure corrected, then raised; floats by the logarithms of their roots."""
     if white != 1:
+        c = np.where(gain == 0, colour, exposure_shift(colour / white, gain, shoulder) * white)
         return c + white * offset
-    raised = c + (np.maximum(c, 0) + unit * EXPOSURE_FLOOR) * (np.exp(offset) - 1)
-    return np.where(offset == 0, c, np.where(c >= 0, np.maximum(raised, 0), raised))
+    v = np.sqrt(np.maximum(colour, 0) / unit) * np.exp(gain)
+    raised = unit * np.maximum(v + (v + EXPOSURE_FLOOR) * (np.exp(offset) - 1), 0) ** 2
+    return np.where((colour < 0) | ((gain == 0) & (offset == 0)), colour, raised)
 
 
 def blend_mark(

@@ -168,8 +168,7 @@ def layer_look(
     ]
     seen = layer_seen(layer, field, box, columns, rows, border, lonlat)
     here = gain[gain_row[cell[1]][:, None], gain_column[cell[0]][None], :3].astype(np.float64)
-    shifted = exposure_shift(seen[..., :3], here, shoulder)
-    return seen, shifted if shoulder else np.sqrt(np.maximum(shifted, 0))
+    return seen, np.maximum(exposure_shift(seen[..., :3], here, shoulder), 0)
 
 
 def cell_parts(

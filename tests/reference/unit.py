@@ -7,6 +7,6 @@ import numpy as np
 from reference.common import Array
 
 
-def unit_scale(layer: Array, factor: float) -> Array:
-    """A layer whose colours are multiplied."""
-    return layer * np.float32([factor, factor, factor, 1])
+def unit_code(layer: Array, root: float) -> Array:
+    """A layer whose light is coded by its root."""
+    return np.concatenate([root * np.sqrt(np.maximum(layer[..., :3], 0)), layer[..., 3:]], axis=-1)
