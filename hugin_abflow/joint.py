@@ -273,7 +273,7 @@ def _redundant(index: int, layers: Sequence[WorkingLayer], masks: Masks) -> bool
             continue
         if not (own & ~mask).any() and (mask & ~own).any():
             if own.any():
-                _unused_log.info(
+                _unused_log.warning(
                     "%s is not used: it lies wholly inside %s, so nothing is its own; where it shall show, "
                     "mask the other photos in Hugin",
                     name, layers[other].layer.name,

@@ -90,7 +90,7 @@ def test_layer_inside_another_takes_no_part(exposure, caplog):
     layers = with_parallax(canvas)
     without = merged(layers, canvas, exposure=exposure)
     inner = Layer.from_array("patch", noise(41, 57), 31, 47)
-    with caplog.at_level(logging.INFO, "hugin_abflow"):
+    with caplog.at_level(logging.WARNING, "hugin_abflow"):
         result = merged([inner, *layers], canvas, exposure=exposure)
     np.testing.assert_array_equal(result, without)
     assert [r.message for r in caplog.records if "wholly inside" in r.message] == [
