@@ -149,11 +149,11 @@ def _depth(target: Path, layer: Layer, wanted: npt.DTypeLike | None) -> npt.DTyp
 
 
 def merge_layers(
-    layers: Sequence[Layer],
+    layers: Iterable[Layer],
     canvas: Canvas,
     settings: Settings | None = None,
     *,
-    guides: Sequence[Guide] = (),
+    guides: Iterable[Guide] = (),
     progress: Progress = silent,
 ) -> npt.NDArray[Any]:
     """Merge layers in memory: the canvas's crop, (height, width, channels + 1) in the layers' dtype.
@@ -166,6 +166,7 @@ def merge_layers(
     be decoded, `SettingsError` if `settings.max_memory` is too little for the flow, `DeviceError`.
     """
     check_canvas(canvas)
+    layers, guides = list(layers), list(guides)
     if not layers:
         raise LayersMissingError("there are no layers to merge; give at least one")
     check_layers(canvas, layers)
@@ -270,21 +271,18 @@ def storable(plan: Plan, compression: str | None) -> str | None:
 
 def _check_early(plan: Plan, settings: Settings, output: Path | str | None, compression: str | None) -> None:
     """Raise what would be raised in the end, too, but after minutes in which nona makes the layers."""
-    if output is None:
-        target = plan.default_output()
-    else:
-        target = Path(output)
-        refuse_input(target, [plan.file, *plan.photos])
-    if is_photo(target):
-        raise OutputError(
-            f"{target} is a photo: its EXIF tells an exposure time; choose another name with -o, or remove it"
-        )
+    target = plan.default_output() if output is None else Path(output)
+    refuse_input(target, [plan.file, *plan.photos])
     check_target(target, compression)
     if settings.device is not None:
         choose(settings.device, settings.threads)
 
 
 def refuse_input(output: Path, inputs: Iterable[Path]) -> None:
-    """Raise `OutputError` for an output that is one of the inputs."""
+    """Raise `OutputError` for an output that is one of the inputs, or a photo, whatever it belongs to."""
     if file_key(output) in map(file_key, inputs):
         raise OutputError(f"{output} is an input of this panorama; choose another name with -o")
+    if is_photo(output):
+        raise OutputError(
+            f"{output} is a photo: its EXIF tells an exposure time; choose another name with -o, or remove it"
+        )

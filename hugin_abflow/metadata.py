@@ -9,7 +9,7 @@ from importlib import metadata as packages
 from pathlib import Path
 
 from hugin_abflow import pto
-from hugin_abflow.exif import Metadata, comment, comment_of, read_exif, text
+from hugin_abflow.exif import Metadata, comment, comment_of, read_exif, text, text_of
 from hugin_abflow.layer import Canvas
 from hugin_abflow.project import Plan
 from hugin_abflow.scratch import is_file
@@ -106,8 +106,12 @@ def describe(plan: Plan) -> Metadata:
 
 
 def is_photo(path: Path) -> bool:
-    """Whether EXIF tells how a single photo was taken: that of panoramas, ours and Hugin's, does not."""
-    return is_file(path) and _EXPOSURE_TIME in read_exif(path).get(EXIF, {})
+    """Whether EXIF tells how a single photo was taken: that of panoramas does not, be they ours or Hugin's,
+    or else it names Hugin.
+    """
+    found = read_exif(path) if is_file(path) else {}
+    made_by = text_of(found.get(MAIN, {}).get(_SOFTWARE, text("")))
+    return _EXPOSURE_TIME in found.get(EXIF, {}) and "hugin" not in made_by.lower()
 
 
 def summary(plan: Plan) -> list[str]:

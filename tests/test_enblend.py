@@ -325,6 +325,32 @@ def test_as_many_cores_as_hugin_says(
     assert found == [threads]
 
 
+def test_photos_are_not_replaced(
+    layers: list[str], exiftool: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Neither those of the project nor any other that tells how it was taken; what Hugin made is."""
+    write_image("photo.tif", picture())
+    Path("named.tif").write_bytes(Path("photo.tif").read_bytes())
+    subprocess.run([exiftool, "-q", "-ExposureTime=0.01", "-Software=Box 1.0", "photo.tif"], check=True)
+    Path("a.pto").write_text(
+        'p f0 w180 h90 v60 n"TIFF_m"\nm i0\n'
+        + "".join(
+            f'i w90 h90 f0 v40 r0 p0 y{yaw} n"{name}"\n' for yaw, name in ((0, "named.tif"), (9, "x.tif"))
+        )
+    )
+    before = {path.name: path.read_bytes() for path in Path().iterdir()}
+    for arguments in (
+        ["-o", "photo.tif"],
+        ["-o", "named.tif", "--parameter=abflow-project=a.pto"],
+        ["-o", "out.tif", "--save-masks=photo.tif"],
+    ):
+        assert run(*arguments, *layers[:1]) == 1
+    assert capsys.readouterr().err.count("choose another name") >= 2
+    assert {path.name: path.read_bytes() for path in Path().iterdir()} == before
+    subprocess.run([exiftool, "-q", "-overwrite_original", "-Software=Hugin 2022.0", "photo.tif"], check=True)
+    assert run("-o", "photo.tif", *layers) == 0
+
+
 # What is said
 
 

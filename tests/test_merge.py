@@ -238,6 +238,15 @@ def test_bands_read_only_rows_near_them():
 # What merge_layers refuses
 
 
+@shared_device
+def test_layers_and_guides_may_come_one_after_the_other():
+    layers = with_parallax(CANVASES["plane"])
+    guides = [Guide(0, 1, (120.0, 60.0), (123.0, 60.0))]
+    expected = merge_layers(layers, CANVASES["plane"], guides=guides)
+    result = merge_layers(iter(layers), CANVASES["plane"], guides=iter(guides))
+    np.testing.assert_array_equal(result, expected)
+
+
 def test_no_layers():
     with pytest.raises(LayersMissingError, match="no layers to merge"):
         merge_layers([], CANVASES["plane"])

@@ -39,6 +39,17 @@ def files(folder: Path) -> dict[str, bytes]:
     return {str(p.relative_to(folder)): p.read_bytes() for p in folder.rglob("*") if p.is_file()}
 
 
+@pytest.mark.skipif(os.name == "nt", reason="Windows has no modes of files")
+def test_the_backup_is_as_private_as_the_preferences(hugin: Places) -> None:
+    preferences = Path(hugin.preferences)
+    preferences.parent.mkdir()
+    preferences.write_bytes(CONFIG)
+    preferences.chmod(0o600)
+    setup.install(hugin)
+    backup = preferences.with_name(f"{preferences.name}.before-abflow")
+    assert [path.stat().st_mode & 0o777 for path in (preferences, backup)] == [0o600, 0o600]
+
+
 @pytest.mark.parametrize("content", [None, b"", CONFIG, CONFIG.replace(b"\n", b"\r\n"), b"A=1"])
 def test_uninstall_restores_every_byte(hugin: Places, tmp_path: Path, content: bytes | None) -> None:
     preferences = Path(hugin.preferences)

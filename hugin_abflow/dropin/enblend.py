@@ -85,12 +85,12 @@ def blend(request: Request, progress: Progress) -> None:
     if request.ignored:
         _log.warning("options of enblend that change nothing here: %s", ", ".join(request.ignored))
     layers = _read(request)
-    refuse_input(request.output, request.inputs)
+    plan = read_plan(request.project) if request.project else None
+    refuse_input(request.output, [*request.inputs, *([plan.file, *plan.photos] if plan else [])])
     settings = Settings(threads=_threads(os.environ.get("OMP_NUM_THREADS", "")))
     guides: Callable[[], Sequence[Guide]] = tuple
     metadata = None
-    if request.project:
-        plan = read_plan(request.project)
+    if plan:
         canvas = replace(plan.canvas, crop=request.crop or bounding_box(layers))
         projection, guides = plan.projection, partial(guides_between, plan, layers, settings)
         metadata = describe(replace(plan, canvas=canvas))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import shutil
 from collections.abc import Sequence
 from importlib import resources
 from pathlib import Path, PureWindowsPath
@@ -100,6 +101,8 @@ def _set_preferences(places: Places, blender: str, dry_run: bool) -> list[str]:
         return [f"{path}: is set already"]
     # a second time the backup would be what we made of the first
     saved = [] if before is None or _is_ours(before) else _write(_backup(path), before, dry_run)
+    if saved and not dry_run:
+        shutil.copymode(path, _backup(path))  # what only its owner may read stays so
     return [*saved, *_write(path, after, dry_run), f"    [{_GROUP}] Custom=1 and Exe={blender}"]
 
 
