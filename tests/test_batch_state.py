@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -268,6 +269,21 @@ def test_state_of_somebody_else_is_none(make: Make, shoot: Path, text: str) -> N
     make()
     (shoot / ".abflow" / "tiny.pto.json").write_text(text)
     assert make().result == "made"
+
+
+@pytest.mark.parametrize(
+    "damage", ['"bytes": null', '"bytes": "x"', '"bytes": 1e999', '"device": 7', '"overlaps": 7']
+)
+def test_damaged_state_is_none(make: Make, shoot: Path, damage: str) -> None:
+    """It ended the run in a traceback, when the table was printed."""
+    make()
+    file = shoot / ".abflow" / "tiny.pto.json"
+    name = damage.split(":")[0]
+    text, count = re.subn(rf'{name}: (\d+|"[^"]*"|\[\])', damage, file.read_text())
+    assert count
+    file.write_text(text)
+    record = make()
+    assert record.result == "made" and record.bytes > 0
 
 
 def test_folder_can_be_moved_as_a_whole(make: Make, shoot: Path) -> None:

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import os
+import subprocess
+import sys
 import time
 from concurrent.futures import ThreadPoolExecutor
 
@@ -60,3 +63,32 @@ def test_merges_at_a_time_open_one_device(monkeypatch):
     with ThreadPoolExecutor(4) as pool:
         got = list(pool.map(lambda _: kept.kept_device("x", 2), range(4)))
     assert opened == [("x", 2)] and got == [("x", 2)] * 4
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="processes are not forked there")
+@pytest.mark.parametrize("first", [True, False])
+def test_a_forked_process_is_told_that_its_parents_device_is_not_there(first):
+    """It waited for threads that only its parent has, for ever. If the parent has none, it works."""
+    code = f"""
+import os
+import numpy as np
+from hugin_abflow import Canvas, Layer, merge_layers
+from hugin_abflow.errors import DeviceError
+
+pixels = np.full((30, 40, 4), 255, np.uint8)
+merge = lambda: merge_layers([Layer.from_array("a", pixels)], Canvas.plane(40, 30))
+if {first}:
+    merge()
+child = os.fork()
+if not child:
+    try:
+        merge()
+    except DeviceError as error:
+        os._exit(3 if "forked" in str(error) and "spawn" in str(error) else 4)
+    os._exit(0)
+print(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]))
+"""
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, timeout=300, check=True
+    )
+    assert int(done.stdout) == (3 if first else 0)

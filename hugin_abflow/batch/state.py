@@ -79,10 +79,12 @@ class State:
                 return False
             if set(known.get("left_out", [])) - set(self._left_out()):
                 return False  # its program has been installed
-            record.outputs = self._plain(known["outputs"])
-            record.device, record.overlaps = known["device"], known["overlaps"]
-        except (KeyError, TypeError, ValueError):  # written by somebody else
+            outputs, device, overlaps = self._plain(known["outputs"]), known["device"], known["overlaps"]
+            if not (isinstance(device, str) and isinstance(overlaps, list)):
+                return False
+        except (KeyError, TypeError, ValueError, OverflowError):  # damaged, or written by somebody else
             return False
+        record.outputs, record.device, record.overlaps = outputs, device, overlaps
         if self._left_out():
             possible_outputs(self._plan)  # warns of them
         record.result = "skipped"
@@ -160,7 +162,7 @@ class State:
     def _plain(self, entries: Iterable[Entry]) -> list[Entry]:
         """Entries as they stand in records."""
         return [
-            {"file": str(Path(os.path.normpath(self._folder / entry["file"]))), "bytes": entry["bytes"]}
+            {"file": str(Path(os.path.normpath(self._folder / entry["file"]))), "bytes": int(entry["bytes"])}
             for entry in entries
         ]
 
