@@ -91,7 +91,7 @@ def _covered(layer: Layer, others: Sequence[Layer]) -> bool:
     for top in range(0, layer.box.height if others else 0, step):
         bottom = min(top + step, layer.box.height)
         shown, *theirs = (
-            one.read(top, bottom)[..., -1] >= full_scale(one.dtype) / 2 for one in (layer, *others)
+            one.rows(top, bottom)[..., -1] >= full_scale(one.dtype) / 2 for one in (layer, *others)
         )
         if (shown & ~np.logical_or.reduce(theirs)).any():
             return False

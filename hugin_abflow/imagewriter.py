@@ -12,6 +12,7 @@ import math
 import os
 import shutil
 from collections.abc import Iterator
+from numbers import Integral
 from pathlib import Path
 from types import TracebackType
 from typing import Any
@@ -23,7 +24,7 @@ import OpenImageIO as oiio  # noqa: N813
 from hugin_abflow import tiffwriter, trace
 from hugin_abflow.errors import OutputError
 from hugin_abflow.exif import Metadata, embed, place_in_png
-from hugin_abflow.layer import full_scale
+from hugin_abflow.layer import full_scale, native
 from hugin_abflow.scratch import is_special, part_beside, put
 
 Pixels = npt.NDArray[Any]
@@ -38,14 +39,7 @@ _OIIO_NAMES = {
 }
 # What TIFF holds beside these.
 _WIDE_NAMES = {np.dtype(np.float64): "double"}
-ENDINGS = {
-    ".tif": "tiff",
-    ".tiff": "tiff",
-    ".jpg": "jpeg",
-    ".jpeg": "jpeg",
-    ".png": "png",
-    ".exr": "openexr",
-}
+ENDINGS = {".tif": "tiff", ".tiff": "tiff", ".jpg": "jpeg", ".jpeg": "jpeg", ".png": "png", ".exr": "openexr"}
 # What the documentation names; more is understood, since projects and other programs say it. What is usual.
 COMPRESSIONS = {
     "TIFF": ("none", "packbits", "lzw", "deflate", "zstd", "jpeg"),
@@ -59,6 +53,7 @@ _KNOWN = {
 }  # fmt: skip
 _PNG_LEVEL = 4  # twice as fast as zlib's usual 6 for 2 % more bytes
 _JPEG_LIMIT = 65500  # pixels a side, of libjpeg
+_FURTHEST = 10_000_000  # pixels from the canvas's corner; TIFF tells positions as fractions of 32 bits
 _JPEG_LEAST = 1 << 16  # bytes of a JPEG beside its samples
 _JPEG_BLANK = 1 / 64  # bytes that nothing takes for each sample
 _CLASSIC_LIMIT = 0xFFFFFFFF - (16 << 20)  # bytes of a classic TIFF, with room for tags and metadata
@@ -118,6 +113,8 @@ class ImageWriter:
         tall = height if self.format == "jpeg" else 0  # within TIFF each strip is a JPEG
         if self.compression.startswith("jpeg") and max(width, tall) > _JPEG_LIMIT:
             raise OutputError(f"{path}: JPEG ends at {_JPEG_LIMIT} pixels a side; choose a TIFF with LZW")
+        if not all(isinstance(one, Integral) and abs(one) <= _FURTHEST for one in offset):
+            raise OutputError(f"{path}: it lies at {offset}; give whole pixels, up to {_FURTHEST}")
         self._offset, self._icc = offset, icc
         self._spec = self._make_spec(offset, icc, canvas_size)
         self._done = 0
@@ -323,7 +320,8 @@ def write_image(
     jpeg_quality: int | None = None,
     canvas_size: tuple[int, int] | None = None,
 ) -> None:
-    """Write pixels (height, width, 2 or 4), unassociated alpha last; see `ImageWriter`.
+    """Write pixels (height, width, 2 or 4), unassociated alpha last; see `ImageWriter`. Pixels with NaN or
+    infinity become transparent.
 
     Raises `OutputError` for pixels of another shape and for what `ImageWriter` cannot write.
     """
@@ -334,10 +332,10 @@ def write_image(
         )
     height, width, samples = pixels.shape
     with ImageWriter(
-        path, width, height, samples - 1, pixels.dtype, offset=offset, icc=icc,
+        path, width, height, samples - 1, pixels.dtype.newbyteorder("="), offset=offset, icc=icc,
         compression=compression, jpeg_quality=jpeg_quality, canvas_size=canvas_size,
     ) as writer:  # fmt: skip
-        writer.write_rows(pixels)
+        writer.write_rows(native(pixels))
 
 
 def check_target(path: Path, compression: str | None) -> None:
@@ -350,6 +348,8 @@ def check_target(path: Path, compression: str | None) -> None:
 
 def _final(path: Path) -> Path:
     """The file that is replaced: through a link what it points to, not the link."""
+    if "\0" in str(path):
+        raise OutputError(f"{str(path)!r} is no name of a file: it has a NUL; choose another with -o")
     final = Path(os.path.realpath(path))
     if not named_in_unicode(final.parent):
         raise OutputError(
@@ -409,7 +409,7 @@ def _stored_dtype(
 
 def _jpeg_quality(path: Path, quality: int | None) -> int:
     quality = JPEG_QUALITY if quality is None else quality
-    if not 1 <= quality <= 100:
+    if not isinstance(quality, Integral) or not 1 <= quality <= 100:
         raise OutputError(f"{path}: JPEG quality {quality}; choose 1 to 100")
     return quality
 

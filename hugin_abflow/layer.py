@@ -7,8 +7,10 @@ covers [x, x+1) x [y, y+1), so its centre is at (x + 0.5, y + 0.5).
 from __future__ import annotations
 
 import logging
+import operator
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from numbers import Integral
 from pathlib import Path
 from typing import Any
 
@@ -28,6 +30,17 @@ def full_scale(dtype: npt.DTypeLike) -> float:
     """Alpha of an opaque pixel: 255, 65535, or 1.0 for floats."""
     kind = np.dtype(dtype)
     return float(np.iinfo(kind).max) if kind.kind == "u" else 1.0
+
+
+def native(pixels: npt.NDArray[Any]) -> npt.NDArray[Any]:
+    """Pixels (height, width, samples), C-contiguous in the machine's byte order; those with NaN or infinity
+    are 0, and so transparent.
+    """
+    stored = np.ascontiguousarray(pixels, pixels.dtype.newbyteorder("="))
+    if stored.dtype.kind == "f":
+        finite = np.isfinite(stored).all(axis=2, keepdims=True)
+        stored = stored if finite.all() else np.where(finite, stored, stored.dtype.type(0))
+    return stored
 
 
 @dataclass(frozen=True)
@@ -136,6 +149,17 @@ class Layer:
     strip: int = 1
     compressed: bool = False
 
+    def rows(self, top: int, bottom: int) -> npt.NDArray[Any]:
+        """What `read` gives, which is not trusted: kernels would read beyond it. Raises `ImageReadError`."""
+        rows = self.read(top, bottom)
+        wanted = (bottom - top, self.box.width, self.channels + 1)
+        if rows.shape != wanted or rows.dtype != self.dtype:
+            raise ImageReadError(
+                f"{self.name}: rows {top} to {bottom} are {rows.dtype} of the shape {rows.shape}; its reader "
+                f"has to give {self.dtype}, {wanted}"
+            )
+        return rows
+
     @property
     def row_bytes(self) -> int:
         """Of one row that `read` gives."""
@@ -148,8 +172,10 @@ class Layer:
         """A layer from pixels in memory: (height, width, 2 or 4), alpha last.
 
         Pixels with NaN or infinity are invalid, as in files. Raises `ImageReadError` for another shape
-        (colours without alpha, for example), an empty array or a type that layers do not have.
+        (colours without alpha, for example), an empty array or a type that layers do not have, and TypeError
+        for a place that is no whole number.
         """
+        left, top = operator.index(left), operator.index(top)
         if pixels.ndim != 3 or pixels.shape[2] not in (2, 4) or not pixels.size:
             raise ImageReadError(
                 f"{name} has the shape {pixels.shape}; give (height, width, 4), RGB and alpha, "
@@ -160,10 +186,7 @@ class Layer:
                 f"{name} has samples of type {pixels.dtype}; possible are uint8, uint16, float16, float32"
             )
         height, width, samples = pixels.shape
-        stored = np.ascontiguousarray(pixels, pixels.dtype.newbyteorder("="))
-        if stored.dtype.kind == "f":
-            finite = np.isfinite(stored).all(axis=2, keepdims=True)
-            stored = stored if finite.all() else np.where(finite, stored, stored.dtype.type(0))
+        stored = native(pixels)
         box = Box.at(left, top, width, height)
         return cls(name, box, stored.dtype, samples - 1, lambda first, last: stored[first:last], icc)
 
@@ -186,8 +209,15 @@ def other_canvas(layer: Layer, canvas: Canvas) -> str | None:
 
 
 def check_canvas(canvas: Canvas) -> None:
-    """Raise `CanvasError` unless the canvas has pixels and its crop is a part of it that has some, too."""
+    """Raise `CanvasError` unless the canvas has pixels and its crop is a part of it that has some, too, all
+    of whole numbers, and on a sphere a field of view.
+    """
     crop = canvas.crop
+    edges = (canvas.width, canvas.height, crop.left, crop.top, crop.right, crop.bottom)
+    if not all(isinstance(edge, Integral) for edge in edges):
+        raise CanvasError(f"canvas and crop have {edges}; give whole numbers of pixels")
+    if canvas.spherical and not 0 < canvas.hfov <= 360:
+        raise CanvasError(f"the canvas has a field of view of {canvas.hfov} degrees; give up to 360")
     if not (0 <= crop.left < crop.right <= canvas.width and 0 <= crop.top < crop.bottom <= canvas.height):
         raise CanvasError(
             f"the crop of columns {crop.left} to {crop.right} and rows {crop.top} to {crop.bottom} is no "
@@ -198,6 +228,8 @@ def check_canvas(canvas: Canvas) -> None:
 def misfit(layer: Layer, canvas: Canvas) -> str | None:
     """Why it cannot be one of the canvas's layers, in words that follow its name; None if it can."""
     box, size = layer.box, f"{canvas.width}x{canvas.height}"
+    if not all(isinstance(edge, Integral) for edge in (box.left, box.top, box.right, box.bottom)):
+        return f"lies at {box}, not at whole pixels"
     if not layer.has_alpha:
         return "has no alpha channel, so nothing says where it ends"
     if made_for := other_canvas(layer, canvas):

@@ -88,7 +88,7 @@ class _Rows:
                 rows = self._recall(self._file, blocks, top, bottom) if blocks[0] >= 0 else None
                 if rows is not None:
                     return rows
-        rows = self._layer.read(top, bottom)
+        rows = self._layer.rows(top, bottom)
         with self._lock:
             if self._file:
                 self._keep(self._file, rows, top)

@@ -276,7 +276,7 @@ def pixel_options(layer: Layer) -> tuple[str, float]:
 
 def device_rows(layer: Layer, top: int, bottom: int) -> np.ndarray:
     """Rows of a layer in a type that kernels read."""
-    return layer.read(top, bottom).astype(device_dtype(layer), copy=False)
+    return layer.rows(top, bottom).astype(device_dtype(layer), copy=False)
 
 
 def rows_at_a_time(device: Device, layer: Layer) -> int:

@@ -256,3 +256,30 @@ def test_device_that_is_none(folder):
     with pytest.raises(DeviceError, match="no OpenCL device fits --device nonesuch"):
         merge_project(folder / "pano.pto", Settings(device="nonesuch"), prefix="pano")
     assert not (folder / "pano.tif").exists()
+
+
+@pytest.mark.parametrize("ending", [".tif", ".png"])
+def test_pixels_in_foreign_byte_order_are_written(tmp_path: Path, ending: str) -> None:
+    """As big-endian TIFF files are decoded by some."""
+    pixels = np.full((3, 5, 4), 0x1234, np.uint16)
+    write_image(tmp_path / f"a{ending}", pixels.astype(">u2"))
+    write_image(tmp_path / f"b{ending}", pixels)
+    assert (tmp_path / f"a{ending}").read_bytes() == (tmp_path / f"b{ending}").read_bytes()
+
+
+@pytest.mark.parametrize("ending", [".tif", ".png", ".jpg", ".exr"])
+def test_pixels_that_are_no_numbers_are_transparent(tmp_path: Path, ending: str) -> None:
+    pixels = np.ones((8, 8, 4), np.float32)
+    pixels[:, :4, 1] = np.nan
+    write_image(tmp_path / f"a{ending}", pixels)
+    rows = read_layer(tmp_path / f"a{ending}").read(0, 8).astype(float)
+    assert rows[:, 5:, 1].min() > 0 and (rows[:, :3, :3].max() < 0.1 * rows.max())
+
+
+@pytest.mark.parametrize("wrong", [{"offset": (1.5, 2)}, {"offset": (10**10, 0)}, {"jpeg_quality": "90"}])
+def test_what_cannot_be_written_is_an_output_error(tmp_path: Path, wrong: dict) -> None:
+    for ending in (".jpg", ".tif", ".png", ".exr") if "offset" in wrong else (".jpg",):
+        with pytest.raises(OutputError):
+            write_image(tmp_path / f"a{ending}", np.ones((3, 5, 4), np.float32), **wrong)
+    with pytest.raises(OutputError, match="NUL"):
+        write_image(tmp_path / "a\0.tif", np.ones((3, 5, 4), np.float32))

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
-from hugin_abflow.errors import ImageReadError
-from hugin_abflow.layer import Box, Canvas, Layer, check_layers, full_scale
+from hugin_abflow import merge_layers
+from hugin_abflow.errors import CanvasError, ImageReadError, LayersMismatchError
+from hugin_abflow.layer import Box, Canvas, Layer, check_canvas, check_layers, full_scale
 
 
 def test_box_is_a_place_and_a_part_of_arrays():
@@ -91,3 +94,39 @@ def test_different_profiles_are_reported(caplog):
     (said,) = caplog.messages
     assert "other than that of b: a; " in said and "not converted" in said
     check_layers(Canvas.plane(31, 17), [])
+
+
+def test_a_place_is_of_whole_pixels():
+    pixels = np.full((3, 5, 4), 255, np.uint8)
+    layer = Layer.from_array("a", pixels, np.uint8(250), np.int16(7))
+    assert layer.box == Box(250, 7, 255, 10)  # no more of 8 bits
+    with pytest.raises(TypeError):
+        Layer.from_array("a", pixels, 120.0)
+    with pytest.raises(LayersMismatchError, match="not at whole pixels"):
+        check_layers(Canvas.plane(300, 20), [replace(layer, box=Box(0.5, 0, 5.5, 3))])
+
+
+@pytest.mark.parametrize("wrong", [np.s_[:, :, :3], np.s_[:, :4], np.s_[:1]])
+def test_rows_of_another_shape_or_type_are_refused(wrong):
+    """Kernels would read beyond them."""
+    pixels = np.full((3, 5, 4), 255, np.uint8)
+    layer = Layer.from_array("a", pixels)
+    assert layer.rows(1, 3).shape == (2, 5, 4)
+    other = replace(layer, read=lambda top, bottom: pixels[top:bottom][wrong])
+    with pytest.raises(ImageReadError, match=r"a: rows 0 to 3 are uint8 of the shape .*, \(3, 5, 4\)"):
+        other.rows(0, 3)
+    with pytest.raises(ImageReadError, match="are float64 of"):
+        replace(layer, read=lambda top, bottom: pixels[top:bottom].astype(float)).rows(0, 3)
+    with pytest.raises(ImageReadError, match="has to give uint8"):
+        merge_layers([other, layer], Canvas.plane(5, 3))
+
+
+@pytest.mark.parametrize("hfov", [0.0, -90.0, 361.0, float("nan")])
+def test_a_sphere_has_a_field_of_view(hfov):
+    with pytest.raises(CanvasError, match="field of view"):
+        check_canvas(Canvas.sphere(60, 30, hfov))
+
+
+def test_a_canvas_is_of_whole_pixels():
+    with pytest.raises(CanvasError, match="whole numbers"):
+        check_canvas(Canvas.plane(60.0, 30))

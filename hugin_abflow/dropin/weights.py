@@ -149,7 +149,7 @@ def _painted(device: Device, one: BlendLayer, white: Layer) -> BlendLayer:
     colour = _WHITE if layer is white else np.uint16(0)
 
     def read(top: int, bottom: int) -> npt.NDArray[Any]:
-        alpha = layer.read(top, bottom)[..., -1:] >= 0.5 * full_scale(layer.dtype)
+        alpha = layer.rows(top, bottom)[..., -1:] >= 0.5 * full_scale(layer.dtype)
         return np.concatenate([np.full(alpha.shape, colour), alpha * _WHITE], 2)
 
     grey = replace(layer, dtype=np.dtype(np.uint16), channels=1, read=read)
@@ -167,7 +167,7 @@ def _weighted(device: Device, layer: BlendLayer, mask: Layer, prepared: Prepared
     rows = np.clip(np.arange(region.top, region.bottom) - crop.top, 0, crop.height - 1)
     columns = np.clip(np.arange(region.left, region.right) - crop.left, 0, crop.width - 1)
     # repeated outside the crop: a working pixel that is not wholly covered would weigh nothing
-    grey = mask.read(0, crop.height)[..., :1][rows][:, columns]
+    grey = mask.rows(0, crop.height)[..., :1][rows][:, columns]
     opaque = np.full_like(grey, full_scale(mask.dtype))
     whole = Layer.from_array(mask.name, np.concatenate([grey, opaque], 2), region.left, region.top)
     reduced = working.reduce_layer(device, whole, prepared.grid, lambda units: None)
