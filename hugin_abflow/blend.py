@@ -232,7 +232,7 @@ def _bands(
                 "blend", "blend_band", groups, store.rows, touched, len(used), fields.values, gains.values,
                 offsets.values, longitudes, latitudes, full.border, full.lonlat, grid.border,
                 prepared.gain_grid.border, prepared.offset_grid.border, (part.left, part.top, *size),
-                (region.left, region.top), prepared.shoulder, prepared.unit,
+                (region.left, region.top), prepared.shoulder, math.sqrt(prepared.unit),
                 int(settings.interpolation == "nearest"), share, marks, marks.shape[-1], out, options=options,
             )  # fmt: skip
             yield _stored(out.get(), first.dtype)

@@ -58,13 +58,13 @@ def choose(
         params, given = _parsed(command, arguments, defaults)
         overruled = {rival for name in given for rival in _rivals(name, params)} - given
         params, _ = _parsed(command, arguments, {k: v for k, v in defaults.items() if k not in overruled})
-        for one, other, both in _RIVALS:
-            if params.get(one) and params.get(other):
-                raise click.UsageError(both)
     except click.UsageError as error:
         if file is None:
             raise
         raise ConfigError(f"{file}: {error.format_message()}") from None
+    for one, other, both in _RIVALS:
+        if params.get(one) and params.get(other):
+            raise click.UsageError(both) if given >= {one, other} else ConfigError(f"{file}: {both}")
     return params
 
 

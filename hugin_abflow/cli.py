@@ -338,12 +338,17 @@ def _chosen(file: Path | None, alone: bool = True) -> dict[str, Any]:
 
 
 def _saved(
-    projects: Iterable[Path | None],
+    projects: Iterable[Path | str | None],
     options: Callable[[Path], tuple[Path | None, dict[str, Any]]],
     force: bool,
-) -> Iterator[Task | None]:
-    """Tasks for projects as they are saved; settings that are wrong at the time are told, and no more."""
+) -> Iterator[Task | str | None]:
+    """Tasks for projects as they are saved, and warnings; settings that are wrong at the time are told, and
+    no more.
+    """
     for project in projects:
+        if isinstance(project, str):
+            yield project
+            continue
         try:
             yield Task(project, _options(**options(project)[1]), not force, True) if project else None
         except (AbflowError, click.UsageError) as error:

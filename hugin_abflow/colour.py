@@ -1,9 +1,9 @@
 """Smooth exposure and colour correction of each layer (kernels/colour.cl).
 
 The aligned layers are compared in their overlaps, on a coarse grid, on the exposure scale of common.cl (log
-odds of integer images, log of floats). Smooth gains that explain how they differ (gains.py) correct them. A
-difference counts as far as it can be trusted, how much it tells (dark samples little) and how far both layers
-are seen.
+odds of integer images, log of floats' roots). Smooth gains that explain how they differ (gains.py) correct
+them. A difference counts as far as it can be trusted, how much it tells (dark samples little) and how far
+both layers are seen.
 
 Cameras' curves level off towards white, by which log odds move colours as exposure does; others run straight
 into it. The scale's shoulder, between both, is the one that leaves the least of the differences: else a

@@ -26,6 +26,36 @@ _INSTALL = {
 _HIDING = ("OCL_ICD_VENDORS", "POCL_DEVICES", "POCL_CACHE_DIR")
 
 
+@dataclass
+class Drivers:
+    """What became of OpenCL's drivers in this process.
+
+    inherited   its parent had loaded them before it was forked from that: their threads are not here, and who
+                waits for them waits for ever.
+    """
+
+    loaded: bool = False
+    inherited: bool = False
+
+    def refuse_inherited(self) -> None:
+        """Raise `DeviceError` where they do not work."""
+        if self.inherited:
+            raise DeviceError(
+                "this process was forked from one in which OpenCL is in use, and cannot use it; start "
+                "processes by 'spawn' or 'forkserver' (multiprocessing.set_start_method), or merge in forked "
+                "ones alone"
+            )
+
+    def after_fork(self) -> None:
+        """In a process that has just been forked."""
+        self.inherited = self.loaded
+
+
+drivers = Drivers()
+if hasattr(os, "register_at_fork"):  # not on Windows, which does not fork
+    os.register_at_fork(after_in_child=drivers.after_fork)
+
+
 @dataclass(frozen=True)
 class DeviceInfo:
     """One line of ``--list-devices``. memory: bytes; kind: "GPU", "CPU" or "other"."""
@@ -46,7 +76,12 @@ def kind_of(device: cl.Device) -> str:
 
 
 def _devices(threads: int = 0) -> list[cl.Device]:
-    """All devices of all platforms; `DeviceError` where there is none. threads: as of `Device`."""
+    """All devices of all platforms. threads: as of `Device`.
+
+    Raises `DeviceError` where there is none, and in a process forked from one that has loaded drivers.
+    """
+    drivers.refuse_inherited()
+    drivers.loaded = True
     pocl.find_cache()
     if kept := pocl.kernel_folder():
         pocl.mend(kept)

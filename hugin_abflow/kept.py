@@ -2,34 +2,27 @@
 
 from __future__ import annotations
 
-import os
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 
 from hugin_abflow import trace
+from hugin_abflow.devices import drivers
 from hugin_abflow.errors import DeviceError
 from hugin_abflow.opencl import Device, DeviceMemoryError
 
 # By what was asked for, and whether they tell their times.
 _kept: dict[tuple[str | None, int, bool], Device] = {}
 _opening = threading.Lock()
-# Drivers of this process's parent, before it was forked from that: their threads are not here, and who waits
-# for them waits for ever.
-_inherited = False
 
 
 def kept_device(wanted: str | None, threads: int) -> Device:
     """What `Device` gives, with all kernels built so far; the same one until it is lost. For any thread.
 
-    Raises `DeviceError` as `Device` does, and in a process that was forked from one that has used a device.
+    Raises `DeviceError` as `Device` does.
     """
-    if _inherited:
-        raise DeviceError(
-            "this process was forked from one in which OpenCL is in use, and cannot use it; start processes "
-            "by 'spawn' or 'forkserver' (multiprocessing.set_start_method), or merge in forked ones alone"
-        )
     key = wanted, threads, trace.is_recording()
+    drivers.refuse_inherited()  # devices are, too
     with _opening:
         if key not in _kept:
             _kept[key] = Device(wanted, threads)
@@ -59,12 +52,3 @@ def _forget(lost: Device) -> None:
     with _opening:
         for key in [key for key, device in _kept.items() if device is lost]:
             del _kept[key]
-
-
-def _after_fork() -> None:
-    global _inherited
-    _inherited = bool(_kept)
-
-
-if hasattr(os, "register_at_fork"):  # not on Windows, which does not fork
-    os.register_at_fork(after_in_child=_after_fork)

@@ -151,7 +151,7 @@ class Layer:
 
     def rows(self, top: int, bottom: int) -> npt.NDArray[Any]:
         """What `read` gives, which is not trusted: kernels would read beyond it. Raises `ImageReadError`."""
-        rows = self.read(top, bottom)
+        rows = np.ascontiguousarray(self.read(top, bottom))
         wanted = (bottom - top, self.box.width, self.channels + 1)
         if rows.shape != wanted or rows.dtype != self.dtype:
             raise ImageReadError(

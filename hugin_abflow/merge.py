@@ -271,17 +271,25 @@ def storable(plan: Plan, compression: str | None) -> str | None:
 
 def _check_early(plan: Plan, settings: Settings, output: Path | str | None, compression: str | None) -> None:
     """Raise what would be raised in the end, too, but after minutes in which nona makes the layers."""
-    target = plan.default_output() if output is None else Path(output)
-    refuse_input(target, [plan.file, *plan.photos])
+    if output is None:
+        target = plan.default_output()
+    else:
+        target = Path(output)
+        refuse_input(target, [plan.file, *plan.photos])
+        refuse_photo(target)
     check_target(target, compression)
     if settings.device is not None:
         choose(settings.device, settings.threads)
 
 
 def refuse_input(output: Path, inputs: Iterable[Path]) -> None:
-    """Raise `OutputError` for an output that is one of the inputs, or a photo, whatever it belongs to."""
+    """Raise `OutputError` for an output that is one of the inputs."""
     if file_key(output) in map(file_key, inputs):
         raise OutputError(f"{output} is an input of this panorama; choose another name with -o")
+
+
+def refuse_photo(output: Path) -> None:
+    """Raise `OutputError` for an output that somebody named and that is a photo, whatever it belongs to."""
     if is_photo(output):
         raise OutputError(
             f"{output} is a photo: its EXIF tells an exposure time; choose another name with -o, or remove it"

@@ -192,7 +192,7 @@ def _make_all(plan: Plan, folder: Path, keep: bool, progress: Progress) -> Found
     """Have nona make every layer."""
     prefix = str(plan.folder / plan.layer_prefix(plan.stem))
     if keep:
-        _refuse_to_keep(prefix)
+        _refuse_to_keep(plan, plan.images, prefix)
     for image in plan.images:
         _require_photo(plan, image)
     with progress("remap", len(_STEPS) * len(plan.images)) as advance:
@@ -207,7 +207,7 @@ def _make_all(plan: Plan, folder: Path, keep: bool, progress: Progress) -> Found
             "whether the photos are RGB or grey"
         )
     _check_made(plan, made)
-    return Found(prefix, _keep(plan, prefix, made) if keep else made)
+    return Found(prefix, _keep(prefix, made) if keep else made)
 
 
 def _find_or_make(
@@ -229,7 +229,7 @@ def _make_missing(
 ) -> dict[int, Path]:
     """Have nona make the layers that are not there; images that miss the crop have none."""
     if keep:
-        _refuse_to_keep(prefix)
+        _refuse_to_keep(plan, missing, prefix)
     project = _project_for_nona(plan, folder)
     with progress("remap", len(_STEPS) * len(missing)) as advance:
         for image in missing:
@@ -242,7 +242,7 @@ def _make_missing(
                 raise _failure(plan, [image], folder, code, lines)
     made = _made(plan, folder)
     _check_made(plan, made)
-    return _keep(plan, prefix, made) if keep else made
+    return _keep(prefix, made) if keep else made
 
 
 def _check_made(plan: Plan, made: dict[int, Path]) -> None:
@@ -346,11 +346,14 @@ def _prefix(plan: Plan, folder: Path) -> str:
     return str(folder / plan.layer_prefix(name))
 
 
+def _ending(plan: Plan) -> str:
+    return ".exr" if plan.hdr else ".tif"
+
+
 def _made(plan: Plan, folder: Path) -> dict[int, Path]:
     """The layers that nona left in the folder."""
-    ending = ".exr" if plan.hdr else ".tif"
     prefix = _prefix(plan, folder)
-    paths = {image.index: layer_path(prefix, image.index, ending) for image in plan.images}
+    paths = {image.index: layer_path(prefix, image.index, _ending(plan)) for image in plan.images}
     return {index: path for index, path in paths.items() if path.is_file()}
 
 
@@ -395,21 +398,18 @@ def _failure(
     return NonaFailedError(f"nona {ending(code)} on {plan.file}; {advice}. Its last lines:\n  {said}")
 
 
-def _refuse_to_keep(prefix: str) -> None:
-    """Raise `OutputError` if layers of these names could not be read."""
+def _refuse_to_keep(plan: Plan, images: Sequence[PlannedImage], prefix: str) -> None:
+    """Raise `OutputError` if layers of `images` could not be read by these names, or would take the place of
+    something else: before nona makes them, which may take minutes.
+    """
     if not named_in_unicode(Path(prefix)):
         raise OutputError(
             f"{prefix}0000 is not valid UTF-8, so that layers cannot be kept by such names; rename "
             "folder and project, or leave out --keep-layers"
         )
-
-
-def _keep(plan: Plan, prefix: str, made: dict[int, Path]) -> dict[int, Path]:
-    """Move layers beside the project, each whole or not at all."""
     photos = {file_key(photo) for photo in plan.photos}
-    kept, advice = {}, "leave out --keep-layers or free the folder"
-    finals = {index: layer_path(prefix, index, path.suffix) for index, path in made.items()}
-    for final in finals.values():
+    finals = [layer_path(prefix, image.index, _ending(plan)) for image in images]
+    for final in finals:
         if file_key(final) in photos:
             raise OutputError(
                 f"{final} is a photo, the layer cannot be kept by that name; rename the project"
@@ -419,14 +419,19 @@ def _keep(plan: Plan, prefix: str, made: dict[int, Path]) -> dict[int, Path]:
                 f"{final} has no alpha channel: it is no layer, and none takes its place; move it, or rename "
                 "the project"
             )
-    for final in finals.values():
+    for final in finals:
         if is_edited(final):
             raise OutputError(
                 f"{final} was changed by another program than nona, and no layer takes its place; move it, "
                 "leave out --keep-layers, or take the layers as they are (--remap never)"
             )
+
+
+def _keep(prefix: str, made: dict[int, Path]) -> dict[int, Path]:
+    """Move layers beside the project, each whole or not at all."""
+    kept, advice = {}, "leave out --keep-layers or free the folder"
     for index, path in made.items():
-        final = finals[index]
+        final = layer_path(prefix, index, path.suffix)
         weights = path.with_name(f"{path.stem}_gray.pgm")  # hugin_hdrmerge asks for them beside the layers
         for file in (path, weights) if weights.is_file() else (path,):
             move_whole(file, final.with_name(file.name.replace(path.stem, final.stem)), advice)

@@ -37,11 +37,6 @@ def complain(text: str, program: str = PROGRAM) -> None:
     say(f"{program}: error: {text}")
 
 
-def warn(text: str, program: str = PROGRAM) -> None:
-    """Print a warning to stderr, outside of what logs messages."""
-    say(label(logging.WARNING, program) + text)
-
-
 def print_path(path: Path) -> None:
     """Print a result to stdout."""
     print_result(os.fspath(path))
@@ -81,8 +76,10 @@ def is_bug(error: Exception) -> bool:
 
 
 def system_error(error: OSError) -> str:
-    """What the system says of an error; of the only one without a name of a file, what to do."""
-    if isinstance(error, FileNotFoundError) and error.filename is None:  # os.getcwd
+    """What the system says of an error; if the current folder is gone, so that names mean nothing, that."""
+    try:
+        os.getcwd()  # noqa: PTH109 - Path's is the same
+    except FileNotFoundError:
         return "the current folder is no longer there; go to one that is"
     return str(error)
 

@@ -29,7 +29,7 @@ def code_floats(device: Device, layers: Sequence[WorkingLayer]) -> float:
     Returns the value of the layers' light that counts as full scale then.
     """
     floats = [one for one in layers if one.layer.dtype.kind == "f"]
-    full = _full_scale([one.pixels.get()[::_EVERY, ::_EVERY] for one in floats])
+    full = _full_scale([one.pixels.get()[::_EVERY, ::_EVERY].copy() for one in floats])  # the rest is freed
     for one in floats:
         size = one.box[2:]
         device.run("unit", "unit_code", size, one.pixels, size, 1 / math.sqrt(full))

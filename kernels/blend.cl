@@ -78,12 +78,18 @@ BLEND_INLINE blend_correction blend_corrected(const blend_corrections *from, __g
 }
 
 /* Floats are corrected as they are coded at working resolution, by their roots (unit.cl). */
-static inline blend_samples blend_correct(blend_samples c, blend_correction by, float shoulder, float unit) {
+static inline blend_samples blend_correct(blend_samples c, blend_correction by, float shoulder, float unit_root) {
     if (INTEGER)
         return BLEND_RAISE(c, by.rise, WHITE, shoulder) + by.offset;
-    blend_samples v = sqrt(GREATEST(c, (blend_samples)(0.0f)));
+    const blend_samples light = GREATEST(c, (blend_samples)(0.0f));
+#define BLEND_0 s0123 /* the samples of each pixel */
+#define BLEND_1 s4567
+#define BLEND_2 s89ab
+#define BLEND_3 scdef
+#define BLEND_LIGHT(n, i) root4(light.BLEND_##n)
+    blend_samples v = (blend_samples)(BLEND_LIST(BLEND_LIGHT));
     v += v * by.rise;
-    v += (v + EXPOSURE_FLOOR * sqrt(unit)) * by.offset;
+    v += (v + EXPOSURE_FLOOR * unit_root) * by.offset;
     v = GREATEST(v, (blend_samples)(0.0f));
     return c < 0.0f || (by.rise == 0.0f && by.offset == 0.0f) ? c : v * v;
 }
@@ -233,7 +239,7 @@ __kernel void blend_band(
     int4 band,                           /* its place: left, top, width, height; run size: columns / PIXELS, rows */
     int2 origin,                         /* the region's place on the canvas */
     float shoulder,                      /* of the exposure scale */
-    float unit,                          /* floats: the value that counts as full scale of what they are coded as */
+    float unit_root,                     /* of the floats' value that counts as full scale of their code */
     int nearest,                         /* 1: nearest-neighbour sampling */
     float share,                         /* of all weight, below which a layer is hidden */
     __global const uint *marks, int words, /* from blend_mark */
@@ -304,7 +310,7 @@ __kernel void blend_band(
                 /* a sample that falls outside its layer counts smoothly less */
                 w *= c.FOURTHS * c.FOURTHS;
                 const blend_correction correction = blend_corrected(&corrections, layers + k);
-                c = blend_correct(c, correction, shoulder, unit);
+                c = blend_correct(c, correction, shoulder, unit_root);
                 corrected |= correction.some & (w > 0.0f);
                 start = BLEND_EACH(all.FOURTHS == 0.0f) ? c : start; /* the next, if that weighs nothing */
                 blend_samples part = (c - start) * BLEND_EACH(w);
@@ -326,7 +332,7 @@ __kernel void blend_band(
         if (!BLEND_SOME(fresh))
             continue;
         const blend_correction correction = blend_corrected(&corrections, layers + k);
-        v = BLEND_EACH(fresh) ? blend_correct(own, correction, shoulder, unit) : v;
+        v = BLEND_EACH(fresh) ? blend_correct(own, correction, shoulder, unit_root) : v;
         corrected |= fresh & correction.some;
         alone &= !fresh;
     }

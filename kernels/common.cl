@@ -333,7 +333,7 @@ static inline float darker_channel(float3 a, float3 b) {
     return LEAST(GREATEST(a.x, GREATEST(a.y, a.z)), GREATEST(b.x, GREATEST(b.y, b.z)));
 }
 
-/* Multiply these odds by 1 + rise, floats by it themselves. Black stays, and an integer image is not raised
+/* Multiply these odds by 1 + rise, floats' roots by it themselves. Black stays, and an integer image is not raised
    beyond white; with a shoulder of 1 white stays as well. Exactly c where the rise is 0. */
 #define EXPOSURE_RAISE(n)                                                                                          \
     static inline float##n exposure_raise##n(float##n c, float##n rise, float white, float shoulder) {             \

@@ -164,7 +164,8 @@ def test_a_band_of_three_layers_equals_its_twin(
         device.run(
             "blend", "blend_band", (-(-width // together), band[3]), rows, touched, 3, lines, factors,
             summands, *axes, full.border, full.lonlat, grid.border, cells.border, halves.border, band, origin,
-            shoulder, unit, nearest, share, device.upload(given.astype(np.uint32)), 1, out, options=options,
+            shoulder, unit**0.5, nearest, share, device.upload(given.astype(np.uint32)), 1, out,
+            options=options,
         )  # fmt: skip
         made.append(out.get())
     assert np.array_equal(*made)  # what is not marked changes nothing

@@ -22,6 +22,7 @@ from hugin_abflow import cli
 from hugin_abflow.batch import state
 from hugin_abflow.errors import ExitCode
 from hugin_abflow.project import read_plan
+from hugin_abflow.terminal import system_error
 
 ROOM = Path(__file__).resolve().parent.parent / "sample_projects" / "room"
 
@@ -157,6 +158,8 @@ def test_current_folder_that_is_gone(
     (tmp_path / "gone").rmdir()
     assert cli.main(["tiny.pto"]) == ExitCode.FAILED
     assert "current folder is no longer there; go to one that is" in capsys.readouterr().err
+    monkeypatch.chdir(tmp_path)
+    assert system_error(FileNotFoundError(2, "No such file")) == "[Errno 2] No such file"  # of a socket, say
 
 
 def test_project_that_is_not_there(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -66,19 +66,19 @@ def test_merges_at_a_time_open_one_device(monkeypatch):
 
 
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="processes are not forked there")
-@pytest.mark.parametrize("first", [True, False])
+@pytest.mark.parametrize("first", ["merge()", "list_devices()", "choose('0', 1)", ""])
 def test_a_forked_process_is_told_that_its_parents_device_is_not_there(first):
     """It waited for threads that only its parent has, for ever. If the parent has none, it works."""
     code = f"""
 import os
 import numpy as np
 from hugin_abflow import Canvas, Layer, merge_layers
+from hugin_abflow.devices import choose, list_devices
 from hugin_abflow.errors import DeviceError
 
 pixels = np.full((30, 40, 4), 255, np.uint8)
 merge = lambda: merge_layers([Layer.from_array("a", pixels)], Canvas.plane(40, 30))
-if {first}:
-    merge()
+{first}
 child = os.fork()
 if not child:
     try:

@@ -112,6 +112,8 @@ def test_rows_of_another_shape_or_type_are_refused(wrong):
     pixels = np.full((3, 5, 4), 255, np.uint8)
     layer = Layer.from_array("a", pixels)
     assert layer.rows(1, 3).shape == (2, 5, 4)
+    wide = np.full((3, 9, 4), 255, np.uint8)
+    assert replace(layer, read=lambda top, bottom: wide[top:bottom, 2:7]).rows(0, 3).flags.c_contiguous
     other = replace(layer, read=lambda top, bottom: pixels[top:bottom][wrong])
     with pytest.raises(ImageReadError, match=r"a: rows 0 to 3 are uint8 of the shape .*, \(3, 5, 4\)"):
         other.rows(0, 3)

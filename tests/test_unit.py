@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import tracemalloc
+
 import numpy as np
 import pytest
 from grids import on_device, random_layer
@@ -74,6 +76,15 @@ def test_light_beyond_what_floats_hold_is_none(device: Device) -> None:
     coded = working(device, pixels)
     unit.code_floats(device, [coded])
     assert np.isfinite(coded.pixels.get()).all()
+
+
+def test_little_of_the_layers_is_on_the_host_at_a_time(device: Device) -> None:
+    """None of their arrays stays, of which some pixels are looked at."""
+    coded = [working(device, np.full((530, 770, 4), 0.3, np.float32)) for _ in range(9)]
+    tracemalloc.start()
+    unit.code_floats(device, coded)
+    assert tracemalloc.get_traced_memory()[1] < 2.5 * 530 * 770 * 16
+    tracemalloc.stop()
 
 
 @pytest.mark.usefixtures(one_device.__name__)

@@ -117,6 +117,11 @@ class Display:
         if level >= logging.WARNING or (self.verbose and not self.quiet):
             self._show(f"{label(level)}{self._heading(task, text)}{text}")
 
+    def warn(self, text: str) -> None:
+        """A warning about no task."""
+        self.write_log(logging.WARNING, text)
+        self._show(label(logging.WARNING) + text)
+
     def phase_began(self, task: Task, name: str, total: int) -> None:
         """A phase of a task begins."""
         self.tell(task, logging.INFO, f"{name} ...")

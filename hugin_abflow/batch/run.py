@@ -59,11 +59,11 @@ def default_jobs() -> int:
     return min(3, os.cpu_count() or 1)
 
 
-def run(tasks: Iterable[Task | None], how: Run, lone: bool = False) -> ExitCode:
+def run(tasks: Iterable[Task | str | None], how: Run, lone: bool = False) -> ExitCode:
     """Perform tasks; print the panoramas' names on stdout. Raises `OutputError` for a log or a report that
     cannot be written, and, in the end, for stdout.
 
-    tasks       None means that there is none at the moment.
+    tasks       None means that there is none at the moment; a text is a warning.
     lone        there is but one: it is done in this process, and no table follows.
     """
     records: list[Record] = []
@@ -123,15 +123,19 @@ def _performers(how: Run, count: int, lone: bool, display: Display) -> Alone | P
     return Pool(min(jobs, count) if count else jobs, level, display)
 
 
-def _announced(tasks: Iterable[Task | None], running: set[Path], display: Display) -> Iterator[Task | None]:
-    """The same, while the display is told of each. A project that was saved again while it is stitched waits
-    until that is done: else the older panorama might be the last to be written.
+def _announced(
+    tasks: Iterable[Task | str | None], running: set[Path], display: Display
+) -> Iterator[Task | None]:
+    """The tasks, while the display is told of each, and of warnings. A project that was saved again while it
+    is stitched waits until that is done: else the older panorama might be the last to be written.
 
     running     projects that are being stitched; here they are added.
     """
     waiting: dict[Path, Task] = {}
     for task in tasks:
-        if task is not None:
+        if isinstance(task, str):
+            display.warn(task)
+        elif task is not None:
             waiting[task.project.absolute()] = task
         project = next((one for one in waiting if one not in running), None)
         if project is None:

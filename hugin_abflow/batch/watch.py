@@ -14,7 +14,6 @@ from hugin_abflow.batch.queue import projects_in
 from hugin_abflow.errors import AbflowError
 from hugin_abflow.project import read_plan
 from hugin_abflow.scratch import is_folder
-from hugin_abflow.terminal import warn
 
 # Seconds for which a project and its photos must have stayed as they are.
 _SETTLED = 3.0
@@ -24,10 +23,10 @@ Sign = tuple[tuple[str, int, int], ...]
 
 def watch(
     folder: Path, recursive: bool, *, clock: Callable[[], float] = time.monotonic
-) -> Iterator[Path | None]:
+) -> Iterator[Path | str | None]:
     """Projects under `folder` that were saved, or whose photos came or changed, once they stay as they are;
     those that are there in the beginning too. None when there is nothing at the moment; ask again
-    after a while. Never ends; a folder that is gone may come back, which is told once.
+    after a while. Never ends; a folder that is gone may come back: what comes up once then is a warning.
     """
     seen: dict[Path, tuple[Sign, float]] = {}  # what each looked like, and since when
     done: dict[Path, Sign] = {}
@@ -36,7 +35,7 @@ def watch(
         now = clock()
         gone = not is_folder(folder)
         if gone and not told:
-            warn(f"{folder} is no longer there, or closed to you; it is looked for again")
+            yield f"{folder} is no longer there, or closed to you; it is looked for again"
         told = gone
         for project in projects_in(folder, recursive):
             sign = _sign(project)

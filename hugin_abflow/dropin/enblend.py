@@ -17,7 +17,7 @@ from hugin_abflow.errors import CommandLineError, ExitCode, LayersMismatchError,
 from hugin_abflow.guides import Guide
 from hugin_abflow.images import read_layers
 from hugin_abflow.layer import Box, Canvas, Layer, bounding_box, check_layers
-from hugin_abflow.merge import guides_between, refuse_input, write_panorama
+from hugin_abflow.merge import guides_between, refuse_input, refuse_photo, write_panorama
 from hugin_abflow.metadata import describe, version
 from hugin_abflow.progress import Progress
 from hugin_abflow.project import read_plan
@@ -87,6 +87,7 @@ def blend(request: Request, progress: Progress) -> None:
     layers = _read(request)
     plan = read_plan(request.project) if request.project else None
     refuse_input(request.output, [*request.inputs, *([plan.file, *plan.photos] if plan else [])])
+    refuse_photo(request.output)
     settings = Settings(threads=_threads(os.environ.get("OMP_NUM_THREADS", "")))
     guides: Callable[[], Sequence[Guide]] = tuple
     metadata = None

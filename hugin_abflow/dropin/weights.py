@@ -18,7 +18,7 @@ from hugin_abflow.errors import CommandLineError, LayersMismatchError, LayersMis
 from hugin_abflow.guides import Guide
 from hugin_abflow.images import ImageWriter, check_target, read_layer
 from hugin_abflow.layer import Box, Canvas, Layer, full_scale
-from hugin_abflow.merge import refuse_input
+from hugin_abflow.merge import refuse_input, refuse_photo
 from hugin_abflow.opencl import Device
 from hugin_abflow.progress import Progress, silent
 from hugin_abflow.settings import Settings
@@ -94,6 +94,7 @@ class MaskedMerge:
             raise CommandLineError(f"--save-masks={self.save} names one mask twice; %n gives each a number")
         for target in targets:
             refuse_input(target, [self.output, *(layer.file for layer in layers if layer.file)])
+            refuse_photo(target)
             check_target(target, None)  # now, not when all else is done
         return targets
 
