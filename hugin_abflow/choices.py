@@ -56,8 +56,10 @@ def choose(
     defaults = {str(names[name].name): value for name, value in values.items()}
     try:
         params, given = _parsed(command, arguments, defaults)
-        overruled = {rival for name in given for rival in _rivals(name, params)} - given
-        params, _ = _parsed(command, arguments, {k: v for k, v in defaults.items() if k not in overruled})
+        overruled = {rival for name in given for rival in _rivals(name, params)} & defaults.keys() - given
+        if overruled:
+            rest = {name: value for name, value in defaults.items() if name not in overruled}
+            params, _ = _parsed(command, arguments, rest)
     except click.UsageError as error:
         if file is None:
             raise
@@ -82,7 +84,7 @@ def _parsed(
 
 def _rivals(name: str, params: Mapping[str, Any]) -> set[str]:
     """The parameters that say something against one."""
-    rivals = {two[two[0] == name] for *two, _ in _RIVALS if name in two}
+    rivals = {other if name == one else one for one, other, _ in _RIVALS if name in (one, other)}
     if name in ("prefix", "layers") and params["remap"] == "always":
         rivals.add("remap")
     if name == "remap" and params["remap"] == "always":

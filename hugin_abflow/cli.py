@@ -346,11 +346,11 @@ def _saved(
     no more.
     """
     for project in projects:
-        if isinstance(project, str):
+        if not isinstance(project, Path):
             yield project
             continue
         try:
-            yield Task(project, _options(**options(project)[1]), not force, True) if project else None
+            yield Task(project, _options(**options(project)[1]), not force, True)
         except (AbflowError, click.UsageError) as error:
             complain(f"{project}: {error.format_message() if isinstance(error, click.UsageError) else error}")
 

@@ -320,8 +320,7 @@ def write_image(
     jpeg_quality: int | None = None,
     canvas_size: tuple[int, int] | None = None,
 ) -> None:
-    """Write pixels (height, width, 2 or 4), unassociated alpha last; see `ImageWriter`. Pixels with NaN or
-    infinity become transparent.
+    """Write pixels (height, width, 2 or 4), unassociated alpha last, as `native` has them; see `ImageWriter`.
 
     Raises `OutputError` for pixels of another shape and for what `ImageWriter` cannot write.
     """
@@ -331,11 +330,12 @@ def write_image(
             "or (height, width, 2), grey and alpha"
         )
     height, width, samples = pixels.shape
+    pixels = native(pixels)
     with ImageWriter(
-        path, width, height, samples - 1, pixels.dtype.newbyteorder("="), offset=offset, icc=icc,
+        path, width, height, samples - 1, pixels.dtype, offset=offset, icc=icc,
         compression=compression, jpeg_quality=jpeg_quality, canvas_size=canvas_size,
     ) as writer:  # fmt: skip
-        writer.write_rows(native(pixels))
+        writer.write_rows(pixels)
 
 
 def check_target(path: Path, compression: str | None) -> None:

@@ -147,10 +147,9 @@ def planned_layers(plan: Plan, remap: Remap) -> tuple[Found | None, Sequence[Pla
         return None, plan.images
     unusable, stale = found.unusable(plan), found.stale(plan)
     if (unusable or stale) and _can_make(plan):
-        edited = [file for file in found.in_order() if is_edited(file)]
         if unusable:
             log.warning("%s: all layers are made again", unusable)
-        elif edited:
+        elif edited := [file for file in found.in_order() if is_edited(file)]:
             log.warning(
                 "%s was changed by another program, but %s is older than the project or its photo: layers "
                 "are made again (--remap never takes them as they are)", edited[0], stale[0],
@@ -346,14 +345,10 @@ def _prefix(plan: Plan, folder: Path) -> str:
     return str(folder / plan.layer_prefix(name))
 
 
-def _ending(plan: Plan) -> str:
-    return ".exr" if plan.hdr else ".tif"
-
-
 def _made(plan: Plan, folder: Path) -> dict[int, Path]:
     """The layers that nona left in the folder."""
     prefix = _prefix(plan, folder)
-    paths = {image.index: layer_path(prefix, image.index, _ending(plan)) for image in plan.images}
+    paths = {image.index: layer_path(prefix, image.index, plan.layer_ending) for image in plan.images}
     return {index: path for index, path in paths.items() if path.is_file()}
 
 
@@ -408,7 +403,7 @@ def _refuse_to_keep(plan: Plan, images: Sequence[PlannedImage], prefix: str) -> 
             "folder and project, or leave out --keep-layers"
         )
     photos = {file_key(photo) for photo in plan.photos}
-    finals = [layer_path(prefix, image.index, _ending(plan)) for image in images]
+    finals = [layer_path(prefix, image.index, plan.layer_ending) for image in images]
     for final in finals:
         if file_key(final) in photos:
             raise OutputError(

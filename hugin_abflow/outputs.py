@@ -123,7 +123,7 @@ class Branch:
     def layer(self, index: int) -> str:
         """The name of an image's layer."""
         prefix = self.plan.layer_prefix(self.plan.stem)
-        return layer_name(prefix, index, ".exr" if self.plan.hdr else ".tif")
+        return layer_name(prefix, index, self.plan.layer_ending)
 
     def steps(self, images: Sequence[int]) -> list[Step]:
         """How the outputs are made of the layers of `images`, in this order.

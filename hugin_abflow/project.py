@@ -105,6 +105,11 @@ class Plan:
             return f"{name}_hdr_"
         return f"{name}_exposure_layers_" if self.ignore_exposure else name
 
+    @property
+    def layer_ending(self) -> str:
+        """Of nona's layers."""
+        return ".exr" if self.hdr else ".tif"
+
     def default_output(self, taken: Iterable[Path] = ()) -> Path:
         """Beside the project, named after it: ``pano.pto`` -> ``pano.tif``.
 

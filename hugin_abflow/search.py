@@ -9,7 +9,7 @@ from beside it where that fits better (Barnes et al., "PatchMatch", 2009).
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -124,33 +124,30 @@ def reaches(
     if reach <= 0:
         return {}
 
-    def tried(level: int, furthest: int) -> dict[int, int]:
-        return {level: min(math.ceil(reach / 2**level), furthest)}
+    def tried(level: int, furthest: int) -> int:
+        return min(math.ceil(reach / (1 << level)), furthest)
 
-    def fits(its: Mapping[int, int]) -> bool:
-        return room(its, grid) <= _enough_room(grid)
+    def fits(level: int, furthest: int) -> bool:
+        return _room(level, tried(level, furthest), grid) <= _enough_room(grid)
 
     first = min(levels - 1, max(0, math.ceil(math.log2(max(reach, 1) / parameters.coarse))))
     # on a chart around two far corners, which are small, motion is: fine levels would do
-    while first < levels - 1 and not fits(tried(first, parameters.furthest[0])):
+    while first < levels - 1 and not fits(first, parameters.furthest[0]):
         first += 1
-    result = tried(first, parameters.furthest[0])
+    result = {first: tried(first, parameters.furthest[0])}
     for level, furthest in zip(range(first - 1, finest - 1, -1), parameters.furthest[1:], strict=False):
-        if fits(tried(level, furthest)):
-            result |= tried(level, furthest)
+        if fits(level, furthest):
+            result[level] = tried(level, furthest)
     return result
 
 
-def room(tried: Mapping[int, int], grid: Grid) -> int:
-    """Bytes that `exhaustive` takes for costs where on each level so many px are tried: the most of them.
+def _room(level: int, largest: int, grid: Grid) -> int:
+    """Bytes that `exhaustive` takes for costs on a level, where so many of its px are tried.
 
     grid    of the finest level.
     """
-    most = 0
-    for level, largest in tried.items():
-        width, height = (-(-side // 2**level) for side in grid[:2])
-        most = max(most, 2 * 4 * height * (2 * largest + 1) ** 2 * _pitch((width, height, 0, 0)))
-    return most
+    width, height = (-(-side // (1 << level)) for side in grid[:2])
+    return 2 * 4 * height * (2 * largest + 1) ** 2 * _pitch((width, height, 0, 0))
 
 
 def _enough_room(grid: Grid) -> int:
@@ -164,8 +161,9 @@ def most_room(reach: float, levels: int, grid: Grid, parameters: SearchParameter
     """
     if reach <= 0:
         return 0
-    all_of_it = room(reaches(reach, levels, grid, parameters, finest), grid)
-    less = room({0: math.ceil(min(reach, parameters.coarse))}, grid)
+    tried = reaches(reach, levels, grid, parameters, finest)
+    all_of_it = max(_room(level, largest, grid) for level, largest in tried.items())
+    less = _room(0, math.ceil(min(reach, parameters.coarse)), grid)
     return max(all_of_it, min(less, _enough_room(grid)))
 
 

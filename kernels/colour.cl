@@ -10,7 +10,7 @@ static inline bool colour_clips(float4 c, float4 clipped) {
 }
 
 /* How much two samples tell of exposure, 0..1: what is nearly black in either may have been any darker, most of all at
-   the rim of a dark lens, and by how much is seen by nobody. Floats are light, of which darkness is no end: all of it tells. */
+   the rim of a dark lens, and by how much is seen by nobody. Floats are light, without such an end: all tell. */
 static inline float colour_tells(float4 a, float4 b, float shoulder) {
     return shoulder > 0.0f ? ramp(darker_channel(a.xyz, b.xyz), COLOUR_DARK, COLOUR_BRIGHT) : 1.0f;
 }

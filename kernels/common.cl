@@ -318,8 +318,8 @@ static inline bool layer_pair(__global const float4 *layer_a, __global const flo
 
 /* The scale on which exposure differences are smooth fields, c in 0..1 of full scale: log odds of shoulder * c.
    Integer images: 1 where the camera's curve levels off towards white, less where it runs straight into it.
-   Floats, which are coded by their roots: 0, which is log. The floor keeps dark noise, and what is nearly white, calm where differences are
-   measured. */
+   Floats, which are coded by their roots: 0, which is log. The floor keeps dark noise, and what is nearly white, calm
+   where differences are measured. */
 #define EXPOSURE_FLOOR 0.02f
 
 static inline float3 exposure_scale(float3 c, float shoulder) {

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import cv2
 import numpy as np
 import OpenImageIO as oiio
 import pytest
@@ -21,11 +22,14 @@ from hugin_abflow.formats import foreign_format, picture_format
 def test_pictures_are_told_by_what_they_hold(tmp_path: Path, ending: str, name: str, foreign: bool) -> None:
     """Whatever they are called."""
     file = tmp_path / f"written.{ending}"
-    output = oiio.ImageOutput.create(str(file))
-    if output is None or not output.open(str(file), oiio.ImageSpec(16, 8, 3, "uint8")):
-        pytest.skip(f"OpenImageIO writes no {name} here")
-    output.write_image(np.zeros((8, 16, 3), np.uint8))
-    output.close()
+    pixels = np.zeros((8, 16, 3), np.uint8)
+    if ending == "webp":  # OpenImageIO may be built without it
+        assert cv2.imwrite(str(file), pixels)
+    else:
+        output = oiio.ImageOutput.create(str(file))
+        assert output.open(str(file), oiio.ImageSpec(16, 8, 3, "uint8"))
+        output.write_image(pixels)
+        output.close()
     renamed = file.rename(tmp_path / "photo.jpg")
     assert picture_format(renamed.read_bytes()) == name
     assert foreign_format(renamed) == (name if foreign else None)
