@@ -162,7 +162,7 @@ def most_room(reach: float, levels: int, grid: Grid, parameters: SearchParameter
     if reach <= 0:
         return 0
     tried = reaches(reach, levels, grid, parameters, finest)
-    all_of_it = max(_room(level, largest, grid) for level, largest in tried.items())
+    all_of_it = max((_room(level, largest, grid) for level, largest in tried.items()), default=0)
     less = _room(0, math.ceil(min(reach, parameters.coarse)), grid)
     return max(all_of_it, min(less, _enough_room(grid)))
 
