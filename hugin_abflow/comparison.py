@@ -18,7 +18,7 @@ SQUARE = np.s_[..., 3]  # the mean square of that difference, of the channel in 
 VARIANCES = np.s_[..., 4:6]  # of what each of both layers shows
 COARSE = np.s_[..., 6:8]  # the same of means of blocks of pixels, in which noise is less
 COVARIANCE = np.s_[..., 8]  # of the two layers, of these blocks
-SHARE = np.s_[..., 9]  # of the cell that tells: what both layers show, and neither clips
+SHARE = np.s_[..., 9]  # of the cell that tells: what both layers show, clipped only if the other is darker
 
 # Sigma, in cells, of the Gaussian by which differences are averaged: texture that is a little off is no
 # reason to cut.

@@ -55,6 +55,10 @@ _AS_IT_IS = 0.15
 _FORBIDDEN = 1e4
 # The share of a region's cells that a layer has for it to be taken from there, whole.
 _MOSTLY = 0.5
+# The share of what a cut shows up to which next to nothing is seen where a region is shown whole: then
+# favour of the softmax, which grows with the area, is no reason to cut. A car across the middle of an overlap
+# was cut in two.
+_CLEAN = 1 / 3
 
 Cells = npt.NDArray[np.bool_]  # (height, width) on the seam grid
 Prices = npt.NDArray[np.float64]  # (layers, height, width) on the seam grid
@@ -132,7 +136,7 @@ class Choice:
 
         One layer is taken, as far as it goes, if that costs no more than `whole_factor` allows: somebody may
         stand there twice, and a cut between his two places, or where these overlap, is as cheap as one beside
-        him.
+        him. So it is, whatever the softmax favours, if a cut is seen much better.
         """
         candidates = np.flatnonzero(self.cover[:, rows, columns].any(1))
         if candidates.size < 2:
@@ -142,17 +146,30 @@ class Choice:
             wanted = replace(plain, price=plain.price + unwanted[candidates][:, rows, columns])
         labels = least(wanted)
         if self.whole_factor is not None:
-            labels = _alone(wanted, labels, self.whole_factor[rows, columns].max())
+            favoured = self._favoured(rows, columns, candidates)
+            factor, faint = self.whole_factor[rows, columns].max(), _WEAK * self._cut_price(rows.size)
+            labels = _alone(wanted, labels, factor, favoured, faint)
         return candidates[labels], _energy(plain, labels)
+
+    def _cut_price(self, cells: int) -> float:
+        """c in a region of so many cells."""
+        return max(self.cut_price, self.cut_share * math.sqrt(cells))
+
+    def _favoured(
+        self, rows: npt.NDArray[np.intp], columns: npt.NDArray[np.intp], candidates: npt.NDArray[np.intp]
+    ) -> Prices:
+        """r (1 - s_k) of a region's cells, (candidates, cells): that the softmax favours other layers."""
+        shares = self.shares[candidates][:, rows, columns]
+        return self.residual.mean[rows, columns] * (1 - shares)
 
     def _graph(
         self, rows: npt.NDArray[np.intp], columns: npt.NDArray[np.intp], candidates: npt.NDArray[np.intp]
     ) -> Graph:
         """The energy of a region's cells, taken from the layers `candidates`."""
-        weight, rough = self.residual.mean[rows, columns], self.residual.rms[rows, columns]
-        cut_price = max(self.cut_price, self.cut_share * math.sqrt(rows.size))
+        rough = self.residual.rms[rows, columns]
+        cut_price = self._cut_price(rows.size)
         present = self.cover[candidates][:, rows, columns]
-        price = np.where(present, weight * (1 - self.shares[candidates][:, rows, columns]), _FORBIDDEN)
+        price = np.where(present, self._favoured(rows, columns, candidates), _FORBIDDEN)
         if self.clipping is not None:
             price += self.clipping[candidates][:, rows, columns]
         number = np.full(self.residual.mean.shape, -1)
@@ -171,15 +188,26 @@ class Choice:
         return Graph(rows, columns, price, present, first, second, cuts)
 
 
-def _alone(graph: Graph, labels: Labels, factor: float) -> Labels:
-    """The labels that take all cells from one layer, as far as it goes, which has most of them, if that costs
-    no more than `factor` times as much as `labels`; else these.
+def _alone(graph: Graph, labels: Labels, factor: float, favoured: Prices, faint: float) -> Labels:
+    """The labels that take all cells from one layer, as far as it goes, which has most of them, if they show
+    next to nothing of what `labels` show, or else if they cost no more than `factor` times as much; else
+    `labels`.
+
+    favoured    the part of the prices that is not seen. faint: the price of a cut up to which it is not.
     """
+
+    def price(labels: Labels) -> float:
+        return _energy(graph, labels)
+
+    def seen(labels: Labels) -> float:
+        return price(labels) - float(np.take_along_axis(favoured, labels[None], 0).sum())
+
+    cuts = graph.cut[labels[graph.first] != labels[graph.second]]
     alone = [np.where(one, k, labels) for k, one in enumerate(graph.possible) if one.mean() > _MOSTLY]
-    least_found, *energies = (_energy(graph, one) for one in (labels, *alone))
-    if alone and min(energies) <= factor * least_found:
-        return alone[int(np.argmin(energies))]
-    return labels
+    is_cut = cuts.sum() > faint * cuts.size
+    clean = [one for one in alone if is_cut and seen(one) <= _CLEAN * seen(labels)]
+    cheap = [one for one in alone if price(one) <= factor * price(labels)]
+    return min(clean or cheap, key=price, default=labels)
 
 
 def seen(residual: Residuals) -> Residuals:

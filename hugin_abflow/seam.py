@@ -5,6 +5,7 @@ layers that differ although exposure is corrected. Each region of such cells is 
 between layers where they show least (regions.py). Regions keep to themselves: elsewhere the softmax stays as
 it is, and the transition lies where the layers agree. What is clipped in one photo only is no such
 difference: it is brighter in the other by an unknown amount, and changes over best where it does so slowly.
+But if it would not be clipped there for certain, the other shows something else, such as no white van.
 
 Where there is no flow, layers are not aligned, and each overlap is such a region, whole: on finer cells, with
 the mean square of the difference in place of r and t, since fine texture is as much in the way, and with
@@ -55,6 +56,11 @@ _FEW = 0.5
 _CLIPPED = 0.5
 # By how much, of full scale, that layer may be darker: what is white here and darker there is something else.
 _DARKER = 0.05
+# What is clipped here and, by the exposures of both, darker there than what would just clip here by more than
+# this, of full scale, is something else for certain.
+_CERTAINLY_DARKER = 0.1
+# The same where layers are not aligned, whose exposures are not known well enough.
+_NEVER = 1e6
 # What is left of a layer's weight where it yields: a pixel that no other layer can fill stays opaque.
 _TRACE = 1e-12
 # How many times as much as a cut it may cost to take a region from one layer that has most of it, which shows
@@ -78,7 +84,7 @@ def residuals(scene: Scene, correction: Correction, single: Cells | None = None)
     mean, square, smooth_square = (np.zeros(cells.shape) for _ in range(3))
     measured, unrelated = (np.zeros(cells.shape, bool) for _ in range(2))
     limits = [clipping(layer) for layer in scene.layers]
-    for its, found in _differences(scene, correction, cells, limits):
+    for its, found in _differences(scene, correction, cells, limits, _CERTAINLY_DARKER):
         smooth = comparison.smoothed(found, cells)
         other = ~comparison.in_another_light(found, smooth, cells)
         if single is not None:
@@ -276,10 +282,15 @@ def _yield(
 
 
 def _differences(
-    scene: Scene, correction: Correction, cells: Grid, limits: Sequence[tuple[float, ...]] | None = None
+    scene: Scene,
+    correction: Correction,
+    cells: Grid,
+    limits: Sequence[tuple[float, ...]] | None = None,
+    darker: float = _NEVER,
 ) -> Iterator[tuple[tuple[slice, slice], Comparison]]:
     """Of each two corrected layers, rows and columns of the cells that both may be in, and what is found
-    of these, of the pixels that are not brighter than their layer's limits (r, g, b, 1); None: of all.
+    of these, of the pixels that are not brighter than their layer's limits (r, g, b, 1), unless the other is
+    darker for certain by more than `darker`; None: of all.
     """
     device, layers, fields, grid = scene.device, scene.layers, scene.fields, scene.grid
     limits = [(math.inf,) * 4] * len(layers) if limits is None else limits
@@ -296,7 +307,7 @@ def _differences(
         device.run(
             "seam", "seam_difference", (part.width, part.height), *sides, grid.border, grid.lonlat,
             correction.grid.border, cells.border, part.place, correction.shoulder, limits[pair.a],
-            limits[pair.b], difference, square, texture,
+            limits[pair.b], darker, difference, square, texture,
         )  # fmt: skip
         return part, difference, square, texture
 

@@ -1,7 +1,16 @@
 /* Where one layer is taken whole. */
 
+/* Whether a sample a tells how much it differs from b though it may be clipped: b is by more than `darker`
+   darker than what has that brightness in its layer, by a gain, theirs less b's, on the exposure scale. What both would show of a grey tells by
+   how much exposures differ: towards white some cameras' curves level off, and bring them closer. */
+static inline int seam_tells(float3 a, float3 clipped, float3 b, float3 gain, float shoulder, float darker) {
+    const float3 ratio = 2.0f * exposure_shift((float3)(0.5f), gain, shoulder);
+    const float3 darkest = LEAST(ratio, (float3)(1.0f)) * clipped - darker;
+    return all(a <= clipped || b < darkest);
+}
+
 /* Mean difference a - b of two aligned, corrected layers over the pixels of a cell (every second one in x and y)
-   that both show unclipped, the share of these, the mean square of the channel that differs most, and what tells of
+   that both show, where neither clips, or the other is darker for certain, the share of these, the mean square of the channel that differs most, and what tells of
    their textures, means of the channels: the variance of what each shows; and of the means of blocks of up to four
    such pixels, in which noise is less, the variances and their covariance. */
 __kernel void seam_difference(__global const float4 *layer_a, __global const float4 *field_a, int4 box_a,
@@ -12,7 +21,8 @@ __kernel void seam_difference(__global const float4 *layer_a, __global const flo
                               int4 colours, int4 cells,    /* grid of the gains; seam grid */
                               int4 part,                   /* cells that are compared, run size */
                               float shoulder,              /* of the exposure scale */
-                              float4 clipped_a, float4 clipped_b, /* brighter samples are not used */
+                              float4 clipped_a, float4 clipped_b, /* brighter samples may be clipped */
+                              float darker, /* they tell if the other is darker by so much than they can be */
                               __global float4 *difference, /* (part.w, part.z): r, g, b, share */
                               __global float *square,      /* (part.w, part.z) */
                               __global float8 *texture)    /* the same: variances, of blocks, their covariance, 0 */
@@ -23,6 +33,7 @@ __kernel void seam_difference(__global const float4 *layer_a, __global const flo
     const int cx = part.x + column, cy = part.y + row;
     const int4 its = cell_pixels(cx, cy, border, cells);
     const int g = gain_index(cx, cy, cells, colours);
+    const float3 brighter = gain_a[g].xyz - gain_b[g].xyz;
     float3 sum = (float3)(0.0f), squares = sum, sum_a = sum, sum_b = sum, squares_a = sum, squares_b = sum;
     float3 mean_a = sum, mean_b = sum, means_a = sum, means_b = sum, products = sum;
     float n = 0.0f, tried = 0.0f, blocks = 0.0f;
@@ -36,7 +47,8 @@ __kernel void seam_difference(__global const float4 *layer_a, __global const flo
                     float4 a, b;
                     const int2 p = (int2)(x, y);
                     if (!layer_pair(layer_a, field_a, box_a, layer_b, field_b, box_b, p, border, lonlat, &a, &b) ||
-                        any(a.xyz > clipped_a.xyz) || any(b.xyz > clipped_b.xyz))
+                        !seam_tells(a.xyz, clipped_a.xyz, b.xyz, brighter, shoulder, darker) ||
+                        !seam_tells(b.xyz, clipped_b.xyz, a.xyz, -brighter, shoulder, darker))
                         continue;
                     const float3 look_a = exposure_look(a.xyz, gain_a[g].xyz, shoulder);
                     const float3 look_b = exposure_look(b.xyz, gain_b[g].xyz, shoulder), d = look_a - look_b;

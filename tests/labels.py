@@ -43,6 +43,26 @@ def energies(labels, rows, columns, residual, shares, cover, wraps) -> np.ndarra
     return total
 
 
+def favoured(labels, rows, columns, residual, shares, cover, wraps) -> np.ndarray:
+    """What of it is not seen: that the softmax favours other layers."""
+    return (residual.mean[rows, columns] * (1 - shares[labels, rows, columns])).sum(1)
+
+
+def cuts_of(labels, rows, columns, residual, shares, cover, wraps) -> float:
+    """The mean residual along the cuts of a labelling; 0 without any."""
+    grid = np.full(residual.rms.shape, -1)
+    grid[rows, columns] = labels
+    found = []
+    for axis in (0, 1):
+        beside, rms = (np.roll(one, -1, axis) for one in (grid, residual.rms))
+        cut = (grid >= 0) & (beside >= 0) & (grid != beside)
+        if axis == 0 or not wraps:
+            cut[(-1, slice(None)) if axis == 0 else (slice(None), -1)] = False
+        found.append(((residual.rms + rms) / 2)[cut])
+    found = np.concatenate(found)
+    return float(found.mean()) if found.size else 0.0
+
+
 @st.composite
 def problems(draw, layers: int, most: int):
     """A connected region of at most `most` cells on a small grid; each is covered by one layer at least."""

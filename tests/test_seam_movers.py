@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -9,7 +10,7 @@ import numpy as np
 import pytest
 from grids import on_device, plane
 from hypothesis import given
-from labels import alike, energies, label, many, problems
+from labels import alike, cuts_of, energies, favoured, label, many, problems
 from test_seam import whole_layer
 
 from hugin_abflow import coefficient, labelling, regions, seam
@@ -89,25 +90,51 @@ def test_cuts_are_as_dear_for_large_people(times: int) -> None:
 @many
 @given(problem=problems(2, 11))
 def test_one_layer_of_two_is_taken_if_it_costs_no_more_than_twice_as_much(problem) -> None:
-    """One that has more than half of the region, as far as it goes; the other one where it does not."""
+    """One that has more than half of the region, as far as it goes; the other one where it does not. Or if
+    it shows next to nothing of what a cut shows.
+    """
     rows, columns, cover = problem[0], problem[1], problem[4]
     found, cut = label(*problem, whole_factor=seam._SINGLE_FACTOR), label(*problem)
     assert cover[found, rows, columns].all()
     there = cover[:, rows, columns]
-    if not there.any(1).all():
-        assert np.array_equal(found, cut)
-        return
     alone = np.array([np.where(there[k], k, 1 - k) for k in (0, 1) if there[k].mean() > 0.5])
-    if not len(alone):
+    if not there.any(1).all() or not len(alone):
         assert np.array_equal(found, cut)
         return
     costs, least = energies(alone, *problem), energies(cut[None], *problem)[0]
+    seen, of_cut = costs - favoured(alone, *problem), least - favoured(cut[None], *problem)[0]
     rounding = 5 * rows.size / labelling._UNIT
-    if costs.min() < seam._SINGLE_FACTOR * least - rounding:
-        assert np.isclose(energies(found[None], *problem)[0], costs.min())
+    clean = (seen <= regions._CLEAN * of_cut) & (cuts_of(cut, *problem) > regions._WEAK)
+    if clean.any() or costs.min() < seam._SINGLE_FACTOR * least - rounding:
+        wanted = costs[clean] if clean.any() else costs
+        assert np.isclose(energies(found[None], *problem)[0], wanted.min())
         assert (found == alone).all(1).any()
     elif costs.min() > seam._SINGLE_FACTOR * least + rounding:
         assert np.array_equal(found, cut)
+
+
+@pytest.mark.parametrize("contrast", [0.3, 0.9])
+def test_a_long_thing_across_the_middle_is_not_cut(contrast: float) -> None:
+    """Half of it is a large area, in which the softmax favours the other layer; but one shows it whole, and
+    nothing of it beside.
+    """
+    thing = np.zeros((14, 50), bool)
+    thing[2:12, 5:45] = True
+    residual = regions.seen(alike(np.where(thing, contrast, 0.01)))
+    share = np.where(np.arange(50) < 25, 0.999, 0.001) * np.ones((14, 1))
+    problem = (
+        *everywhere((14, 50)),
+        residual,
+        np.stack([share, 1 - share]),
+        np.ones((2, 14, 50), bool),
+        False,
+    )
+    assert set(label(*problem)) == {0, 1}
+    assert len(set(label(*problem, whole_factor=seam._WHOLE_FACTOR))) == 1
+    ends = np.ones((2, 14, 50), bool)
+    ends[0, :, 40:] = ends[1, :, :10] = False  # neither shows all of it: a cut is seen anyway
+    found = label(*problem[:4], ends, False, whole_factor=seam._WHOLE_FACTOR).reshape(14, 50)
+    assert set(found[:, 24]) == {0} and set(found[:, 25]) == {1}
 
 
 def test_cells_that_no_layer_covers_cost_nothing() -> None:
@@ -247,8 +274,11 @@ def test_one_layer_may_cost_more_where_something_moved(
     grid = plane(240, 96)
     region = np.zeros((12, 30), bool)
     region[2:10, 4:26] = True
-    energies = iter([1.0, cost, 9.0, cost])
-    monkeypatch.setattr(regions, "energy", lambda *graph: next(energies))
+    alone = {0: cost, 1: 9.0}
+    monkeypatch.setattr(
+        regions, "energy", lambda _, labels: alone[labels[0]] if (labels == labels[0]).all() else 1.0
+    )
+    monkeypatch.setattr(regions, "_WEAK", math.inf)  # a cut is not seen, however much it costs
     seen = []
     monkeypatch.setattr(seam, "_yield", lambda *given: seen.append(given[3]))
     once = np.zeros(region.shape, bool)

@@ -245,19 +245,6 @@ def test_layers_that_agree_are_blended_as_ever(
         assert gains == [[None, None]] * 2
 
 
-def test_what_is_clipped_in_one_layer_changes_over_as_ever(device: Device) -> None:
-    """A bright ceiling that the lighter layer burns out is no thing that only one of them shows."""
-    canvas, x, _ = CANVASES["plane"]
-    layers = []
-    for mask, its in zip(halves(canvas, x), (1.0, 0.6), strict=True):
-        picture = wall(canvas).astype(float)
-        picture[..., :3] *= its
-        picture[: canvas.height // 2, :, :3] = min(330 * its, 255)
-        layers.append(masked(picture.astype(np.uint8), mask))
-    with_, without = (fields_of(prepared(device, layers, canvas, seam=s)) for s in (True, False))
-    assert all(np.array_equal(*pair) for pair in zip(with_, without, strict=True))
-
-
 def test_identical_layers_have_no_regions(device: Device, monkeypatch: pytest.MonkeyPatch) -> None:
     """They are no pair, so that nothing is measured; weights and places are the same to the bit."""
     asked = []

@@ -146,6 +146,17 @@ def exposure_shift(c: Array, gain: Array, shoulder: float) -> Array:
     return np.where(gain == 0, c, moved)
 
 
+def gains_at(gain: Array, border: Sequence[int], colours: Sequence[int], cells: Sequence[int]) -> Array:
+    """The gain at the centre of each pixel's cell (height, width, 3)."""
+    gain_row = (2 * np.arange(cells[1]) + 1) * colours[1] // (2 * cells[1])
+    gain_column = (2 * np.arange(cells[0]) + 1) * colours[0] // (2 * cells[0])
+    cell = [
+        np.searchsorted(np.arange(1, c + 1) * b // c, np.arange(b), "right")
+        for b, c in zip(border, cells, strict=False)
+    ]
+    return gain[gain_row[cell[1]][:, None], gain_column[cell[0]][None], :3].astype(np.float64)
+
+
 def layer_look(
     layer: Array,
     field: Array,
@@ -160,14 +171,8 @@ def layer_look(
     """What an aligned layer shows in all pixels of a grid (height, width, 4), and how it looks with the gain
     at the centre of each one's cell (height, width, 3)."""
     columns, rows = pixels(border[0], border[1])
-    gain_row = (2 * np.arange(cells[1]) + 1) * colours[1] // (2 * cells[1])
-    gain_column = (2 * np.arange(cells[0]) + 1) * colours[0] // (2 * cells[0])
-    cell = [
-        np.searchsorted(np.arange(1, c + 1) * b // c, np.arange(b), "right")
-        for b, c in zip(border, cells, strict=False)
-    ]
     seen = layer_seen(layer, field, box, columns, rows, border, lonlat)
-    here = gain[gain_row[cell[1]][:, None], gain_column[cell[0]][None], :3].astype(np.float64)
+    here = gains_at(gain, border, colours, cells)
     return seen, np.maximum(exposure_shift(seen[..., :3], here, shoulder), 0)
 
 

@@ -13,6 +13,8 @@ from reference.common import (
     canvas_point,
     canvas_position,
     cell_parts,
+    exposure_shift,
+    gains_at,
     layer_look,
     layer_seen,
     on_box,
@@ -36,18 +38,24 @@ def seam_difference(
     shoulder: float,
     clipped_a: Numbers,
     clipped_b: Numbers,
+    darker: float,
 ) -> tuple[Array, Array, Array]:
     """Mean corrected difference a - b of every cell's pixels, every other one in x and y, with their share,
     the largest channel's mean square, and, means of the channels', the variances of a and b, those of the
     means of blocks of four, their covariance, and zeros; samples brighter than `clipped` of their layer are
-    left out."""
-    looks = []
-    usable = np.ones((border[1], border[0]), bool)
-    sides = (layer_a, field_a, box_a, gain_a, clipped_a), (layer_b, field_b, box_b, gain_b, clipped_b)
-    for *side, clipped in sides:
-        seen, look = layer_look(*side, border, lonlat, colours, cells, shoulder)
-        usable &= (seen[..., 3] > 0) & (seen[..., :3] <= np.float32(clipped)[:3]).all(-1)
-        looks.append(look)
+    left out, but where the other's are `darker` than what has that brightness."""
+    sides = (layer_a, field_a, box_a, gain_a), (layer_b, field_b, box_b, gain_b)
+    seen, looks = zip(
+        *(layer_look(*side, border, lonlat, colours, cells, shoulder) for side in sides), strict=True
+    )
+    usable = (seen[0][..., 3] > 0) & (seen[1][..., 3] > 0)
+    gains = [gains_at(gain, border, colours, cells) for gain in (gain_a, gain_b)]
+    for first, clipped in enumerate((clipped_a, clipped_b)):
+        brighter = gains[first] - gains[1 - first]
+        ratio = exposure_shift(np.full_like(brighter, 0.5), brighter, shoulder) / 0.5
+        limit = np.float32(clipped)[:3]
+        other = seen[1 - first][..., :3] < np.minimum(ratio, 1) * limit - darker
+        usable &= ((seen[first][..., :3] <= limit) | other).all(-1)
     result, square, texture = (np.zeros((cells[1], cells[0], *n)) for n in ((4,), (), (8,)))
     for place, part in cell_parts(border, cells, 2):
         values = (looks[0] - looks[1])[part][usable[part]]
