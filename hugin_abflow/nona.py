@@ -191,7 +191,7 @@ def _make_all(plan: Plan, folder: Path, keep: bool, progress: Progress) -> Found
     """Have nona make every layer."""
     prefix = str(plan.folder / plan.layer_prefix(plan.stem))
     if keep:
-        _refuse_to_keep(plan, plan.images, prefix)
+        refuse_to_keep(plan, plan.images, prefix)
     for image in plan.images:
         _require_photo(plan, image)
     with progress("remap", len(_STEPS) * len(plan.images)) as advance:
@@ -228,7 +228,7 @@ def _make_missing(
 ) -> dict[int, Path]:
     """Have nona make the layers that are not there; images that miss the crop have none."""
     if keep:
-        _refuse_to_keep(plan, missing, prefix)
+        refuse_to_keep(plan, missing, prefix)
     project = _project_for_nona(plan, folder)
     with progress("remap", len(_STEPS) * len(missing)) as advance:
         for image in missing:
@@ -393,7 +393,7 @@ def _failure(
     return NonaFailedError(f"nona {ending(code)} on {plan.file}; {advice}. Its last lines:\n  {said}")
 
 
-def _refuse_to_keep(plan: Plan, images: Sequence[PlannedImage], prefix: str) -> None:
+def refuse_to_keep(plan: Plan, images: Sequence[PlannedImage], prefix: str) -> None:
     """Raise `OutputError` if layers of `images` could not be read by these names, or would take the place of
     something else: before nona makes them, which may take minutes.
     """

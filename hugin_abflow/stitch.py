@@ -12,7 +12,7 @@ from pathlib import Path
 
 from hugin_abflow.errors import LayersMismatchError, ProgramMissingError
 from hugin_abflow.exif import embed
-from hugin_abflow.found import Remap, layers_there
+from hugin_abflow.found import Remap, layer_name, layers_there
 from hugin_abflow.images import COMPRESSIONS, DEFAULTS, ENDINGS, JPEG_QUALITY, read_layer
 from hugin_abflow.layer import Layer, check_layers
 from hugin_abflow.merge import (
@@ -25,7 +25,7 @@ from hugin_abflow.merge import (
     write_panorama,
 )
 from hugin_abflow.metadata import describe
-from hugin_abflow.nona import open_layers, planned_layers, remapping
+from hugin_abflow.nona import open_layers, planned_layers, refuse_to_keep, remapping
 from hugin_abflow.outputs import (
     BLEND,
     WORDS,
@@ -44,6 +44,9 @@ from hugin_abflow.progress import Progress, silent
 from hugin_abflow.project import Output, Plan, read_plan
 from hugin_abflow.scratch import work_folder
 from hugin_abflow.settings import Settings
+
+# In commands of a script: what stands before files in its temporary folder. No argument can hold it.
+_TEMPORARY = "\0"
 
 
 def stitch_project(
@@ -120,45 +123,78 @@ def show_project(
     """What `stitch_project` would do, as lines of a shell script: a comment on the plan, then the commands.
 
     options     of our own command line that say how to blend; the other arguments are `stitch_project`'s.
-                Of settings, keep_layers and metadata the commands know by these options alone.
+                Of settings and metadata the commands know by these options alone.
 
-    Photos that miss the crop, which nona tells later, are taken for part of the panorama; where the other
-    layers are there, nona fails on such a one, and nothing is missed. Raises as `stitch_project` does for
-    what the project can get wrong.
+    As the run does, the script makes what is no output in a temporary folder, so that nothing is replaced but
+    outputs. It ends at the first error. Photos that miss the crop, which nona tells later, are taken for part
+    of the panorama; where nona makes some layers of several, to be kept or stacked, such a one is an error.
+    Raises as `stitch_project` does for what the project can get wrong, and what must not be replaced.
     """
     plan = read_plan(path)
-    canvas, name = plan.canvas, no_option(plan.file.name)
-    head = [
-        f"# {plan.file.name}: {len(plan.images)} photos, {plan.projection}, "
-        f"{canvas.crop.width} x {canvas.crop.height} of {canvas.width} x {canvas.height}",
-        shlex.join(["cd", str(plan.folder)]),
-    ]
+    name = no_option(plan.file.name)
     stored = _storing(compression if output else storable(plan, compression), jpeg_quality)
     if output or prefix or layers:
         if output:
             target = str(Path(output).absolute())
         else:
             target = no_option(default_target(plan, layers_there(plan, prefix, layers, remap)).name)
-        named = ["--layers", *(str(Path(layer).absolute()) for layer in layers)] if layers else []
-        named = ["--prefix", _from_anywhere(plan, prefix)] if prefix else named
-        remapped, found = ([], "") if named else _remapping(plan, remap)
-        named = named or ["--prefix", found]
-        return [*head, *remapped, shlex.join([BLEND, *options, *stored, "-o", target, name, *named])]
-    lines: list[str] = []
+        merging = [BLEND, *options, *stored, "-o", target, name]
+        if prefix:
+            return _script(plan, [[*merging, "--prefix", _from_anywhere(plan, prefix)]])
+        if layers:
+            return _script(plan, [[*merging, "--layers", *(str(Path(one).absolute()) for one in layers)]])
+        return _script(plan, _merging(merging, *_remapping(plan, remap, keep_layers)[:2]))
+    commands: list[Sequence[str]] = []
     for branch in _branches(plan):
-        lines += [f"# {WORDS[kind]}" for kind in Kind if kind in branch.kinds]
-        remapped, found = _remapping(branch.plan, _remap(branch.plan, remap))
-        lines += remapped
+        commands += [["#", WORDS[kind]] for kind in Kind if kind in branch.kinds]
+        keep = keep_layers or branch.keeps_layers
+        remapped, found, files = _remapping(branch.plan, _remap(branch.plan, remap), keep)
         if Kind.PANORAMA in branch.kinds:
             target = no_option(default_target(plan).name)
-            lines.append(shlex.join([BLEND, *options, *stored, "-o", target, name, "--prefix", found]))
+            remapped = _merging([BLEND, *options, *stored, "-o", target, name], remapped, found)
+        commands += remapped
         asked = _stored(branch.plan, compression, jpeg_quality)
         differs = _differing(asked.output, plan.output)
-        steps = replace(branch, plan=asked).steps([image.index for image in plan.images])
-        lines += [
-            shlex.join(step.command(name, [*options, *(differs if step.final else [])])) for step in steps
-        ]
+        names = {branch.layer(index): file for index, file in files.items()}
+        for step in replace(branch, plan=asked).steps([image.index for image in plan.images]):
+            if step.wanted:
+                refuse_input(plan.folder / step.result, [plan.file, *plan.photos])
+            names[step.result] = step.result if step.wanted else _TEMPORARY + step.result
+            inputs = tuple(names.get(file, file) for file in step.inputs)
+            placed = replace(step, result=names[step.result], inputs=inputs)
+            commands.append(placed.command(name, [*options, *(differs if step.final else [])]))
+    return _script(plan, commands)
+
+
+def _script(plan: Plan, commands: Sequence[Sequence[str]]) -> list[str]:
+    """Commands as lines of a shell script, which ends at the first error; one "#" is a comment."""
+    crop, canvas = plan.canvas.crop, plan.canvas
+    head = [
+        f"# {plan.file.name}: {len(plan.images)} photos, {plan.projection}, "
+        f"{crop.width} x {crop.height} of {canvas.width} x {canvas.height}",
+        "set -e",
+        shlex.join(["cd", str(plan.folder)]),
+    ]
+    lines = ["# " + words[1] if words[0] == "#" else " ".join(map(_quoted, words)) for words in commands]
+    if any(word.startswith(_TEMPORARY) for words in commands for word in words):
+        remove = 'rm -rf "$layers"'
+        # another project's script may follow, with a folder of its own
+        return [*head, "layers=$(mktemp -d)", f"trap '{remove}' EXIT INT TERM", *lines, remove]
     return [*head, *lines]
+
+
+def _quoted(word: str) -> str:
+    """A word as a shell reads it."""
+    if word.startswith(_TEMPORARY):
+        return '"$layers"/' + shlex.quote(word.removeprefix(_TEMPORARY))
+    return shlex.quote(word)
+
+
+def _merging(command: list[str], remapped: list[list[str]], found: str) -> list[list[str]]:
+    """Commands for a panorama, which `command` makes of layers that `_remapping` tells of."""
+    if found:
+        return [*remapped, [*command, "--prefix", found]]
+    return [[*command, "--remap", "auto"]]  # which has nona make what is missing
 
 
 def _storing(compression: str | None, jpeg_quality: int | None) -> list[str]:
@@ -202,16 +238,23 @@ def _remap(plan: Plan, remap: Remap) -> Remap:
     return "always" if plan.hdr and remap == "auto" else remap
 
 
-def _remapping(plan: Plan, remap: Remap) -> tuple[list[str], str]:
-    """nona's commands, if layers have to be made, and what comes before the numbers of all layers."""
+def _remapping(plan: Plan, remap: Remap, keep: bool) -> tuple[list[list[str]], str, dict[int, str]]:
+    """nona's commands, if layers have to be made; what comes before the numbers of all layers, "" where these
+    lie in two folders; and the layers' files by image.
+
+    Raises `OutputError` for layers that cannot be kept.
+    """
     found, missing = planned_layers(plan, remap)
-    name = no_option(plan.file.name)
-    if found is None:
-        prefix = no_option(plan.layer_prefix(plan.stem))
-        return [shlex.join(remapping(plan, [], prefix, name))], prefix
-    prefix = no_option(Path(found.prefix).name)
-    each = [remapping(plan, ["-i", str(image.index)], prefix, name) for image in missing]
-    return [shlex.join(command) for command in each], prefix
+    prefix = found.prefix if found else str(plan.folder / plan.layer_prefix(plan.stem))
+    if keep and missing:
+        refuse_to_keep(plan, missing, prefix)
+    here = Path(prefix).name
+    there = no_option(here) if keep or not missing else _TEMPORARY + here
+    which = [["-i", str(image.index)] for image in missing] if found else [[]]
+    commands = [remapping(plan, options, there, no_option(plan.file.name)) for options in which]
+    files = {index: file.name for index, file in found.files.items()} if found else {}
+    files |= {image.index: layer_name(there, image.index, plan.layer_ending) for image in missing}
+    return commands, "" if found and missing and not keep else there, files
 
 
 def _stored(plan: Plan, compression: str | None, jpeg_quality: int | None) -> Plan:

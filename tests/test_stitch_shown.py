@@ -1,19 +1,21 @@
-"""Commands that are shown store what they make as the run does, whatever it is called."""
+"""Commands that are shown store what they make as the run does, by any name, and replace no more."""
 
 from __future__ import annotations
 
 import shlex
+import subprocess
 from pathlib import Path
 
 import pytest
 import tifffile
-from conftest import ProjectMaker
+from conftest import ProjectMaker, remap
 from pictures import one_device
 from test_hugin import CANVAS, stacked
 from test_stitch import asked, programs, run_shown
 
 from hugin_abflow.errors import OutputError
 from hugin_abflow.outputs import Kind
+from hugin_abflow.project import read_plan
 from hugin_abflow.settings import Settings
 from hugin_abflow.stitch import show_project, stitch_project
 
@@ -89,6 +91,73 @@ def test_a_compression_for_other_types_leaves_jpeg_and_png_as_they_are(
     with pytest.raises(OutputError, match=rf"pano\.{kind}: compression 'lzw'; choose one of {own}"):
         stitch_project(project, settings, output=made, compression="lzw")
     assert stitch_project(project, settings, output=made, compression=own.upper()) == [made]
+
+
+# What must not be replaced
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    return {path.name: path.read_bytes() for path in folder.iterdir()}
+
+
+def test_layers_of_a_script_replace_nothing(
+    make_project: ProjectMaker, tmp_path: Path, temporary: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """They would have the photos' names; a stack, which is made on the way, that of a picture."""
+    project = make_project(panorama=CANVAS, yaws=(0, 60), photo="pano{:04d}.tif")
+    project.write_text(project.read_text() + asked(Kind.PANORAMA, Kind.FUSED_STACKS))
+    project.with_name("pano_stack_ldr_0000.tif").write_bytes(b"a picture of mine")
+    before = contents(project.parent)
+    run_shown("\n".join(show_project(project, options=["--no-flow"])), tmp_path, monkeypatch)
+    made = {"pano.tif", "pano_fused.tif"}
+    assert {name: data for name, data in contents(project.parent).items() if name not in made} == before
+
+
+@pytest.mark.parametrize("kinds", [(Kind.PANORAMA,), (Kind.LAYERS,)])
+def test_layers_that_cannot_be_kept_are_refused(make_project: ProjectMaker, kinds: tuple[Kind, ...]) -> None:
+    """As the run refuses them: a script would have nona replace them."""
+    project = make_project(panorama=CANVAS, photo="pano{:04d}.tif", extra=asked(*kinds))
+    with pytest.raises(OutputError, match=r"pano0000\.tif is a photo"):
+        show_project(project, keep_layers=Kind.PANORAMA in kinds)
+
+
+def test_stacks_that_would_replace_photos_are_refused(make_project: ProjectMaker) -> None:
+    """As by the run: enfuse would replace them."""
+    project = make_project(panorama=CANVAS, photo="pano_stack_ldr_{:04d}.tif", extra=asked(Kind.STACKS))
+    with pytest.raises(OutputError, match=r"pano_stack_ldr_0000\.tif is an input"):
+        show_project(project)
+
+
+def test_missing_layers_are_made_beside_those_that_are_there(
+    make_project: ProjectMaker, tmp_path: Path, temporary: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of exposures, which programs take that have no --remap."""
+    project = make_project(panorama=CANVAS, yaws=(0, 60), extra=asked(Kind.FUSED_STACKS))
+    stitch_project(project, keep_layers=True)
+    for name in ("pano_fused.tif", "pano_exposure_layers_0001.tif"):
+        project.with_name(name).unlink()
+    before = contents(project.parent)
+    run_shown("\n".join(show_project(project)), tmp_path, monkeypatch)
+    after = contents(project.parent)
+    assert after.pop("pano_fused.tif") and after == before
+
+
+@pytest.mark.parametrize("fails", ["cd", "nona"])
+def test_a_script_ends_at_the_first_error(
+    make_project: ProjectMaker, tmp_path: Path, temporary: Path, monkeypatch: pytest.MonkeyPatch, fails: str
+) -> None:
+    """Even if layers are there from before, or the current folder has a project of the same name."""
+    project = make_project(panorama=CANVAS, yaws=(0, 60))
+    remap(read_plan(project), "pano")
+    script = "\n".join(show_project(project, remap="always"))
+    here = project.parent
+    if fails == "cd":
+        here = project.parent.rename(tmp_path / "elsewhere")
+    else:
+        project.with_name("photo 0.tif").unlink()
+    with pytest.raises(subprocess.CalledProcessError):
+        run_shown(script, here, monkeypatch)
+    assert not (here / "pano.tif").exists()
 
 
 def compression_of(path: Path) -> str:
