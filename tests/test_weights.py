@@ -146,6 +146,20 @@ def test_masks_that_cannot_be(layers: list[str], capsys: pytest.CaptureFixture[s
     assert "%q in %q.tif means nothing" in refused(capsys, "--save-masks=%q.tif", *layers)
 
 
+def test_masks_replace_no_photos_of_the_project(
+    layers: list[str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Whether or not their EXIF tells an exposure time, and whether they are active."""
+    for number in (1, 2):
+        tifffile.imwrite(f"photo{number}.tif", np.full((90, 90, 3), 99, np.uint8))
+    photo = 'i w90 h90 f0 v40 r0 p0 y0 n"photo{}.tif"'
+    lines = ['p f0 w200 h100 v60 n"TIFF_m"', "m i0", photo.format(1), "#-hugin disabled", photo.format(2)]
+    Path("a.pto").write_text("\n".join([*lines, ""]))
+    for first in ("photo%n", "./photo%n", "photo2"):
+        said = refused(capsys, "--parameter=abflow-project=a.pto", f"--save-masks={first}.tif", layers[0])
+        assert "is an input" in said
+
+
 def test_masks_that_cannot_be_written_are_told_before_the_work(
     layers: list[str], capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:

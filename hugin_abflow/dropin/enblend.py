@@ -86,7 +86,8 @@ def blend(request: Request, progress: Progress) -> None:
         _log.warning("options of enblend that change nothing here: %s", ", ".join(request.ignored))
     layers = _read(request)
     plan = read_plan(request.project) if request.project else None
-    refuse_input(request.output, [*request.inputs, *([plan.file, *plan.photos] if plan else [])])
+    inputs = [*request.inputs, *([plan.file, *plan.photos] if plan else [])]
+    refuse_input(request.output, inputs)
     refuse_photo(request.output)
     settings = Settings(threads=_threads(os.environ.get("OMP_NUM_THREADS", "")))
     guides: Callable[[], Sequence[Guide]] = tuple
@@ -103,7 +104,7 @@ def blend(request: Request, progress: Progress) -> None:
         _log.warning("only one layer: there is nothing to blend, the output is the layer")
     write_panorama(
         request.output, layers, canvas, settings, projection=projection, guides=guides,
-        method=MaskedMerge(request.save_masks, request.load_masks, request.output),
+        method=MaskedMerge(request.save_masks, request.load_masks, request.output, inputs),
         depth=request.depth, jpeg_quality=request.jpeg_quality,
         # what the others call compression is not what enblend's option means
         compression=request.compression if request.output.suffix.lower() in (".tif", ".tiff") else None,

@@ -35,6 +35,7 @@ class MaskedMerge:
 
     save, load      templates of the masks' names, see `name`; None: not.
     output          the panorama's file, which templates may refer to.
+    inputs          files that are needed: no mask takes their place.
 
     A mask covers the output's pixels. White: the layer counts wherever another could stand in for it.
     """
@@ -42,6 +43,7 @@ class MaskedMerge:
     save: str | None
     load: str | None
     output: Path
+    inputs: Sequence[Path] = ()
 
     def __call__(
         self,
@@ -93,7 +95,7 @@ class MaskedMerge:
         if len(set(targets)) < len(targets):
             raise CommandLineError(f"--save-masks={self.save} names one mask twice; %n gives each a number")
         for target in targets:
-            refuse_input(target, [self.output, *(layer.file for layer in layers if layer.file)])
+            refuse_input(target, [self.output, *self.inputs])
             refuse_photo(target)
             check_target(target, None)  # now, not when all else is done
         return targets
