@@ -215,7 +215,7 @@ _information = partial(click.option, cls=Option, group="Information")
     help="Skip panoramas that still hold: same project, photos, settings and version as when they were made. "
     "This is what happens where several projects or a folder are named.",
 )
-@_batch("--force", is_flag=True, help="Make all panoramas anew, those that still hold, too.")
+@_batch("--force", is_flag=True, help="Make all panoramas anew, also those that hold or that you changed.")
 @_batch(
     "--jobs",
     metavar="N",

@@ -118,7 +118,7 @@ def test_project_of_a_dead_worker_is_stitched_by_another(
     again = subprocess.run(
         [*command[:-3], "--scheduler", address], capture_output=True, text=True, timeout=120
     )
-    assert again.returncode == 0 and again.stderr.count("still holds") == 5
+    assert again.returncode == 0 and again.stderr.count("left as it is") == 5
 
 
 @posix

@@ -7,6 +7,7 @@ import os
 import re
 import shutil
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -69,7 +70,7 @@ def test_dry_run_leaves_out_what_holds(make: Make, shoot: Path, capsys: pytest.C
     """By the options of the run; with --force, and of one project without --resume, it is made."""
     options = {**cli_options(), "settings": Settings()}
     make(**options)
-    holds = "# tiny.pto: tiny.tif: made before, still holds (--force: anew)\n"
+    holds = "# tiny.pto: tiny.tif: made before, left as it is (--force: anew)\n"
     for arguments, shown in (
         ([str(shoot)], True),
         (["--resume", str(shoot / "tiny.pto")], True),
@@ -245,10 +246,96 @@ def test_output_that_lacked_its_program_is_made_once_that_is_there(
 
 def test_panorama_that_was_retouched_is_left_as_it_is(make: Make, shoot: Path) -> None:
     make()
-    tifffile.imwrite(shoot / "tiny.tif", PHOTO)
+    retouch(shoot / "tiny.tif")
     record = make()
-    assert record.result == "skipped" and "--force" in record.warnings[0]
+    assert record.result == "skipped"
+    (warning,) = record.warnings
+    assert "tiny.tif was changed since it was made; it is left as it is (--force" in warning
     assert (tifffile.imread(shoot / "tiny.tif") == PHOTO).all()
+
+
+def retouch(file: Path) -> None:
+    tifffile.imwrite(file, PHOTO)
+
+
+@pytest.mark.parametrize("options", [{}, {"settings": Settings(seam=False)}, {"jpeg_quality": 80}], ids=str)
+@pytest.mark.parametrize("name", ["tiny.pto", "right.png"])
+def test_it_is_left_whatever_else_changed(
+    make: Make, shoot: Path, name: str, options: dict[str, Any]
+) -> None:
+    """A comment in the project is enough for another panorama; somebody's work is not lost for that."""
+    make()
+    retouch(shoot / "tiny.tif")
+    with (shoot / name).open("a") as file:
+        file.write("# a comment\n")
+    for _ in range(2):
+        record = make(**options)
+        assert record.result == "skipped" and record.files == [shoot / "tiny.tif"]
+        (warning,) = record.warnings
+        assert "tiny.tif was changed since it was made, and so were project, photos" in warning
+        assert "--force makes it anew" in warning
+    assert (tifffile.imread(shoot / "tiny.tif") == PHOTO).all()
+    assert make(resume=False, **options).result == "made"
+    assert make(**options).warnings == []
+
+
+def test_it_is_left_where_another_output_is_gone_or_was_left_out(
+    make: Make, shoot: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    merge = task.stitch_project
+
+    def both(path: Path, finished: Callable[[Path], None], **keywords: Any) -> None:
+        merge(path, finished, **keywords)
+        finished(Path(shutil.copy(shoot / "tiny.tif", shoot / "tiny_fused.tif")))
+
+    monkeypatch.setattr(task, "stitch_project", both)
+    assert make().files == [shoot / "tiny.tif", shoot / "tiny_fused.tif"]
+    retouch(shoot / "tiny.tif")
+    (shoot / "tiny_fused.tif").unlink()
+    record = make()
+    assert record.files == [shoot / "tiny.tif"] and "another output" in record.warnings[0]
+    assert (tifffile.imread(shoot / "tiny.tif") == PHOTO).all()
+
+
+def test_painted_layers_are_blended_anew(make: Make, shoot: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """They are outputs where remapped images are asked for, but inputs, too, and never replaced."""
+    merge = task.stitch_project
+
+    def both(path: Path, finished: Callable[[Path], None], **keywords: Any) -> None:
+        finished(shoot / "tiny0000.tif")
+        merge(path, finished, **keywords)
+
+    monkeypatch.setattr(task, "stitch_project", both)
+    make()
+    retouch(shoot / "tiny0000.tif")
+    assert make().result == "made"
+
+
+@pytest.mark.parametrize("how", ["killed", "failed", "not to be remembered"])
+def test_panorama_that_is_made_anew_was_not_retouched(
+    make: Make, shoot: Path, monkeypatch: pytest.MonkeyPatch, how: str
+) -> None:
+    """By a run that could not, or need not, say of what it is made."""
+    make()
+    with (shoot / "tiny.pto").open("a") as file:
+        file.write("# a comment\n")
+    merge = task.stitch_project
+
+    def part(path: Path, finished: Callable[[Path], None], **keywords: Any) -> None:
+        merge(path, finished, **keywords)
+        if how != "not to be remembered":
+            raise KeyboardInterrupt if how == "killed" else RuntimeError("a bug")
+
+    monkeypatch.setattr(task, "stitch_project", part)
+    options = {"settings": Settings(), "output": None, "remap": "auto"}
+    with suppress(KeyboardInterrupt):
+        perform(Task(shoot / "tiny.pto", options, remember=how == "killed"), Deaf())
+    monkeypatch.setattr(task, "stitch_project", merge)
+    written = (shoot / "tiny.tif").read_bytes()
+    retouch(shoot / "tiny.tif")
+    assert make().result == "skipped"
+    (shoot / "tiny.tif").write_bytes(written)
+    assert make().result == "made"
 
 
 @pytest.mark.parametrize(

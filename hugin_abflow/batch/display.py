@@ -34,7 +34,7 @@ def outcome(record: Record) -> str:
         return "failed"
     names = ", ".join(file.name for file in record.files)
     if record.result == "skipped":
-        return f"{names} still holds"
+        return f"{names} left as it is"
     return f"made {names} ({duration(record.seconds)}, {size(record.bytes)})"
 
 

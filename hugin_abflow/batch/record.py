@@ -19,7 +19,7 @@ class Record:
     """What became of one project; plain values, as they stand in a report (docs/report.md).
 
     project     its file, absolute.
-    result      "made", "skipped" (what was made before still holds) or "failed".
+    result      "made", "skipped" (what was made before still holds, or was changed since) or "failed".
     outputs     the files that were made, with "file" and "bytes"; of a failed one those before the failure.
     inputs      the project, its photos, and layers that were there before, as `outputs`.
     message     what went wrong and what to do; empty if nothing.

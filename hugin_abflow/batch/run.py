@@ -154,7 +154,7 @@ def show(tasks: Iterable[Task], words: Mapping[Path, Sequence[str]]) -> ExitCode
             try:
                 if left := left_alone(one):
                     names = ", ".join(file.name for file in left)
-                    print_result(f"# {one.project.name}: {names}: made before, still holds (--force: anew)")
+                    print_result(f"# {one.project.name}: {names}: made before, left as it is (--force: anew)")
                 else:
                     options = words[one.project]
                     print_result("\n".join(show_project(one.project, **one.options, options=options)))

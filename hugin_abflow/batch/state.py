@@ -14,7 +14,7 @@ import os
 from collections.abc import Iterable, Mapping
 from contextlib import suppress
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from hugin_abflow.batch.record import Record, write_json
 from hugin_abflow.errors import AbflowError
@@ -54,6 +54,7 @@ class State:
         self.file = self._folder / FOLDER / f"{name}.json"
         self._known = self._load()
         self._inputs: list[Entry] = []
+        self._noted: list[Entry] = []
 
     def inputs(self) -> list[Path]:
         """The project, its photos and the layers that would be used, as far as they are there now."""
@@ -70,25 +71,52 @@ class State:
 
     def restore(self, record: Record) -> bool:
         """Make `record` that of what was made before, if project, inputs, settings and version are still the
-        same and the panorama is there; else do nothing. `begin` comes first.
+        same and the panorama is there. So too, with a warning, if somebody changed it since, whatever else
+        changed: nobody's work is lost unasked. Else do nothing. `begin` comes first.
         """
         known = self._known
         try:
-            same = known["schema"] == SCHEMA and known["hash"] == self._hash()
-            if not same or not known["outputs"] or not all(map(self._is_whole, known["outputs"])):
+            if known["schema"] != SCHEMA:
                 return False
+            found = [(entry, self._look(entry)) for entry in known["outputs"]]
+            there = [entry for entry, how in found if how != "gone"]
+            holds = bool(found) and len(there) == len(found) and known["hash"] == self._hash()
             if set(known.get("left_out", [])) - set(self._left_out()):
-                return False  # its program has been installed
-            outputs, device, overlaps = self._plain(known["outputs"]), known["device"], known["overlaps"]
+                holds = False  # its program has been installed
+            # layers are inputs as well; such as somebody changed are used, and replaced by none
+            inputs = set() if holds else {entry["file"] for entry in self._inputs}
+            changed = [
+                entry["file"] for entry, how in found if how == "changed" and entry["file"] not in inputs
+            ]
+            if not (holds or changed):
+                return False
+            outputs, device, overlaps = self._plain(there), known["device"], known["overlaps"]
             if not (isinstance(device, str) and isinstance(overlaps, list)):
                 return False
         except (KeyError, TypeError, ValueError, OverflowError):  # damaged, or written by somebody else
             return False
         record.outputs, record.device, record.overlaps = outputs, device, overlaps
+        also = "" if holds else ", and so were project, photos, layers, settings or another output"
+        for name in changed:
+            _log.warning(
+                "%s was changed since it was made%s; it is left as it is (--force makes it anew)",
+                self._folder / name, also,
+            )  # fmt: skip
         if self._left_out():
             possible_outputs(self._plan)  # warns of them
         record.result = "skipped"
         return True
+
+    def note(self, file: Path) -> None:
+        """Remember that an output was made just now, though not yet of what: where the run is killed, or is
+        not to be remembered, it is not taken for one that somebody changed.
+        """
+        with suppress(OSError, KeyError, TypeError):  # it cannot be written, or somebody else wrote it
+            if self._known:
+                self._noted += self._entries([file], [])
+                ours = {entry["file"] for entry in self._noted}
+                others = [entry for entry in self._known["outputs"] if entry["file"] not in ours]
+                write_json(self.file, self._known | {"hash": "", "outputs": others + self._noted})
 
     def save(self, record: Record) -> None:
         """Remember what was made. A folder that takes no memory is worth a warning."""
@@ -107,7 +135,7 @@ class State:
                 "device": record.device,
                 "settings": self._settings,
                 "inputs": self._inputs,
-                "outputs": self._entries(record.files, []),
+                "outputs": self._entries(record.files, self._noted),
                 "left_out": self._left_out(),
                 "overlaps": record.overlaps,
             }
@@ -166,19 +194,14 @@ class State:
             for entry in entries
         ]
 
-    def _is_whole(self, entry: Entry) -> bool:
-        """Whether an output is there, as it was made or as somebody made it since, but whole."""
+    def _look(self, entry: Entry) -> Literal["made", "changed", "gone"]:
+        """Whether an output is there as it was made, or as somebody changed it; a damaged one is gone."""
         file = self._folder / entry["file"]
         if not file.is_file():
-            return False
+            return "gone"
         if self._entries([file], [entry])[0]["blake2b"] == entry["blake2b"]:
-            return True
-        if _decodes(file):
-            _log.warning(
-                "%s was changed since it was made; it is left as it is (--force makes it anew)", file
-            )
-            return True
-        return False
+            return "made"
+        return "changed" if _decodes(file) else "gone"
 
 
 def _digest(file: Path) -> str:

@@ -96,7 +96,7 @@ def perform(task: Task, listener: Listener, level: int = logging.WARNING, turn: 
         try:
             state = _state(task, record)
             if not (state and task.resume and state.restore(record)):
-                _stitch(task, record, listener, turn)
+                _stitch(task, record, listener, turn, state)
                 if state and task.remember:
                     state.save(record)
         except Exception as error:
@@ -113,7 +113,7 @@ def perform(task: Task, listener: Listener, level: int = logging.WARNING, turn: 
 
 
 def left_alone(task: Task) -> list[Path]:
-    """The outputs that `perform` leaves as they are, since they still hold; none: it makes them."""
+    """The outputs that `perform` leaves as they are; none: it makes them."""
     record = Record(task.project.absolute())
     state = _state(task, record) if task.resume else None
     return record.files if state and state.restore(record) else []
@@ -132,7 +132,7 @@ def _state(task: Task, record: Record) -> State | None:
     return None
 
 
-def _stitch(task: Task, record: Record, listener: Listener, turn: Turn | None) -> None:
+def _stitch(task: Task, record: Record, listener: Listener, turn: Turn | None, state: State | None) -> None:
     """Fill in the record while the panorama is made."""
     record.versions = _versions()
     shared = False  # a processor serves several at a time; a graphics card's memory may not hold two
@@ -157,10 +157,16 @@ def _stitch(task: Task, record: Record, listener: Listener, turn: Turn | None) -
             turn.give_back()  # what is left is to encode
 
     made: list[Path] = []
+
+    def finished(file: Path) -> None:
+        made.append(file)
+        if state:
+            state.note(file)
+
     try:
         stitch_project(
             task.project, **task.options,
-            progress=trace.phases(progress), open_device=open_device, finished=made.append,
+            progress=trace.phases(progress), open_device=open_device, finished=finished,
         )  # fmt: skip
         record.result = "made"
     finally:
