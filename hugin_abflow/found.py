@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import logging
 import os
 import re
@@ -22,6 +23,7 @@ _log = logging.getLogger(__name__)
 
 Remap = Literal["auto", "always", "never"]
 
+_ENDINGS = (".tif", ".tiff", ".exr")  # of layers
 _STALE_SECONDS = 2.0  # file times closer than this say nothing (FAT counts in steps of 2 s)
 
 
@@ -93,7 +95,7 @@ def layer_path(prefix: str, index: int, ending: str) -> Path:
 
 def _find_under(plan: Plan, prefix: str) -> Found | None:
     """Layers that begin with `prefix`, if any."""
-    endings = (".exr", ".tif", ".tiff") if plan.hdr else (".tif", ".tiff", ".exr")
+    endings = (".exr", ".tif", ".tiff") if plan.hdr else _ENDINGS
     photos = {file_key(photo) for photo in plan.photos}  # may be named alike: img0000.tif of img.pto
     for ending in endings:
         paths = {image.index: layer_path(prefix, image.index, ending) for image in plan.images}
@@ -162,11 +164,22 @@ def layers_by_prefix(plan: Plan, prefix: str | Path) -> Found:
                     "no layer of image %d (%s) under %s: it is left out", image.index, image.name, prefix
                 )
             return found
+    _refuse_photos(plan, prefix)
     first = layer_name(prefix, plan.images[0].index, ".tif")
     raise LayersMissingError(
         f"no layer {first} (nor .exr, nor of another active image) here or in {plan.folder}; "
         f"{_better_prefix(plan, prefix)}"
     )
+
+
+def _refuse_photos(plan: Plan, prefix: str) -> None:
+    """Raise `LayersMissingError` where files of such names are there after all: then they are photos."""
+    names = itertools.product(_places(plan, prefix), (image.index for image in plan.images), _ENDINGS)
+    if photo := next(filter(is_file, itertools.starmap(layer_path, names)), None):
+        raise LayersMissingError(
+            f"{photo} is a photo of the project, and no layer; check --prefix, or leave it out to have nona "
+            "make the layers"
+        )
 
 
 def _places(plan: Plan, name: str) -> tuple[str, str]:

@@ -12,8 +12,8 @@ import tifffile
 from conftest import age, photo_pixels, remap, to_make
 from layer_files import write_layer
 
-from hugin_abflow.errors import LayersMismatchError, OutputError
-from hugin_abflow.found import candidates
+from hugin_abflow.errors import LayersMismatchError, LayersMissingError, OutputError
+from hugin_abflow.found import candidates, layers_by_prefix
 from hugin_abflow.merge import refuse_input
 from hugin_abflow.nona import open_layers
 from hugin_abflow.project import Plan, file_key, read_plan
@@ -43,6 +43,19 @@ def test_photos_are_no_layers_whatever_leads_to_them(developed, tmp_path, way):
     plan = read_plan(tmp_path / "linked" / "pano.pto" if way == "absolute" else developed)
     assert candidates(plan) == []
     assert to_make(plan) == (None, [0, 1, 2])
+
+
+@pytest.mark.parametrize("prefix", ["pano", "project/pano"])
+def test_a_prefix_that_photos_have_is_told(developed, tmp_path, monkeypatch, prefix):
+    """Their files are there: it is no help to say that there are none of such names."""
+    monkeypatch.chdir(tmp_path)
+    said = r"pano0000\.tif is a photo of the project, and no layer; .* leave it out"
+    with pytest.raises(LayersMissingError, match=said), open_layers(read_plan(developed), prefix=prefix):
+        pass
+    for index in range(3):
+        (developed.parent / f"pano{index:04d}.tif").unlink()
+    with pytest.raises(LayersMissingError, match=r"no layer .*pano0000\.tif"):
+        layers_by_prefix(read_plan(developed), prefix)
 
 
 def test_a_photo_of_pages_is_no_file_of_layers(developed):
