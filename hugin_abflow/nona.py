@@ -45,7 +45,7 @@ from hugin_abflow.layer import Layer, check_layers, other_canvas
 from hugin_abflow.programs import LAST_LINES, ending, last_lines, move_whole, started
 from hugin_abflow.progress import Progress, silent
 from hugin_abflow.project import Plan, PlannedImage, file_key
-from hugin_abflow.scratch import is_file, work_folder
+from hugin_abflow.scratch import is_file, is_special, work_folder
 from hugin_abflow.tifftags import is_edited
 
 log = logging.getLogger("hugin_abflow.nona")
@@ -415,6 +415,10 @@ def refuse_to_keep(plan: Plan, images: Sequence[PlannedImage], prefix: str) -> N
                 "the project"
             )
     for final in finals:
+        if is_special(final):  # who opens a pipe waits until somebody writes
+            raise OutputError(
+                f"{final} is a pipe or a device, the layer cannot be kept by that name; move it"
+            )
         if is_edited(final):
             raise OutputError(
                 f"{final} was changed by another program than nona, and no layer takes its place; move it, "

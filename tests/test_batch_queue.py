@@ -47,6 +47,17 @@ def test_projects_are_found_once_and_in_order(
     assert found(*places, recursive=recursive) == projects
 
 
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="needs named pipes")
+def test_pipes_are_no_projects_of_a_folder(shoot: Path) -> None:
+    """To open one waits for ever; one that is named is meant. What is not there fails by itself."""
+    os.mkfifo(shoot / "day 1" / "pipe.pto")
+    (shoot / "day 1" / "link.pto").symlink_to("pipe.pto")
+    (shoot / "day 1" / "nowhere.pto").symlink_to("gone.pto")
+    projects = ["day 1/c.pto", "day 1/nowhere.pto"]
+    assert found("day 1") == found("day 1/*.pto") == projects
+    assert found("day 1/pipe.pto") == ["day 1/pipe.pto"]
+
+
 @pytest.mark.skipif(os.name == "nt", reason="links need rights there")
 def test_links_lead_nowhere_twice(shoot: Path) -> None:
     """Two that lead back make endless ways to each project."""

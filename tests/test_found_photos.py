@@ -150,6 +150,19 @@ def test_a_picture_is_not_replaced_by_a_layer_that_is_kept(make_project, nona):
     assert {path.name: path.read_bytes() for path in plan.folder.iterdir()} == before
 
 
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="needs named pipes")
+def test_a_pipe_is_not_replaced_by_a_layer_that_is_kept(make_project, nona, monkeypatch):
+    """Nor is it opened, which waits for ever."""
+    plan = read_plan(make_project())
+    os.mkfifo(plan.folder / "pano0001.tif")
+    monkeypatch.setattr("hugin_abflow.nona.is_edited", lambda file: file.name == "pano0001.tif")
+    with (
+        pytest.raises(OutputError, match=r"pano0001\.tif is a pipe or a device"),
+        open_layers(plan, keep_layers=True),
+    ):
+        pass
+
+
 # ------------------------------------------------------------------------------------ edited layers
 
 

@@ -12,7 +12,7 @@ from pathlib import Path
 from hugin_abflow.errors import ProjectError, SameOutputError
 from hugin_abflow.outputs import panoramas
 from hugin_abflow.project import read_plan
-from hugin_abflow.scratch import is_file, is_folder
+from hugin_abflow.scratch import is_file, is_folder, is_special
 from hugin_abflow.terminal import label, say
 
 
@@ -73,13 +73,14 @@ def _projects(place: Path, recursive: bool) -> list[Path]:
 
 
 def _matches(pattern: Path) -> Iterator[Path]:
-    """What fits a pattern; as in a shell no hidden files, unless the pattern names them."""
+    """What fits a pattern; as in a shell no hidden files, unless the pattern names them. No pipes."""
     top = Path(pattern.anchor)
     wanted = pattern.relative_to(top) if pattern.anchor else pattern
     shown = {part for part in wanted.parts if part.startswith(".")}
     # unlike glob.glob it follows no links for **, which may lead back
     for match in top.glob(str(wanted)):
-        if all(part in shown or not part.startswith(".") for part in match.relative_to(top).parts):
+        hidden = any(part.startswith(".") and part not in shown for part in match.relative_to(top).parts)
+        if not hidden and not is_special(match):
             yield match
 
 
@@ -98,5 +99,7 @@ def _walk(folder: Path, recursive: bool, tell: Callable[[OSError], None] | None)
     for parent, folders, files in os.walk(folder, onerror=tell):
         folders[:] = sorted(name for name in folders if recursive and not name.startswith("."))
         for name in files:
-            if name.lower().endswith(".pto") and not name.startswith("."):
-                yield Path(parent) / name
+            project = Path(parent) / name
+            # who opens a pipe waits until somebody writes
+            if name.lower().endswith(".pto") and not name.startswith(".") and not is_special(project):
+                yield project
