@@ -49,7 +49,7 @@ Pixels = npt.NDArray[Any]
 _DTYPES = {"uint8": np.uint8, "uint16": np.uint16, "half": np.float16, "float": np.float32}
 _UNASSOCIATED = "oiio:UnassociatedAlpha"
 # TIFF PhotometricInterpretation
-_MIN_IS_BLACK, _RGB, _PALETTE, _SEPARATED, _LABS = 1, 2, 3, 5, (8, 9, 10)
+_MIN_IS_WHITE, _MIN_IS_BLACK, _RGB, _PALETTE, _SEPARATED, _LABS = 0, 1, 2, 3, 5, (8, 9, 10)
 _MAX_CHUNK = 32 << 20  # a strip above this size (bytes) is not decoded whole to get a few rows of it
 _MAX_KEPT = 1 << 20  # bytes of already decoded rows that a layer keeps for its next read
 
@@ -59,7 +59,8 @@ def read_layer(path: Path | str) -> Layer:
 
     8, 16 bit, half or float; grey or RGB, with or without alpha. Pixels are decoded when
     `Layer.read` is called. Raises `ImageReadError` for what cannot be decoded, for palette, CMYK,
-    Lab and 1-bit images, and for a file of several layers (see `read_layers`).
+    Lab and 1-bit images, for grey ones whose 0 is white and that have alpha or more than 8 bit, and for a
+    file of several layers (see `read_layers`).
     """
     layers = read_layers(path)
     if len(layers) > 1:
@@ -162,6 +163,8 @@ def _refuse_unusable(path: Path, spec: Any) -> None:
         "YCCK",
     ):
         found = "a CMYK image"
+    elif photometric == _MIN_IS_WHITE and (spec.nchannels > 1 or str(spec.format) != "uint8"):
+        found = "a grey image whose 0 is white"  # OpenImageIO inverts alpha, too; of 16 bit nothing
     elif photometric in _LABS:  # OpenImageIO calls its samples R, G and B
         found = "a Lab image"
     elif 0 < bits < 8:

@@ -106,6 +106,14 @@ def test_without_alpha_all_is_opaque(tmp_path, dtype, channels):
     assert (rows[..., -1] == full_scale(dtype)).all()
 
 
+def test_grey_whose_0_is_white(tmp_path):
+    """Where OpenImageIO inverts what it should, and no more."""
+    colours = photo_pixels(2, np.uint8, 1)
+    tifffile.imwrite(tmp_path / "a.tif", colours[..., 0], photometric="miniswhite")
+    rows = whole(read_layer(tmp_path / "a.tif"))
+    assert np.array_equal(rows[..., :-1], 255 - colours) and (rows[..., -1] == 255).all()
+
+
 def test_unspecified_extra_sample_is_alpha(tmp_path):
     pixels = noise(np.uint8)
     tifffile.imwrite(tmp_path / "a.tif", pixels, photometric="rgb", extrasamples=["unspecified"])
@@ -179,6 +187,10 @@ UNUSABLE = {
     ),
     "CMYK": lambda p: tifffile.imwrite(p, np.zeros((5, 7, 4), np.uint8), photometric="separated"),
     "Lab": lambda p: tifffile.imwrite(p, np.zeros((5, 7, 3), np.uint8), photometric="cielab"),
+    "whose 0 is white": lambda p: tifffile.imwrite(
+        p, np.zeros((5, 7, 2), np.uint8), photometric="miniswhite", extrasamples=["unassalpha"]
+    ),
+    "0 is white": lambda p: tifffile.imwrite(p, np.zeros((5, 7), np.uint16), photometric="miniswhite"),
     "1-bit": lambda p: tifffile.imwrite(p, np.zeros((5, 7), bool), photometric="minisblack"),
     "int16": lambda p: tifffile.imwrite(p, np.zeros((5, 7, 3), np.int16), photometric="rgb"),
     "double": lambda p: tifffile.imwrite(p, np.zeros((5, 7, 3), np.float64), photometric="rgb"),
