@@ -13,7 +13,7 @@ from hugin_abflow.errors import ConfigError
 from hugin_abflow.options import kind_of, long_names
 
 # Options that a file of settings cannot give.
-_UNSETTLED = frozenset({"config", "print-config", "dry-run"})
+_UNSETTLED = frozenset({"config", "print-config", "dry-run", "watch"})
 # Parameters that are not about one project, but the run as a whole.
 OF_THE_RUN = frozenset(
     {
@@ -92,11 +92,16 @@ def _rivals(name: str, params: Mapping[str, Any]) -> set[str]:
     return rivals
 
 
-def for_several(values: Mapping[str, Any], why: str) -> None:
-    """Raise `click.UsageError` for options that name the files of one project; why: there may be several."""
+def for_several(values: Mapping[str, Any], why: str, file: Path | None) -> None:
+    """Raise `click.UsageError` for options that name the files of one project, `ConfigError` if it is `file`
+    that gives them; why: there may be several.
+    """
+    source = click.get_current_context().get_parameter_source
     for name, option in (("output", "-o"), ("layers", "--layers")):
-        if values[name]:
+        if values[name] and source(name) is click.core.ParameterSource.COMMANDLINE:
             raise click.UsageError(f"{option} is for one project, but {why}")
+        if values[name]:
+            raise ConfigError(f"{file}: {name} is for one project, but {why}")
 
 
 def words(command: click.Command, values: Mapping[str, Any]) -> list[str]:

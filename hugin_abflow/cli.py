@@ -308,7 +308,7 @@ def command(projects: tuple[Path, ...], **given: Any) -> ExitCode:
         file = config or find_config(project, places)
         values = _chosen(file, alone=file == first)
         if given["watch"]:
-            for_several(values, "--watch takes all of a folder")
+            for_several(values, "--watch takes all of a folder", file)
         return file, values
 
     if given["watch"]:
@@ -322,8 +322,8 @@ def command(projects: tuple[Path, ...], **given: Any) -> ExitCode:
         return ExitCode.OK
     keywords = {project: _options(**values) for project, (_, values) in chosen.items()}
     if len(found) > 1:
-        for its in keywords.values():
-            for_several(its, f"there are {len(found)}")
+        for file, values in chosen.values():
+            for_several(values, f"there are {len(found)}", file)
         refuse_same_output({project: its["prefix"] for project, its in keywords.items()})
     remember = resume or force or len(found) > 1 or any(map(is_folder, projects))
     tasks = [Task(project, its, remember and not force, remember) for project, its in keywords.items()]

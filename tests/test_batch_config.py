@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import tomllib
 from collections.abc import Callable
 from pathlib import Path
@@ -135,6 +136,7 @@ def test_files_are_meant_from_the_folder_of_the_settings(calls: Calls, shoot: Pa
         ("[blending]\nseam = 1", ["'blending'"]),
         ("help = true", ["'help'"]),
         ('config = "other.toml"', ["'config'"]),
+        ('watch = "."', ["'watch' for such files"]),
         ("seam = false", ["seam is False", "text"]),
         ('keep-layers = "yes"', ["keep-layers is 'yes'", "true or false"]),
         ("jobs = 2.5", ["jobs is 2.5", "a whole number"]),
@@ -164,6 +166,38 @@ def test_mistake_is_told_with_the_file(
 def test_file_that_is_not_there(calls: Calls, shoot: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert cli.main(["shoot/a.pto", "--config", "gone.toml"]) == ExitCode.USAGE
     assert "gone.toml cannot be read" in capsys.readouterr().err and calls == {}
+
+
+@pytest.mark.parametrize("arguments", [["shoot"], ["shoot", "--config", "shoot/abflow.toml"]])
+@pytest.mark.parametrize("option", ["output", "layers"])
+def test_files_of_one_project_are_refused_for_several(
+    calls: Calls, shoot: Path, capsys: pytest.CaptureFixture[str], option: str, arguments: list[str]
+) -> None:
+    """With the name of the file that says so; or of the option, if it is the command line's."""
+    (shoot / "b.pto").touch()
+    (shoot / "abflow.toml").write_text('output = "out.tif"' if option == "output" else 'layers = ["l.tif"]')
+    assert cli.main(arguments) == ExitCode.USAGE
+    assert f"shoot/abflow.toml: {option} is for one project, but there are 2" in capsys.readouterr().err
+    assert cli.main([*arguments, f"--{option}", "other.tif", "--remap=auto"]) == ExitCode.USAGE
+    assert "abflow.toml" not in capsys.readouterr().err and calls == {}
+
+
+@pytest.mark.skipif(os.name == "nt", reason="links need rights there")
+@pytest.mark.parametrize(
+    ("target", "why"),
+    [("gone.toml", "No such file"), ("abflow.toml", "Too many levels"), (None, "Is a directory")],
+)
+def test_file_that_cannot_be_read_is_told(
+    calls: Calls, shoot: Path, capsys: pytest.CaptureFixture[str], target: str | None, why: str
+) -> None:
+    """Such as a link that leads nowhere, for which the run went on without settings."""
+    if target:
+        (shoot / "abflow.toml").symlink_to(target)
+    else:
+        (shoot / "abflow.toml").mkdir()
+    assert cli.main(["shoot/a.pto"]) == ExitCode.USAGE
+    assert f"shoot/abflow.toml cannot be read: {why}" in capsys.readouterr().err and calls == {}
+    assert cli.main(["shoot/a.pto", "--config", os.devnull]) == ExitCode.OK
 
 
 def test_what_concerns_the_whole_run_is_said_in_one_place(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import os
 import tomllib
 from collections.abc import Iterable, Mapping
 from pathlib import Path
@@ -11,18 +12,23 @@ from typing import Any
 import tomli_w
 
 from hugin_abflow.errors import ConfigError
-from hugin_abflow.scratch import is_file, is_folder
+from hugin_abflow.scratch import is_folder, is_special
 
 NAME = "abflow.toml"
 
 
 def find_config(project: Path, places: Iterable[Path]) -> Path | None:
-    """The settings of a project: in its folder, else in the next one above, up to a folder of `places`."""
+    """The settings of a project: in its folder, else in the next one above, up to a folder of `places`.
+
+    What has their name and cannot be read (a link that leads nowhere, a folder) is given, too: `read_config`
+    tells of it. A pipe or a device says nothing.
+    """
     folder = project.absolute().parent
     tops = {place.absolute() for place in places if is_folder(place)}
     above = [folder, *folder.parents]
     top = next((number for number, one in enumerate(above) if one in tops), 0)
-    return next((one / NAME for one in above[: top + 1] if is_file(one / NAME)), None)
+    files = (one / NAME for one in above[: top + 1])
+    return next((file for file in files if os.path.lexists(file) and not is_special(file)), None)
 
 
 def read_config(file: Path, kinds: Mapping[str, str], paths: Iterable[str]) -> dict[str, Any]:
@@ -37,12 +43,16 @@ def read_config(file: Path, kinds: Mapping[str, str], paths: Iterable[str]) -> d
     try:
         values = tomllib.loads(file.read_text("utf-8-sig"))
     except OSError as error:
-        raise ConfigError(f"{file} cannot be read: {error.strerror}; check --config") from None
+        raise ConfigError(
+            f"{file} cannot be read: {error.strerror}; mend or remove it, or check --config"
+        ) from None
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
         raise ConfigError(f"{file} is no TOML: {error}") from None
     for name, value in values.items():
         if name not in kinds:
-            raise ConfigError(f"{file}: there is no option {name!r}; {_suggestion(name, kinds)}")
+            raise ConfigError(
+                f"{file}: there is no option {name!r} for such files; {_suggestion(name, kinds)}"
+            )
         _check(file, name, value, kinds[name])
     for name in set(paths) & set(values):
         value = values[name]
