@@ -57,14 +57,24 @@ _DEFAULTS = Settings()
 _COMPRESSIONS = "; ".join(f"{kind}: {', '.join(names)}" for kind, names in COMPRESSIONS.items())
 
 
-def _print_devices(context: click.Context, parameter: click.Parameter, wanted: bool) -> None:
-    """Answer --list-devices and end."""
-    if not wanted or context.resilient_parsing:
-        return
-    for device in list_devices():
-        kind = f"{device.kind}, {device.memory / 2**30:.1f} GiB, {device.platform}"
-        print_result(f"{device.index}: {device.name} ({kind}{', default' if device.default else ''})")
-    context.exit(ExitCode.OK)
+def _print(text: Callable[[click.Context], str]) -> Callable[..., None]:
+    """The callback of an option that is answered by a text, and ends the run."""
+
+    def callback(context: click.Context, parameter: click.Parameter, wanted: bool) -> None:
+        if wanted and not context.resilient_parsing:
+            print_result(text(context))
+            context.exit(ExitCode.OK)
+
+    return callback
+
+
+def _devices(context: click.Context) -> str:
+    """The answer to --list-devices."""
+    return "\n".join(
+        f"{one.index}: {one.name} ({one.kind}, {one.memory / 2**30:.1f} GiB, {one.platform}"
+        f"{', default' if one.default else ''})"
+        for one in list_devices()
+    )
 
 
 _file, _new_file, _new_image = OldFile(), NewFile(), NewFile(image=True)
@@ -75,6 +85,7 @@ _result = partial(click.option, cls=Option, group="Result")
 _batch = partial(click.option, cls=Option, group="Many projects")
 _resources = partial(click.option, cls=Option, group="Resources")
 _information = partial(click.option, cls=Option, group="Information")
+_question = partial(_information, is_flag=True, is_eager=True, expose_value=False)
 
 
 @click.command(cls=Command, examples=EXAMPLES, exit_codes=EXIT_CODES, add_help_option=False)
@@ -257,14 +268,7 @@ _information = partial(click.option, cls=Option, group="Information")
     type=click.IntRange(1, 1024),
     help="Processor cores to use, 1 to 1024; it changes no pixel. [default: all]",
 )
-@_information(
-    "--list-devices",
-    is_flag=True,
-    is_eager=True,
-    expose_value=False,
-    callback=_print_devices,
-    help="List the OpenCL devices and exit.",
-)
+@_question("--list-devices", callback=_print(_devices), help="List the OpenCL devices and exit.")
 @_information(
     "--dry-run", is_flag=True, help="Print what would be made, and the commands that make it; do nothing."
 )
@@ -276,10 +280,10 @@ _information = partial(click.option, cls=Option, group="Information")
     type=_new_file,
     help="Write where the time goes, as a trace (JSON) that chrome://tracing and ui.perfetto.dev open.",
 )
-@click.version_option(
-    version(), prog_name=PROGRAM, message="%(prog)s %(version)s", help="Print the version and exit."
+@_question(
+    "--version", callback=_print(lambda _: f"{PROGRAM} {version()}"), help="Print the version and exit."
 )
-@click.help_option("-h", "--help", help="Show this help and exit.")
+@_question("-h", "--help", callback=_print(click.Context.get_help), help="Show this help and exit.")
 def command(projects: tuple[Path, ...], **given: Any) -> ExitCode:
     """Blend the photos of Hugin projects into panoramas, by optical flow.
 
