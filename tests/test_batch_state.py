@@ -279,6 +279,14 @@ def test_it_is_left_whatever_else_changed(
     assert make(**options).warnings == []
 
 
+def test_it_is_left_in_colours_that_no_layer_has(make: Make, shoot: Path) -> None:
+    """Such as CMYK for a printer; it was taken for damaged."""
+    make()
+    tifffile.imwrite(shoot / "tiny.tif", np.zeros((5, 7, 4), np.uint8), photometric="separated")
+    record = make()
+    assert record.result == "skipped" and "was changed since it was made" in record.warnings[0]
+
+
 def test_it_is_left_where_another_output_is_gone_or_was_left_out(
     make: Make, shoot: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

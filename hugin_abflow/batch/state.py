@@ -17,9 +17,9 @@ from pathlib import Path
 from typing import Any, Literal
 
 from hugin_abflow.batch.record import Record, write_json
-from hugin_abflow.errors import AbflowError
+from hugin_abflow.errors import AbflowError, ImageReadError
 from hugin_abflow.found import layers_there
-from hugin_abflow.images import read_layers
+from hugin_abflow.images import image_size, read_layers
 from hugin_abflow.jpeg import is_cut
 from hugin_abflow.metadata import version
 from hugin_abflow.outputs import checked_outputs, impossible, possible_outputs
@@ -217,11 +217,15 @@ def _flush(file: Path) -> None:
 
 
 def _decodes(file: Path) -> bool:
-    """Whether an image can be decoded to its end."""
+    """Whether an image can be decoded to its end; of what no layer can be, whether it can be opened."""
     if is_cut(file):
         return False
     try:
-        for layer in read_layers(file):
+        layers = read_layers(file)
+    except ImageReadError:  # somebody's in CMYK, of 1 bit ..., which no layer is, and none of ours
+        return image_size(file) is not None
+    try:
+        for layer in layers:
             for top in range(0, layer.box.height, _ROWS):
                 layer.read(top, min(top + _ROWS, layer.box.height))
     except AbflowError:
