@@ -120,13 +120,24 @@ class Choice:
 
         unwanted: what each layer costs in a cell, which does not count as energy.
         """
-        owner = np.where(self.cover.any(0), (self.shares * self.cover).argmax(0), -1)
-        total = 0.0
+        owner, total = self._favoured(), 0.0
         for region in parts(self.whole, self.wraps):
             rows, columns = np.nonzero(region)
             owner[rows, columns], its = self.label(rows, columns, unwanted)
             total += its
         return owner, total
+
+    def _favoured(self) -> npt.NDArray[np.intp]:
+        """The layer of each cell that the softmax favours, (height, width); -1 where none is. One by one: of
+        many layers a product of all would take gigabytes.
+        """
+        owner, most = np.full(self.whole.shape, -1), np.full(self.whole.shape, -np.inf)
+        for k, (shares, there) in enumerate(zip(self.shares, self.cover, strict=True)):
+            its = shares * there
+            better = its > most
+            owner[better], most[better] = k, its[better]
+        owner[~self.cover.any(0)] = -1
+        return owner
 
     def label(
         self, rows: npt.NDArray[np.intp], columns: npt.NDArray[np.intp], unwanted: Prices | None = None

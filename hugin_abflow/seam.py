@@ -160,9 +160,13 @@ def cut(
         cut_share=_CUT_SHARE, whole_factor=factor, clipping=clipping_price,
     )  # fmt: skip
     owner, gone = choose(choice) if choose else (choice.owners()[0], Gone())
-    yields = [yielded(whole, owner, k, cells.wraps) for k in range(len(scene.layers))]
-    for k, at in gone.items():  # wholly: beside a border the softmax hardly knows another layer
-        yields[k] = np.maximum(yields[k], grown(at, 1, cells.wraps) & (owner != k))
+
+    def yields(k: int) -> npt.NDArray[np.float32]:
+        one = yielded(whole, owner, k, cells.wraps)
+        if k in gone:  # wholly: beside a border the softmax hardly knows another layer
+            one = np.maximum(one, grown(gone[k], 1, cells.wraps) & (owner != k))
+        return one
+
     same = averaged(grown(whole, 1, cells.wraps).astype(np.float32), cells.wraps)
     _yield(scene, yields, same, cells)
     return owner, gone
@@ -218,8 +222,7 @@ def cut_unaligned(scene: Scene, correction: Correction) -> None:
     whole = square > 0
     cover = on_cells(scene.masks.host, cells, np.logical_and)
     owner, _ = _choice(scene, Residuals(square, square), whole, cells, cover, _FINE_CUT).owners()
-    yields = [(whole & (owner != k)).astype(np.float32) for k in range(len(scene.layers))]
-    _yield(scene, yields, whole.astype(np.float32), cells)
+    _yield(scene, lambda k: (whole & (owner != k)).astype(np.float32), whole.astype(np.float32), cells)
 
 
 def _choice(
@@ -243,41 +246,49 @@ def _shown(scene: Scene, cells: Grid) -> npt.NDArray[np.bool_]:
     """
     device, grid = scene.device, scene.grid
     cover = on_cells(scene.masks.host, cells, np.logical_and)
-    shown = [device.empty(cells.shape, np.uint8) for _ in scene.layers]
-    for layer, field, one in zip(scene.layers, scene.fields, shown, strict=True):
+    inside, shown = cover.copy(), device.empty(cells.shape, np.uint8)
+    for layer, field, one in zip(scene.layers, scene.fields, inside, strict=True):
         device.run(
             "seam", "seam_shown", cells.border[:2],
-            layer.pixels, field, layer.box, grid.border, grid.lonlat, cells.border, one,
+            layer.pixels, field, layer.box, grid.border, grid.lonlat, cells.border, shown,
         )  # fmt: skip
-    inside = cover & np.stack([one.get() > 0 for one in shown])
-    return np.where(inside.any(0), inside, cover)
+        one &= shown.get() > 0
+    np.copyto(inside, cover, where=~inside.any(0))
+    return inside
 
 
 def _weights(scene: Scene, cells: Grid) -> npt.NDArray[np.float64]:
     """The layers' colour weights at the centres of cells, (layers, height, width)."""
     device = scene.device
     rows, columns = (device.upload(one, np.int32) for one in centres(cells, scene.grid.shape))
-    weights = [device.empty(cells.shape) for _ in scene.layers]
+    # of 300 layers these are a third of a gigabyte: one buffer serves all, and nothing is copied
+    weights, found = np.empty((len(scene.layers), *cells.shape)), device.empty(cells.shape)
     for layer, field, one in zip(scene.layers, scene.fields, weights, strict=True):
         device.run(
-            "seam", "seam_weights", cells.border[:2], field, layer.box, rows, columns, cells.border, one
+            "seam", "seam_weights", cells.border[:2], field, layer.box, rows, columns, cells.border, found
         )
-    return np.stack([one.get() for one in weights]).astype(np.float64)
+        one[:] = found.get()
+    return weights
 
 
 def _yield(
-    scene: Scene, yields: Sequence[npt.NDArray[np.float32]], same: npt.NDArray[np.floating], cells: Grid
+    scene: Scene,
+    yields: Callable[[int], npt.NDArray[np.float32]],
+    same: npt.NDArray[np.floating],
+    cells: Grid,
 ) -> None:
     """Take the layers' colour weight away where they yield; where they are the `same`, 0..1, none weighs more
     than another one before.
+
+    yields      gives how much a layer does, (height, width): of many layers all take gigabytes.
     """
     device, grid = scene.device, scene.grid
     anywhere, everywhere = same > 0, device.upload(same, np.float32)
-    for layer, field, one in zip(scene.layers, scene.fields, yields, strict=True):
+    for k, (layer, field) in enumerate(zip(scene.layers, scene.fields, strict=True)):
         if any_around(anywhere, layer.box, grid, cells):  # of many layers few
             device.run(
                 "seam", "seam_yield", layer.box[2:],
-                field, layer.box, grid.border, device.upload(one), everywhere, cells.border, _TRACE,
+                field, layer.box, grid.border, device.upload(yields(k)), everywhere, cells.border, _TRACE,
             )  # fmt: skip
 
 

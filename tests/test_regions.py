@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 from grids import patches, plane, sphere
 from hypothesis import given
-from labels import alike, energies, label, many, problems
+from labels import CUT, alike, energies, label, many, problems
 
 from hugin_abflow import labelling, regions, seam
-from hugin_abflow.regions import Residuals
+from hugin_abflow.regions import Choice, Residuals
 from hugin_abflow.working import Grid
 
 WRAPS = [False, True]
@@ -116,6 +116,18 @@ def test_a_short_cut_through_what_differs_much_is_seen_less_than_a_long_one() ->
         assert not found[:, :8].any() and found[:, 26:].all()
         assert (not found[:, :21].any() and found[:, 21:].all()) == along
     assert np.allclose(regions.seen(alike(np.array([[0.0, 0.15]]))).rms, [[0, 0.15]])
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_outside_regions_the_softmax_favours_the_first_of_equals(seed: int) -> None:
+    """Of layers that are there; where none is, nobody's."""
+    random = np.random.default_rng(seed)
+    shares, cover = random.integers(0, 3, (4, 9, 11)) / 2, random.random((4, 9, 11)) < 0.4
+    assert not cover.any(0).all()
+    whole = np.zeros(cover.shape[1:], bool)
+    owner, total = Choice(whole, alike(whole * 1.0), shares, cover, False, CUT).owners()
+    assert np.array_equal(owner, np.where(cover.any(0), (shares * cover).argmax(0), -1))
+    assert total == 0
 
 
 def test_a_border_counts_as_a_cut() -> None:
