@@ -50,9 +50,10 @@ class Graph:
     cut: npt.NDArray[np.float64]
 
 
-def energy(graph: Graph, labels: Labels) -> float:
-    """What a labelling costs."""
-    own = np.take_along_axis(graph.price, labels[None], 0).sum()
+def energy(graph: Graph, labels: Labels, priced: npt.NDArray[np.bool_] | None = None) -> float:
+    """What a labelling costs. priced: (nodes,), those whose own price counts; None: all."""
+    own = np.take_along_axis(graph.price, labels[None], 0)
+    own = (own if priced is None else np.where(priced, own, 0.0)).sum()
     return float(own + graph.cut[labels[graph.first] != labels[graph.second]].sum())
 
 

@@ -15,6 +15,7 @@ shows in t alone.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -157,21 +158,23 @@ class Choice:
             wanted = replace(plain, price=plain.price + unwanted[candidates][:, rows, columns])
         labels = least(wanted)
         if self.whole_factor is not None:
-            favoured = self._favoured(rows, columns, candidates)
+
+            def unseen(labels: Labels) -> float:
+                return float(self._disfavour(candidates[labels], rows, columns).sum())
+
             factor, faint = self.whole_factor[rows, columns].max(), _WEAK * self._cut_price(rows.size)
-            labels = _alone(wanted, labels, factor, favoured, faint)
+            labels = _alone(wanted, labels, factor, unseen, faint)
         return candidates[labels], _energy(plain, labels)
 
     def _cut_price(self, cells: int) -> float:
         """c in a region of so many cells."""
         return max(self.cut_price, self.cut_share * math.sqrt(cells))
 
-    def _favoured(
-        self, rows: npt.NDArray[np.intp], columns: npt.NDArray[np.intp], candidates: npt.NDArray[np.intp]
-    ) -> Prices:
-        """r (1 - s_k) of a region's cells, (candidates, cells): that the softmax favours other layers."""
-        shares = self.shares[candidates][:, rows, columns]
-        return self.residual.mean[rows, columns] * (1 - shares)
+    def _disfavour(
+        self, owner: npt.NDArray[np.intp] | np.intp, rows: npt.NDArray[np.intp], columns: npt.NDArray[np.intp]
+    ) -> npt.NDArray[np.float64]:
+        """r (1 - s_k) of a region's cells (cells,), k the layers that they are of."""
+        return np.asarray(self.residual.mean[rows, columns] * (1 - self.shares[owner, rows, columns]))
 
     def _graph(
         self, rows: npt.NDArray[np.intp], columns: npt.NDArray[np.intp], candidates: npt.NDArray[np.intp]
@@ -179,8 +182,11 @@ class Choice:
         """The energy of a region's cells, taken from the layers `candidates`."""
         rough = self.residual.rms[rows, columns]
         cut_price = self._cut_price(rows.size)
-        present = self.cover[candidates][:, rows, columns]
-        price = np.where(present, self._favoured(rows, columns, candidates), _FORBIDDEN)
+        present = self.cover[candidates[:, None], rows, columns]
+        price = np.full(present.shape, _FORBIDDEN)
+        # in place: where 300 layers overlap each array of prices takes a sixth of a gigabyte
+        for k, its, there in zip(candidates, price, present, strict=True):
+            its[there] = self._disfavour(k, rows, columns)[there]
         if self.clipping is not None:
             price += self.clipping[candidates][:, rows, columns]
         number = np.full(self.residual.mean.shape, -1)
@@ -189,8 +195,8 @@ class Choice:
         for down, right in ((0, 1), (1, 0), (0, -1), (-1, 0)):
             inside, there = neighbours(rows + down, columns + right, self.residual.mean.shape, self.wraps)
             # a layer's own border is a cut as well, where the union goes on
-            ends = inside & self.cover[:, *there].any(0) & ~self.cover[candidates][:, *there]
-            price += cut_price * rough * ends
+            ends = inside & self.cover[:, *there].any(0) & ~self.cover[candidates[:, None], *there]
+            np.add(price, cut_price * rough, out=price, where=ends)
             if down + right > 0:
                 linked = np.flatnonzero(inside & (number[there] >= 0))
                 links.append(np.stack([linked, number[there][linked]]))
@@ -199,19 +205,22 @@ class Choice:
         return Graph(rows, columns, price, present, first, second, cuts)
 
 
-def _alone(graph: Graph, labels: Labels, factor: float, favoured: Prices, faint: float) -> Labels:
+def _alone(
+    graph: Graph, labels: Labels, factor: float, unseen: Callable[[Labels], float], faint: float
+) -> Labels:
     """The labels that take all cells from one layer, as far as it goes, which has most of them, if they show
     next to nothing of what `labels` show, or else if they cost no more than `factor` times as much; else
     `labels`.
 
-    favoured    the part of the prices that is not seen. faint: the price of a cut up to which it is not.
+    unseen      the part of what labels cost that nobody sees. faint: the price of a cut up to which it is not
+                seen, either.
     """
 
     def price(labels: Labels) -> float:
         return _energy(graph, labels)
 
     def seen(labels: Labels) -> float:
-        return price(labels) - float(np.take_along_axis(favoured, labels[None], 0).sum())
+        return price(labels) - unseen(labels)
 
     cuts = graph.cut[labels[graph.first] != labels[graph.second]]
     alone = [np.where(one, k, labels) for k, one in enumerate(graph.possible) if one.mean() > _MOSTLY]
@@ -297,4 +306,4 @@ def completed(residual: Residuals, cover: npt.NDArray[np.bool_], wraps: bool) ->
 
 def _energy(graph: Graph, labels: Labels) -> float:
     """What a labelling costs, where any layer is."""
-    return energy(replace(graph, price=np.where(graph.possible.any(0), graph.price, 0.0)), labels)
+    return energy(graph, labels, np.asarray(graph.possible.any(0)))

@@ -276,7 +276,7 @@ def test_one_layer_may_cost_more_where_something_moved(
     region[2:10, 4:26] = True
     alone = {0: cost, 1: 9.0}
     monkeypatch.setattr(
-        regions, "energy", lambda _, labels: alone[labels[0]] if (labels == labels[0]).all() else 1.0
+        regions, "energy", lambda _, labels, priced: alone[labels[0]] if (labels == labels[0]).all() else 1.0
     )
     monkeypatch.setattr(regions, "_WEAK", math.inf)  # a cut is not seen, however much it costs
     seen = []
