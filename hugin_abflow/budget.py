@@ -9,8 +9,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 
-from hugin_abflow import memory, pairflow, working
+from hugin_abflow import memory, pairflow, seam, working
 from hugin_abflow.chart import Chart
+from hugin_abflow.coefficient import Masks
 from hugin_abflow.errors import SettingsError
 from hugin_abflow.opencl import Device
 from hugin_abflow.settings import FlowQuality, Settings
@@ -19,8 +20,9 @@ from hugin_abflow.working import Grid, WorkingLayer
 _log = logging.getLogger(__name__)
 
 # Bytes for each working pixel of a layer, of what is made from flow: a field, an array of coefficients, and
-# offsets with what they are made from.
-_STEP_BYTES = 16 + 4 + 9
+# offsets with what they are made from. While layers are cut there are fields alone.
+_FIELD_BYTES = 16
+_STEP_BYTES = _FIELD_BYTES + 4 + 9
 # Bytes for each pixel of a chart, of all charts, for flow both ways.
 _FLOW_BYTES = 16
 # The same until flow is filled: with trust and brightness.
@@ -34,11 +36,17 @@ _LIBRARY_BYTES = 50 << 20
 
 @dataclass(frozen=True)
 class Work:
-    """What is calculated at working resolution. charts: on which flow is found; none if there is no flow."""
+    """What is calculated at working resolution.
+
+    charts  on which flow is found; none if there is no flow.
+    layers  how many. shared: the share of the grid that several of them cover.
+    """
 
     charts: Sequence[Chart]
     grid: Grid
     settings: Settings
+    layers: int
+    shared: float
 
     @classmethod
     def of_quality(
@@ -46,19 +54,20 @@ class Work:
         quality: FlowQuality,
         full: Grid,
         overlaps: Sequence[npt.NDArray[np.bool_]],
-        masks: Grid,
+        masks: Masks,
         settings: Settings,
     ) -> Work:
         """The work of another `--flow-quality`.
 
-        overlaps    of pairs whose flow is found, (height, width) on the grid `masks`.
+        overlaps    of pairs whose flow is found, (height, width) on the grid of the layers' `masks`.
         """
         settings = replace(settings, flow_quality=quality)
         grid = working.working_grid(full, settings)
-        return cls(pairflow.charts(overlaps, masks, grid, settings), grid, settings)
+        charts = pairflow.charts(overlaps, masks.grid, grid, settings)
+        return cls(charts, grid, settings, len(masks.host), masks.shared)
 
     def bytes(self, pixels: int, abreast: int = 1) -> int:
-        """What flow, and what is found from it, take.
+        """What flow, and what is found from it, take, or cuts where layers are many.
 
         pixels: of all layers. abreast: how many pairs' flow is found at a time.
         """
@@ -66,7 +75,8 @@ class Work:
         size = sum(chart.width * chart.height for chart in finest)
         solvers = sorted(map(self._solver_bytes, self.charts, finest))
         while_found = _FOUND_BYTES * size + sum(solvers[-abreast:])
-        return max(_FLOW_BYTES * size + _STEP_BYTES * pixels, while_found)
+        cuts = seam.room(self.grid, self.settings.flow, self.layers, self.shared) if self.settings.seam else 0
+        return max(_FLOW_BYTES * size + _STEP_BYTES * pixels, while_found, _FIELD_BYTES * pixels + cuts)
 
     def _solver_bytes(self, drawn: Chart, finest: Chart) -> int:
         """What a pair's flow takes while it is found on one chart and ends up on another."""

@@ -36,6 +36,11 @@ class Masks:
         """The masks of some of the layers."""
         return Masks(self.grid, tuple(self.buffers[i] for i in indices), self.host[list(indices)])
 
+    @property
+    def shared(self) -> float:
+        """The share of the grid that several layers cover."""
+        return float((self.host.sum(0, dtype=np.uint16) > 1).mean())
+
     def overlap(self, first: int, second: int) -> npt.NDArray[np.bool_]:
         """What two layers both cover, (height, width)."""
         return np.asarray(self.host[first] & self.host[second])

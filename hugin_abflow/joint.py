@@ -198,8 +198,9 @@ def _flow(
     """
     overlaps = used.overlaps if settings.flow else ()
     charts = pairflow.charts(overlaps, used.masks.grid, grid, settings)
-    fast = partial(budget.Work.of_quality, "fast", full, overlaps, used.masks.grid, settings)
-    abreast = budget.abreast(device, used.layers, budget.Work(charts, grid, settings), fast, most)
+    work = budget.Work(charts, grid, settings, len(used.layers), used.masks.shared)
+    fast = partial(budget.Work.of_quality, "fast", full, overlaps, used.masks, settings)
+    abreast = budget.abreast(device, used.layers, work, fast, most)
     if not settings.flow:
         return pairflow.Solution([], [], [])
     return pairflow.solve(

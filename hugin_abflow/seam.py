@@ -63,6 +63,10 @@ _CERTAINLY_DARKER = 0.1
 _NEVER = 1e6
 # What is left of a layer's weight where it yields: a pixel that no other layer can fill stays opaque.
 _TRACE = 1e-12
+# Bytes that `cut` takes for each cell of each layer: share and cover; and more where several layers are, for
+# a graph of prices with what finds the least of them.
+_CELL_BYTES = 8 + 2
+_SHARED_BYTES = 16
 # How many times as much as a cut it may cost to take a region from one layer that has most of it, which shows
 # things once and whole.
 _WHOLE_FACTOR = 1.65
@@ -73,6 +77,15 @@ _SINGLE_FACTOR = 2.0
 def seam_grid(grid: Grid) -> Grid:
     """The grid of the regions, over the working grid's region."""
     return grid.coarser(_CELL)
+
+
+def room(grid: Grid, aligned: bool, layers: int, shared: float) -> int:
+    """Bytes that `cut` takes, at most; `cut_unaligned` if layers are not `aligned`.
+
+    grid        the working grid. layers: how many. shared: the share of the grid that several of them cover.
+    """
+    cells = grid.coarser(_CELL if aligned else _FINE_CELL)
+    return math.ceil(layers * cells.width * cells.height * (_CELL_BYTES + shared * _SHARED_BYTES))
 
 
 def residuals(scene: Scene, correction: Correction, single: Cells | None = None) -> Residuals:

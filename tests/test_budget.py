@@ -10,13 +10,14 @@ import numpy as np
 import pytest
 from pictures import merged, noise, one_device
 
-from hugin_abflow import budget, quality
+from hugin_abflow import budget, quality, seam
 from hugin_abflow.budget import Work
 from hugin_abflow.errors import SettingsError
 from hugin_abflow.layer import Canvas, Layer
 from hugin_abflow.settings import Settings
 
 CANVAS = Canvas.plane(301, 151)
+CELLS = SimpleNamespace(width=100, height=80)
 MIB = 1 << 20
 
 pytestmark = pytest.mark.usefixtures(one_device.__name__)
@@ -36,13 +37,13 @@ def small(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(quality, "_LEAST_PIXELS", dict.fromkeys(quality._LEAST_PIXELS, 10_000))
 
 
-def work(sizes: Sequence[int], **settings: Any) -> Work:
-    """On charts of so many pixels, which are not refined."""
+def work(sizes: Sequence[int], cut: int = 0, **settings: Any) -> Work:
+    """On charts of so many pixels, which are not refined. cut: how many layers are."""
     charts: Any = [
         SimpleNamespace(width=pixels, height=1, coarse=1, border=(pixels, 1, 0, 0)) for pixels in sizes
     ]
-    grid: Any = SimpleNamespace(width=1000, height=1000)
-    return Work(charts, grid, Settings(flow_quality="fast", large_motion="off", **settings))
+    grid: Any = SimpleNamespace(width=1000, height=1000, coarser=lambda by: CELLS)
+    return Work(charts, grid, Settings(flow_quality="fast", large_motion="off", **settings), cut, 0.5)
 
 
 def reckoned(monkeypatch: pytest.MonkeyPatch, its: Work, most: int) -> int:
@@ -61,6 +62,17 @@ def test_the_larger_of_both_counts() -> None:
     assert its.bytes(0, abreast=2) == one + budget._SOLVER_BYTES * 200
     assert its.bytes(1_000_000) == budget._FLOW_BYTES * 600 + budget._STEP_BYTES * 1_000_000
     assert work([]).bytes(7) == budget._STEP_BYTES * 7
+
+
+def test_cuts_count_where_layers_are_many() -> None:
+    """With the fields that are there already; not where nothing is cut."""
+    room = seam.room(work([]).grid, False, 300, 0.5)
+    assert room == 300 * 8000 * (seam._CELL_BYTES + seam._SHARED_BYTES / 2)
+    assert work([], 300, flow=False).bytes(10_000) == budget._FIELD_BYTES * 10_000 + room
+    assert work([], 300, flow=False).bytes(10_000_000) == budget._STEP_BYTES * 10_000_000
+    assert work([], 300, flow=False, seam=False).bytes(10_000) == budget._STEP_BYTES * 10_000
+    few = work([100]).bytes(0)
+    assert work([100], 300).bytes(0) == max(few, room)
 
 
 def test_a_search_that_takes_more_than_the_solver_counts(monkeypatch: pytest.MonkeyPatch) -> None:
