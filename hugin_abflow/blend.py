@@ -22,6 +22,7 @@ from hugin_abflow.layer import Box, Layer
 from hugin_abflow.opencl import Buffer, Device, DeviceMemoryError
 from hugin_abflow.progress import Advance
 from hugin_abflow.settings import Settings
+from hugin_abflow.slices import Band, Coarse, Slices, Span, coarse_rows
 from hugin_abflow.working import Grid, Place, device_dtype, device_rows, pixel_options
 
 _log = logging.getLogger(__name__)
@@ -55,9 +56,6 @@ _LAYER = np.dtype(
     ]
 )
 
-Span = tuple[int, int]
-_Coarse = tuple[Place, Buffer]  # place on a coarse grid; float32 (height, width, 4)
-
 
 @dataclass(frozen=True)
 class BlendLayer:
@@ -76,7 +74,7 @@ class BlendLayer:
     field: Buffer
     reach: Sequence[float]
     gain: Buffer | None
-    offset: _Coarse | None = None
+    offset: Coarse | None = None
 
 
 @dataclass(frozen=True)
@@ -98,16 +96,6 @@ class Prepared:
     shoulder: float
     unit: float = 1.0
     unlike: Unlike | None = None
-
-
-@dataclass(frozen=True)
-class _Band:
-    """part: the band, in pixels of the region. rows: for each layer, the half-open range of its rows that
-    this band may sample; both ends equal where it samples none.
-    """
-
-    part: Box
-    rows: tuple[Span, ...]
 
 
 def bands(
@@ -154,7 +142,7 @@ def _band_height(device: Device, prepared: Prepared, crop: Box, settings: Settin
     return height
 
 
-def _pass_memory(layers: Sequence[BlendLayer], plan: Sequence[_Band], scale: float) -> int:
+def _pass_memory(layers: Sequence[BlendLayer], plan: Sequence[Band], scale: float) -> int:
     """Bytes that the bands take on host and device beside what is there before.
 
     scale: rows of the panorama per row of the working grid.
@@ -200,10 +188,11 @@ def _bands(
     whole = (0, 0, prepared.gain_grid.width, prepared.gain_grid.height)
     longitudes = _sines_cosines(device, full.lonlat[0], full.lonlat[1], crop.left - region.left, crop.width)
     plan = _plan(prepared, crop, height)
-    fields = _Slices(device, [(layer.box, layer.field) for layer in layers], grid, plan)
+    # all that lie in a band tell what nobody sees
+    fields = Slices(device, [(layer.box, layer.field) for layer in layers], grid, plan, everywhere=True)
     corrections = [None if layer.gain is None else (whole, layer.gain) for layer in layers]
-    gains = _Slices(device, corrections, prepared.gain_grid, plan)
-    offsets = _Slices(device, [layer.offset for layer in layers], prepared.offset_grid, plan)
+    gains = Slices(device, corrections, prepared.gain_grid, plan)
+    offsets = Slices(device, [layer.offset for layer in layers], prepared.offset_grid, plan)
     spans = [band.rows for band in plan]
     with _Store(device, [layer.layer for layer in layers], spans, settings.cores) as store:
         for band in plan:
@@ -211,25 +200,24 @@ def _bands(
             size = part.width, part.height
             groups = -(-part.width // together), part.height
             store.next()
-            places = [slices.take(part) for slices in (fields, gains, offsets)]
-            top, bottom = _coarse_rows((0, 0, grid.width, grid.height), part, grid.row_height)
-            hidden.mark(device, fields.values, places[0], (0, top, grid.width, bottom - top), share)
-            table = np.zeros(len(layers), _LAYER)
-            for row, layer, ring, (start, end) in zip(
-                table, layers, store.shelves.rings, band.rows, strict=True
-            ):
-                box = layer.layer.box
+            places = [slices.take(band) for slices in (fields, gains, offsets)]
+            top, bottom = coarse_rows((0, 0, grid.width, grid.height), part, grid.row_height)
+            read = places[0][places[0][:, 3] > 0]
+            hidden.mark(device, fields.values, read, (0, top, grid.width, bottom - top), share)
+            used = np.flatnonzero(band.samples)
+            table = np.zeros(used.size, _LAYER)
+            for row, k in zip(table, used, strict=True):
+                box, ring, (start, end) = layers[k].layer.box, store.shelves.rings[k], band.rows[k]
                 row["place"] = box.left - region.left, box.top - region.top + start, box.width, end - start
                 row["rows"], row["ring"], row["turn"] = ring.start, ring.rows, start % ring.rows
             for name, its_places in zip(("field", "gain", "offset"), places, strict=True):
-                table[name], table[name + "s"] = its_places[:, :4], its_places[:, 4]
-            used = [k for k, (start, end) in enumerate(band.rows) if start < end]
-            touched = device.upload(table[used])
+                table[name], table[name + "s"] = its_places[used, :4], its_places[used, 4]
+            touched = device.upload(table)
             marks = _mark(device, store.rows, touched, fields.values, full, grid, part, options)
             latitudes = _sines_cosines(device, full.lonlat[2], -full.lonlat[3], part.top, part.height)
             out = device.empty((part.height, part.width, first.channels + 1), device_dtype(first))
             device.run(
-                "blend", "blend_band", groups, store.rows, touched, len(used), fields.values, gains.values,
+                "blend", "blend_band", groups, store.rows, touched, used.size, fields.values, gains.values,
                 offsets.values, longitudes, latitudes, full.border, full.lonlat, grid.border,
                 prepared.gain_grid.border, prepared.offset_grid.border, (part.left, part.top, *size),
                 (region.left, region.top), prepared.shoulder, math.sqrt(prepared.unit),
@@ -250,41 +238,6 @@ def _sines_cosines(device: Device, angle: float, step: float, first: int, count:
     """Sine and cosine at the centres of pixels, float32 (n, 2); angle: of the border of pixel 0."""
     angles = angle + (np.arange(first, first + count) + 0.5) * step
     return device.upload(np.stack([np.sin(angles), np.cos(angles)], -1).astype(np.float32))
-
-
-class _Slices:
-    """Of arrays on boxes of a coarse grid the rows that a band reads. values: float32 (n, 4), one array after
-    the other.
-    """
-
-    def __init__(
-        self, device: Device, arrays: Sequence[_Coarse | None], grid: Grid, plan: Sequence[_Band]
-    ) -> None:
-        self._arrays = arrays
-        self._scale = grid.row_height
-        most = max(int(places[:, 2] @ places[:, 3]) for places in (self._places(band.part) for band in plan))
-        self.values = device.empty((most, 4))
-
-    def take(self, part: Box) -> npt.NDArray[np.int32]:
-        """Have `values` hold the rows of a band. Per array their box on the grid, where they begin, -1 where
-        there is none, and three zeros: (arrays, 8).
-        """
-        places = self._places(part)
-        for (_, first, width, height, start, *_), array in zip(places.tolist(), self._arrays, strict=True):
-            if array is not None:
-                self.values.copy(start, array[1], (first - array[0][1]) * width, height * width)
-        return places
-
-    def _places(self, part: Box) -> npt.NDArray[np.int32]:
-        places, values = np.zeros((len(self._arrays), 8), np.int32), 0
-        places[:, 4] = -1
-        for place, array in zip(places, self._arrays, strict=True):
-            if array is not None:
-                left, _, width, _ = array[0]
-                first, last = _coarse_rows(array[0], part, self._scale)
-                place[:5] = left, first, width, last - first, values
-                values += width * (last - first)
-        return places
 
 
 def _mark(
@@ -311,20 +264,13 @@ def _mark(
     return marks
 
 
-def _coarse_rows(box: Place, part: Box, scale: float) -> Span:
-    """Rows of a coarse grid in `box` that a band reads, at least one; scale: band rows per coarse row."""
-    _, top, _, height = box
-    first = min(max(math.floor(part.top / scale) - 1, top), top + height - 1)
-    return first, min(max(math.ceil(part.bottom / scale) + 2, first + 1), top + height)
-
-
 def _rows_needed(layer: BlendLayer, full: Grid, part: Box, scale: float) -> Span:
     """Layer rows (from, to) that a band may sample; equal if none."""
     box = layer.layer.box
     offset = box.top - full.region.top
     if part.bottom <= offset or part.top >= offset + box.height:
         return 0, 0
-    first, last = (row - layer.box[1] for row in _coarse_rows(layer.box, part, scale))
+    first, last = (row - layer.box[1] for row in coarse_rows(layer.box, part, scale))
     beyond = math.ceil(max(layer.reach[first:last]) * scale) + 3  # 3: bicubic taps, rounding
     start, end = max(0, part.top - beyond - offset), min(box.height, part.bottom + beyond - offset)
     # whole strips, unless they are large: parts would have to be cut and joined again
@@ -332,7 +278,7 @@ def _rows_needed(layer: BlendLayer, full: Grid, part: Box, scale: float) -> Span
     return start, min(box.height, end + (-end % strip if strip * row <= _WHOLE_STRIP else 0))
 
 
-def _plan(prepared: Prepared, crop: Box, height: int) -> list[_Band]:
+def _plan(prepared: Prepared, crop: Box, height: int) -> list[Band]:
     """The bands from top to bottom. No band needs a row that the one before it has let go of."""
     layers, full, scale = prepared.layers, prepared.full, prepared.grid.row_height
     left, top = full.region.left, full.region.top
@@ -347,7 +293,7 @@ def _plan(prepared: Prepared, crop: Box, height: int) -> list[_Band]:
             spans[after][k] = spans[after][k][0], max(spans[before][k][1], spans[after][k][1])
         for before, after in reversed(list(pairwise(touched))):
             spans[before][k] = min(spans[before][k][0], spans[after][k][0]), spans[before][k][1]
-    return [_Band(part, tuple(rows)) for part, rows in zip(parts, spans, strict=True)]
+    return [Band(part, tuple(rows)) for part, rows in zip(parts, spans, strict=True)]
 
 
 @dataclass(frozen=True)
