@@ -111,14 +111,16 @@ class CellFlow:
     ends        the same: where the flow leads.
     shown       whether both photos show where it starts and where it ends.
     consistent  whether, besides, the opposite flow leads back (forward-backward consistency).
-    period      px after which the columns of the chart repeat; 0: they do not.
+    wraps       whether the columns of the chart are periodic.
+    period      px after which places repeat, on the chart or beside it; 0: never (`Chart.period`).
     """
 
     starts: Places
     ends: Places
     shown: Mask
     consistent: Mask
-    period: int = 0
+    wraps: bool = False
+    period: float = 0.0
 
     @classmethod
     def of(
@@ -132,7 +134,7 @@ class CellFlow:
         there = np.where(inside, row, 0), np.where(inside, column, 0)
         shown = inside & views[index].cells & (views[1 - index].mask[there] > 0)
         consistent = shown & (np.linalg.norm(flow + flows[1 - index][there], axis=-1) < gap)
-        return cls(starts, starts + flow, shown, consistent, chart.width * chart.wraps)
+        return cls(starts, starts + flow, shown, consistent, chart.wraps, chart.period)
 
     @property
     def vectors(self) -> Places:

@@ -75,6 +75,14 @@ class Chart:
         """Whether it is of a sphere."""
         return bool(self.transform[13])
 
+    @property
+    def period(self) -> float:
+        """Px after which positions repeat, also beside a chart that does not wrap; 0: never."""
+        if self.wraps:
+            return float(self.width)
+        around = 2 * math.pi if self.spherical else float(self.transform[14])
+        return around * float(self.transform[9])
+
     def positions(self, points: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
         """Chart positions (n, 2) of points (n, 3) in the scene; on the host what kernels do on the device."""
         t = self.transform.astype(np.float64)

@@ -92,10 +92,10 @@ def _near_things(
     behind = (sizes >= max(_WIDE, _SHARE * np.count_nonzero(flow.shown)))[surfaces]
     if not behind.any():
         return _NearThings(np.zeros(behind.shape, np.int32), np.zeros(1))
-    around = flow.vectors[_nearest(behind, flow.period > 0)]
+    around = flow.vectors[_nearest(behind, flow.wraps)]
     own = np.linalg.norm(flow.vectors - around, axis=-1)
     longer = np.linalg.norm(flow.vectors, axis=-1) > np.linalg.norm(around, axis=-1)
-    parts = connected((own > _APART) & longer & flow.shown, flow.period > 0)
+    parts = connected((own > _APART) & longer & flow.shown, flow.wraps)
     kept = np.bincount(parts[flow.consistent], minlength=parts.max() + 1) >= LEAST_CELLS
     kept[0] = False
     kept[flow.confirmed(parts, control_points)] = False
@@ -136,7 +136,7 @@ def _surfaces(flow: CellFlow) -> npt.NDArray[np.int32]:
     """Adjacent cells whose flows are consistent and alike share a number; each other one has its own."""
     number = np.arange(flow.shown.size).reshape(flow.shown.shape)
     links = [_alike(flow, np.s_[:, :-1], np.s_[:, 1:]), _alike(flow, np.s_[:-1], np.s_[1:])]
-    if flow.period:
+    if flow.wraps:
         links.append(_alike(flow, np.s_[:, -1:], np.s_[:, :1]))
     first, second = (np.concatenate([number[ends[k]][alike] for *ends, alike in links]) for k in (0, 1))
     graph = scipy.sparse.csr_array((np.ones(first.size), (first, second)), shape=(number.size, number.size))

@@ -62,11 +62,14 @@ class GuidanceParameters:
 
 @dataclass(frozen=True)
 class ChartGuides:
-    """The guides of one pair: at_a, at_b float64 (n, 2), their ends on its chart, px."""
+    """The guides of one pair: at_a, at_b float64 (n, 2), their ends on its chart, px. period: px after which
+    places there repeat, on the chart or beside it; 0: never.
+    """
 
     at_a: Points
     at_b: Points
     names: tuple[str, ...]
+    period: float = 0.0
 
     def __len__(self) -> int:
         return len(self.names)
@@ -74,7 +77,7 @@ class ChartGuides:
     def only(self, chosen: npt.NDArray[np.bool_]) -> ChartGuides:
         """The chosen ones, a mask (n,)."""
         names = tuple(name for name, used in zip(self.names, chosen, strict=True) if used)
-        return ChartGuides(self.at_a[chosen], self.at_b[chosen], names)
+        return ChartGuides(self.at_a[chosen], self.at_b[chosen], names, self.period)
 
 
 def on_chart(guides: Sequence[Guide], start: int, chart: Chart, grid: Grid) -> ChartGuides:
@@ -85,7 +88,7 @@ def on_chart(guides: Sequence[Guide], start: int, chart: Chart, grid: Grid) -> C
     ends = [(g.at_a, g.at_b) if g.a == start else (g.at_b, g.at_a) for g in guides]
     places = np.array(ends, np.float64).reshape(-1, 2, 2)
     at_a, at_b = (chart.positions(grid.points(places[:, end])) for end in (0, 1))
-    return ChartGuides(at_a, at_b, tuple(guide.name for guide in guides))
+    return ChartGuides(at_a, at_b, tuple(guide.name for guide in guides), chart.period)
 
 
 def lead(
@@ -103,7 +106,7 @@ def lead(
     """
     parameters, count = parameters or GuidanceParameters(), len(guides)
     directed = _directed(images[0].grid, (flows[0].get(), flows[1].get()), guides)
-    leading = _leading(guides, directed, images[0].grid, parameters.radius * circumference, parameters)
+    leading = _leading(guides, directed, parameters.radius * circumference, parameters)
     if not leading.any():
         return flows
     guides, directed = guides.only(leading), (directed[0].only(leading), directed[1].only(leading))
@@ -128,7 +131,6 @@ def lead(
 def _leading(
     guides: ChartGuides,
     directed: Sequence[_DirectedGuides],
-    grid: tuple[int, int, int, int],
     radius: float,
     parameters: GuidanceParameters,
 ) -> npt.NDArray[np.bool_]:
@@ -136,7 +138,7 @@ def _leading(
     wrong = _wrong(directed, parameters.agreement)
     if not wrong.any():
         return wrong
-    reasons = doubts(guides.at_a, directed[0].moves, radius, _period(grid))
+    reasons = doubts(guides.at_a, directed[0].moves, radius, guides.period or math.inf)
     for name, reason, counts in zip(guides.names, reasons, wrong, strict=True):
         if reason and counts:
             _log.info("%s is ignored: %s", name, reason)
@@ -235,10 +237,9 @@ def _wrong(directed: Sequence[_DirectedGuides], agreement: float) -> npt.NDArray
 def _directed(
     grid: tuple[int, int, int, int], flows: Flows, guides: ChartGuides
 ) -> tuple[_DirectedGuides, _DirectedGuides]:
-    width, _, wraps, _ = grid
     moves = guides.at_b - guides.at_a
-    if wraps:
-        moves[:, 0] -= width * np.rint(moves[:, 0] / width)
+    if guides.period:  # the shorter way round
+        moves[:, 0] -= guides.period * np.rint(moves[:, 0] / guides.period)
     directed = []
     for field, places, its in zip(flows, (guides.at_a, guides.at_b), (moves, -moves), strict=True):
         inside, (row, column) = pixels_at(places, grid)

@@ -143,7 +143,7 @@ def _moved(
     control_points: tuple[Places, Places],
 ) -> Mask:  # fmt: skip
     """The cells of what moved by itself; off_parallax: by how much each misses parallax, of the limit."""
-    things = connected(off_parallax > _WEAK, flow.period > 0)
+    things = connected(off_parallax > _WEAK, flow.wraps)
     clear = np.bincount(things[(off_parallax > 1) & flow.shown], minlength=things.max() + 1)
     kept = clear >= np.maximum(LEAST_CELLS, _CLEAR * np.bincount(things.ravel()))
     kept[flow.confirmed(things, control_points)] = False

@@ -6,11 +6,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from grids import plane
 from reference import common
 from scenes import CANVAS, CHARTS
 from scipy import ndimage
 
-from hugin_abflow.cells import CELL, SingleSource, ends_within
+from hugin_abflow.cells import CELL, CellFlow, SingleSource, View, ends_within
 from hugin_abflow.chart import pair_chart
 from hugin_abflow.layer import Box
 from hugin_abflow.working import Grid
@@ -66,6 +67,25 @@ def test_around_the_canvas_every_cell_has_one_of_the_chart() -> None:
     everywhere = SingleSource(np.ones(shape, bool), np.zeros(shape, bool))
     found = everywhere.on_canvas(chart, CANVAS.resized(90, 45))
     assert found[20:25].all() and not found[:5].any() and not found[-5:].any()
+
+
+@pytest.mark.parametrize("move", [-40, 40])
+def test_a_control_point_confirms_flow_beyond_a_chart_of_a_cylinder(move: int) -> None:
+    """Which does not wrap, while places do."""
+    grid = plane(800, 200, wraps=True)
+    overlap = np.zeros(grid.shape, bool)
+    overlap[:, 300:400] = True
+    chart = pair_chart(overlap, grid, grid)
+    there = np.full((chart.height, chart.width, 2), (move, 0), np.float32)
+    views = (View(*np.ones((2, chart.height, chart.width), np.float32)),) * 2
+    found = CellFlow.of(chart, (there, -there), views, 0)
+    things = np.ones(found.shown.shape, np.int32)
+    start = 300.0 if move < 0 else 400.0
+    starts, ends, wrong = (
+        chart.positions(grid.points(np.array([(start + by, 100.0)]))) for by in (0, move, -move)
+    )
+    assert found.confirmed(things, (starts, ends)).tolist() == [1]
+    assert found.confirmed(things, (starts, wrong)).tolist() == []
 
 
 @pytest.mark.parametrize("wraps", [False, True])

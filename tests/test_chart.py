@@ -159,6 +159,9 @@ def test_a_finer_chart_shows_the_same_places(name: str) -> None:
     points = common.canvas_point(columns + 0.5, rows + 0.5, grid.lonlat)[mask]
     assert np.allclose(fine.positions(points), 2 * coarse.positions(points), atol=1e-4)
     assert fine.circumference(grid) == pytest.approx(2 * coarse.circumference(grid))
+    for one in (coarse, fine):
+        around = one.circumference(grid) if grid.wraps else 2 * np.pi * one.transform[9] * one.spherical
+        assert one.period == pytest.approx(around)
     if coarse.projection:
         places = np.random.default_rng(1).uniform(0, coarse.height, (50, 2))
         assert np.allclose(fine.projection.bearings(2 * places), coarse.projection.bearings(places))

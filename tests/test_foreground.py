@@ -83,7 +83,12 @@ def pair(
     views = tuple(View(np.zeros(mask.shape, np.float32), mask.astype(np.float32)) for mask in masks)
     border = width, HEIGHT, int(turned is not None), 0
     chart = SimpleNamespace(
-        width=width, height=HEIGHT, wraps=turned is not None, border=border, projection=None
+        width=width,
+        height=HEIGHT,
+        wraps=turned is not None,
+        border=border,
+        projection=None,
+        period=0 if turned is None else width,
     )
     return Pair(chart, tuple(flows), views, tuple(things))
 
@@ -271,7 +276,9 @@ def test_what_somebody_vouches_for_across_the_border_of_a_chart() -> None:
 @pytest.mark.parametrize("size", [(1, 1), (90, 1), (90, 2), (1, 90), (2, 90), (90, 3), (3, 90)])
 def test_charts_without_cells(size: tuple[int, int], wraps: bool) -> None:
     border = *size, int(wraps), 0
-    chart = SimpleNamespace(width=size[0], height=size[1], wraps=wraps, border=border, projection=None)
+    chart = SimpleNamespace(
+        width=size[0], height=size[1], wraps=wraps, period=size[0] * wraps, border=border, projection=None
+    )
     flow, shown = np.zeros((*size[::-1], 2), np.float32), np.ones(size[::-1], np.float32)
     assert foreground.find(chart, (flow, flow), (View(shown, shown),) * 2, NOBODY) is None
 

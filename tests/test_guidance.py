@@ -346,7 +346,7 @@ def test_guides_around_the_border_of_a_cylinder(device: Device) -> None:
             np.add(ends, (turn, 0)) % (384, 1000) for ends in (ON_THE_THING.at_a, ON_THE_THING.at_b)
         )
         alone = flow.pair_flow(device, *images)
-        guides = ChartGuides(at_a, at_b, ("one", "two"))
+        guides = ChartGuides(at_a, at_b, ("one", "two"), 384.0)
         led = guidance.lead(device, images, alone, guides, 2048.0, GuidanceParameters(spacing=2.0))
         results.append(np.roll(led[0].get(), -turn, 1))
     x, y = common.pixels(384, HEIGHT)

@@ -6,13 +6,13 @@ from itertools import permutations
 
 import numpy as np
 import pytest
-from grids import GRIDS, on_device
+from grids import GRIDS, on_device, plane
 from pictures import masked, one_device, pixel_places
 from test_flow_truth import scene
 
-from hugin_abflow import flow, geometry
+from hugin_abflow import flow, geometry, guidance
 from hugin_abflow.chart import pair_chart
-from hugin_abflow.guidance import on_chart
+from hugin_abflow.guidance import GuidanceParameters, on_chart
 from hugin_abflow.guides import Guide, by_pair, doubts
 from hugin_abflow.layer import Canvas, Layer
 from hugin_abflow.merge import merge_layers
@@ -132,6 +132,32 @@ def test_guides_on_a_chart_are_where_kernels_put_them(name: str) -> None:
         assert np.allclose(found, [(u, v)] * 2, atol=1e-3)
     back = on_chart(pairs[0, 1], 1, chart, grid)
     assert np.array_equal(back.at_a, placed.at_b) and np.array_equal(back.at_b, placed.at_a)
+
+
+@pytest.mark.parametrize("first", [0, 300, 770])
+@pytest.mark.parametrize("move", [-40, 40])
+def test_guides_that_lead_beyond_a_chart_of_a_cylinder_go_the_shorter_way(first: int, move: int) -> None:
+    """Also where the overlap lies across the canvas's border, and beside its chart, which does not wrap."""
+    grid = plane(800, 200, wraps=True)
+    overlap = np.zeros(grid.shape, bool)
+    overlap[:, np.arange(first, first + 100) % 800] = True
+    chart = pair_chart(overlap, grid, grid)
+    assert not chart.wraps and chart.period == 800
+    starts = [(first + column, row) for column, row in ((5, 40), (95, 100), (-10, 110), (108, 120))]
+    guides = [Guide(0, 1, (x % 800, y), ((x + move) % 800, y)) for x, y in starts]
+    its = on_chart(guides, 0, chart, grid)
+    there = np.zeros((chart.height, chart.width, 2), np.float32)
+    there[..., 0] = move
+    assert not guidance.contradict(chart, (there, -there), its, 1)
+    assert guidance.contradict(chart, (-there, there), its, 1)
+    # one that is farther away the other way round is a neighbour: three of them outvote the last one
+    odd = on_chart(
+        [*guides[:3], Guide(0, 1, (first % 800, 90), ((first + 30 - move) % 800, 130))], 0, chart, grid
+    )
+    for one in (its, odd):
+        directed = guidance._directed(chart.border, (there, -there), one)
+        leading = guidance._leading(one, directed, 200.0, GuidanceParameters(agreement=-1.0))
+        assert leading.tolist() == [True, True, True, one is its]
 
 
 @pytest.mark.parametrize("name", ["plane", "sphere", "window"])
