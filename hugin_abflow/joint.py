@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib
 import logging
 import threading
+from collections import defaultdict
 from collections.abc import Callable, Generator, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
@@ -176,9 +177,12 @@ def _parted(
     blended = list(compress(reduced, kept))
     masks = masks.only(np.flatnonzero(kept).tolist())
     pairs = _overlapping(device, blended, masks)
-    order = {id(layer): index for index, layer in enumerate(layers)}
-    numbers = [order[id(one.layer)] for one in blended]
-    used = _Used(saturation.with_whites(device, blended, pairs), numbers, masks, pairs)
+    order = defaultdict[int, list[int]](list)
+    for index, layer in enumerate(layers):  # which may be one, given twice
+        order[id(layer)].append(index)
+    numbers = [order[id(one.layer)].pop(0) for one in reduced]
+    whites = saturation.with_whites(device, blended, pairs)
+    used = _Used(whites, list(compress(numbers, kept)), masks, pairs)
     return used, [one for one, its in zip(reduced, kept, strict=True) if not its]
 
 

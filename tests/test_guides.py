@@ -10,14 +10,16 @@ from grids import GRIDS, on_device, plane
 from pictures import masked, one_device, pixel_places
 from test_flow_truth import scene
 
-from hugin_abflow import flow, geometry, guidance
+from hugin_abflow import flow, geometry, guidance, joint, reading
 from hugin_abflow.chart import pair_chart
 from hugin_abflow.guidance import GuidanceParameters, on_chart
 from hugin_abflow.guides import Guide, by_pair, doubts
 from hugin_abflow.layer import Canvas, Layer
 from hugin_abflow.merge import merge_layers
 from hugin_abflow.opencl import Device
+from hugin_abflow.progress import silent
 from hugin_abflow.settings import Settings
+from hugin_abflow.working import full_grid, working_grid
 
 pytestmark = pytest.mark.usefixtures(one_device.__name__)
 
@@ -132,6 +134,22 @@ def test_guides_on_a_chart_are_where_kernels_put_them(name: str) -> None:
         assert np.allclose(found, [(u, v)] * 2, atol=1e-3)
     back = on_chart(pairs[0, 1], 1, chart, grid)
     assert np.array_equal(back.at_a, placed.at_b) and np.array_equal(back.at_b, placed.at_a)
+
+
+def test_a_layer_that_is_given_twice_has_two_numbers(device: Device) -> None:
+    """Guides may be about the first or the second of them."""
+    one, other = (
+        Layer.from_array(
+            "layer", (200 * np.random.default_rng(k).random((40, 50, 4))).astype(np.uint8), 9 * k, 3
+        )
+        for k in (0, 1)
+    )
+    layers = [one, other, one]
+    grid = working_grid(full_grid(Canvas.plane(60, 50), layers), Settings())
+    reduced = reading.read(device, layers, grid, silent, Settings())
+    used, _ = joint._parted(device, reduced, layers, grid)
+    assert len(used.layers) == 3 and sorted(used.numbers) == [0, 1, 2]
+    assert all(layers[k] is its.layer for k, its in zip(used.numbers, used.layers, strict=True))
 
 
 @pytest.mark.parametrize("first", [0, 300, 770])
