@@ -47,12 +47,13 @@ def stretch(
     unlike  where they show different things; what they agree in holds them.
     """
     cover = on_cells(masks.host, cells, np.logical_or)
+    several = cover.sum(0) > 1
     changed = []
     for k, (layer, field) in enumerate(zip(layers, fields, strict=True)):
         its = whole & unlike & (owner == k)
         if not its.any():  # of many layers nearly all
             continue
-        inner = its & ~_held(k, owner, whole, cover, cells.wraps)
+        inner = its & ~_held(k, owner, whole, cover[k] & several, cells.wraps)
         if inner.any() and _stretch(device, layer, field, inner, grid, cells):
             changed.append(k)
     return changed
@@ -86,9 +87,8 @@ def _stretch(
     return True
 
 
-def _held(k: int, owner: npt.NDArray[np.intp], whole: Cells, cover: Cells, wraps: bool) -> Cells:
-    """Cells along cuts of layer k, in or beside what it and others show. cover: (layers, height, width)."""
-    both = cover[k] & (np.delete(cover, k, 0).any(0))
+def _held(k: int, owner: npt.NDArray[np.intp], whole: Cells, both: Cells, wraps: bool) -> Cells:
+    """Cells along cuts of layer k, in or beside what it and others show, `both`."""
     return grown(whole & (owner != k) & grown(both, 1, wraps), _HELD, wraps)
 
 
