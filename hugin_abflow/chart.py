@@ -16,7 +16,7 @@ import numpy.typing as npt
 from hugin_abflow.opencl import Device
 from hugin_abflow.projection import EQUIRECTANGULAR, Projection, directions
 from hugin_abflow.pyramid import Level
-from hugin_abflow.working import Grid, WorkingLayer
+from hugin_abflow.working import Grid, WorkingLayer, on_cells
 
 # Chart pixels around the overlap, so that flow is smooth across its border.
 _MARGIN = 16
@@ -202,9 +202,8 @@ def pair_chart(overlap: npt.NDArray[np.bool_], mask_grid: Grid, grid: Grid, coar
         found = _sphere(overlap, mask_grid, 1 / (coarse * grid.lonlat[1]))
     else:
         height, width = (max(1, round(n / coarse)) for n in grid.shape)
-        rows = np.arange(height) * mask_grid.height // height
-        columns = np.arange(width) * mask_grid.width // width
-        found = _plane(overlap[rows][:, columns], grid)
+        # all that it reaches into: a strip of a pixel may lie between those that are picked
+        found = _plane(on_cells(overlap[None], mask_grid.resized(width, height), np.logical_or)[0], grid)
         found = replace(found, projection=_plane_projection(found, grid))
     return replace(found, coarse=coarse)
 

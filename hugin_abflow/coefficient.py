@@ -10,7 +10,7 @@ import math
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import repeat
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -20,8 +20,6 @@ from hugin_abflow.working import Grid, Place, WorkingLayer
 
 # Distances are smooth: a mask grid of this many pixels is fine enough, and four times faster.
 _FINE_PIXELS = 600_000
-
-_Kind = TypeVar("_Kind", bound=np.generic)
 
 
 @dataclass(frozen=True)
@@ -59,21 +57,6 @@ class Overlaps(Sequence[npt.NDArray[np.bool_]]):
 
     def __getitem__(self, index: Any) -> Any:  # of numbers only
         return self._masks.overlap(*self._pairs[index])
-
-
-def on_cells(values: npt.NDArray[_Kind], cells: Grid, rule: np.ufunc) -> npt.NDArray[_Kind]:
-    """What any finer grid over the region of `cells` has, (n, height, width), per cell. Of masks
-    `np.logical_or` tells cells that they reach into, `np.logical_and` those that they cover whole.
-    """
-    values = _on_rows(values, cells.height, rule).transpose(0, 2, 1)
-    return np.ascontiguousarray(_on_rows(np.ascontiguousarray(values), cells.width, rule).transpose(0, 2, 1))
-
-
-def _on_rows(values: npt.NDArray[_Kind], count: int, rule: np.ufunc) -> npt.NDArray[_Kind]:
-    """(n, height, width) as (n, count, width). By whole rows: `reduceat` takes several times as long."""
-    starts = np.arange(count) * values.shape[1] // count
-    ends = np.maximum(np.append(starts[1:], values.shape[1]), starts + 1)
-    return np.stack([rule.reduce(values[:, a:b], 1) for a, b in zip(starts, ends, strict=True)], 1)
 
 
 def masks(device: Device, layers: Sequence[WorkingLayer], grid: Grid) -> Masks:

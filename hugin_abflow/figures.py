@@ -9,10 +9,9 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from hugin_abflow.coefficient import on_cells
 from hugin_abflow.consistency import EXCLUDED, WeightedFlow
 from hugin_abflow.geometry import Pair
-from hugin_abflow.working import Grid, WorkingLayer
+from hugin_abflow.working import Grid, WorkingLayer, on_cells
 
 _log = logging.getLogger(__name__)
 

@@ -15,9 +15,9 @@ import numpy.typing as npt
 import scipy
 
 from hugin_abflow.cells import averaged, grown, neighbours
-from hugin_abflow.coefficient import Masks, on_cells
+from hugin_abflow.coefficient import Masks
 from hugin_abflow.opencl import Buffer, Device
-from hugin_abflow.working import Grid, WorkingLayer
+from hugin_abflow.working import Grid, WorkingLayer, on_cells
 
 # Cells along a cut in which layers stay as flow has brought them together.
 _HELD = 2

@@ -13,7 +13,7 @@ import threading
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
-from typing import Any
+from typing import Any, TypeVar
 from zlib import crc32
 
 import cv2
@@ -53,6 +53,8 @@ PIXEL = {"uint8": ("uchar", 255.0), "uint16": ("ushort", 65535.0), "float32": ("
 _NARROWEST = 0.02
 
 Place = tuple[int, int, int, int]  # left, top, width, height on a grid
+
+_Kind = TypeVar("_Kind", bound=np.generic)
 
 
 @dataclass(frozen=True)
@@ -160,6 +162,21 @@ class Grid:
         lon, dlon, lat, dlat = self.lonlat
         lonlat = (lon, dlon * self.width / width, lat, dlat * self.height / height)
         return replace(self, width=width, height=height, lonlat=lonlat)
+
+
+def on_cells(values: npt.NDArray[_Kind], cells: Grid, rule: np.ufunc) -> npt.NDArray[_Kind]:
+    """What any finer grid over the region of `cells` has, (n, height, width), per cell. Of masks
+    `np.logical_or` tells cells that they reach into, `np.logical_and` those that they cover whole.
+    """
+    values = _on_rows(values, cells.height, rule).transpose(0, 2, 1)
+    return np.ascontiguousarray(_on_rows(np.ascontiguousarray(values), cells.width, rule).transpose(0, 2, 1))
+
+
+def _on_rows(values: npt.NDArray[_Kind], count: int, rule: np.ufunc) -> npt.NDArray[_Kind]:
+    """(n, height, width) as (n, count, width). By whole rows: `reduceat` takes several times as long."""
+    starts = np.arange(count) * values.shape[1] // count
+    ends = np.maximum(np.append(starts[1:], values.shape[1]), starts + 1)
+    return np.stack([rule.reduce(values[:, a:b], 1) for a, b in zip(starts, ends, strict=True)], 1)
 
 
 def connected(mask: npt.NDArray[np.bool_], wraps: bool) -> npt.NDArray[np.int32]:

@@ -30,14 +30,16 @@ __kernel void transition_texture(__global const float4 *layer, /* (box.w, box.z)
     if (column >= place.z || row >= place.w)
         return;
     const int4 its = cell_pixels(column + place.x, row + place.y, border, cells);
-    const int left = max(its.x - box.x, 1), right = min(its.z - box.x, box.z - 1);
+    const int rim = border.z && box.z == border.x ? 0 : 1; /* all round, the outermost columns are neighbours */
+    const int left = max(its.x - box.x, rim), right = min(its.z - box.x, box.z - rim);
     const int top = max(its.y - box.y, 1), bottom = min(its.w - box.y, box.w - 1);
     float steepest = 0.0f;
     for (int y = top; y < bottom; ++y)
         for (int x = left; x < right; ++x) {
             __global const float4 *p = layer + y * box.z + x;
-            const float4 a = p[-box.z - 1], b = p[-box.z], c = p[-box.z + 1], d = p[-1], f = p[1], g = p[box.z - 1],
-                         h = p[box.z], i = p[box.z + 1];
+            const int west = x > 0 ? -1 : box.z - 1, east = x + 1 < box.z ? 1 : 1 - box.z;
+            const float4 a = p[west - box.z], b = p[-box.z], c = p[east - box.z], d = p[west], f = p[east],
+                         g = p[west + box.z], h = p[box.z], i = p[east + box.z];
             if (a.w * b.w * c.w * d.w * f.w * g.w * h.w * i.w == 0.0f)
                 continue;
             const float3 across = 0.125f * (c + 2.0f * f + i - a - 2.0f * d - g).xyz;

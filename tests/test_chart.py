@@ -346,3 +346,18 @@ def test_margins_of_masks_keep_black_out(device: Device) -> None:
         pixels[..., 3] = mask
         images.append(chart.sample(device, on_device(device, pixels), grid, found).image.get())
     assert np.array_equal(*images)
+
+
+@pytest.mark.parametrize("wraps", [False, True])
+@pytest.mark.parametrize("across", [False, True])
+@pytest.mark.parametrize("place", [0, 41, 42, 100])
+def test_a_strip_of_a_pixel_has_a_chart(wraps: bool, across: bool, place: int) -> None:
+    """On charts of half the resolution as well, of an odd size: it lies within."""
+    grid = plane(101, 101, wraps=wraps)
+    overlap = np.zeros(grid.shape, bool)
+    overlap[(place, slice(None)) if across else (slice(None), place)] = True
+    for coarse in (1, 2):
+        found = pair_chart(overlap, grid, grid, coarse)
+        points = np.argwhere(overlap)[:, ::-1] + 0.5
+        x, y = found.positions(np.column_stack([points, np.zeros(len(points))])).T
+        assert (x >= 0).all() and (x <= found.width).all() and (y >= 0).all() and (y <= found.height).all()

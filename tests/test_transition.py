@@ -111,15 +111,18 @@ def test_flow_that_is_everywhere_the_same_has_no_strain(device: Device, name: st
 
 
 @pytest.mark.parametrize("name", list(GRIDS))
-def test_texture_equals_its_twin(device: Device, name: str) -> None:
+@pytest.mark.parametrize("whole", [False, True])
+def test_texture_equals_its_twin(device: Device, name: str, whole: bool) -> None:
+    """Also of a layer that goes all round, whose ends are beside each other."""
     grid = GRIDS[name]
-    cells, place, layer = cells_of(grid, 19, 11), (2, 1, 15, 9), random_layer(4, *BOX[2:], 0.8)
-    found = device.empty((place[3], place[2]))
+    cells = cells_of(grid, 19, 11)
+    box, place = (BOX, (2, 1, 15, 9)) if not whole else ((0, 0, *grid.border[:2]), (0, 0, *cells.border[:2]))
+    layer, found = random_layer(4, *box[2:], 0.8), device.empty((place[3], place[2]))
     device.run(
-        "transition", "transition_texture", place[2:], device.upload(layer), BOX, grid.border, cells.border,
+        "transition", "transition_texture", place[2:], device.upload(layer), box, grid.border, cells.border,
         place, found,
     )  # fmt: skip
-    expected = twin.transition_texture(layer, BOX, grid.border, cells.border, place)
+    expected = twin.transition_texture(layer, box, grid.border, cells.border, place)
     assert 0.2 < (expected > 0).mean() < 1
     assert_close(found.get(), expected, 10 * SUM)
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -381,3 +382,19 @@ def test_what_lies_beside_a_place_is_around_it(wraps: bool) -> None:
         mask[row, column] = True
         assert working.any_around(mask, (0, 32, 13, 8), grid, grid.coarser(4)) == seen
         assert not working.any_around(mask, (0, 0, 13, 20), grid, grid.coarser(4))
+
+
+@pytest.mark.parametrize("rule", [np.logical_or, np.logical_and, np.add])
+@pytest.mark.parametrize("shape", [(5, 7), (19, 31), (23, 5)])
+def test_cells_have_what_lies_in_them(rule: np.ufunc, shape: tuple[int, int]) -> None:
+    """Each finer row and column is of one cell; where there are fewer than cells, of several."""
+    values = np.random.default_rng(0).random((2, 19, 31)) < 0.9
+    values = values if rule is not np.add else values.astype(np.float64)
+    result = working.on_cells(values, plane(31, 23).resized(*shape[::-1]), rule)
+    rows, columns = (np.append(np.arange(n) * m // n, m) for n, m in zip(shape, (19, 31), strict=True))
+    expected = [
+        [rule.reduce(values[:, a : max(b, a + 1), c:d], (1, 2)) for c, d in pairwise(columns)]
+        for a, b in pairwise(rows)
+    ]
+    assert result.flags.c_contiguous
+    assert np.array_equal(result, np.moveaxis(expected, 2, 0))

@@ -28,10 +28,12 @@ def transition_texture(
     layer: Array, box: Sequence[int], border: Sequence[int], cells: Sequence[int], place: Sequence[int]
 ) -> Array:
     """The steepest slope, by Sobel's operator, of r, g or b in each cell of place (left, top, width, height),
-    where all pixels around are valid.
+    where all pixels around are valid; those of a layer that goes all round are beside each other at its ends.
     """
-    padded = np.pad(np.asarray(layer, np.float64), ((1, 1), (1, 1), (0, 0)))
     height, width = layer.shape[:2]
+    padded = np.pad(np.asarray(layer, np.float64), ((1, 1), (0, 0), (0, 0)))
+    all_round = border[2] and width == border[0]
+    padded = np.pad(padded, ((0, 0), (1, 1), (0, 0)), "wrap" if all_round else "constant")
     around = {
         (right, down): padded[1 + down : 1 + down + height, 1 + right : 1 + right + width]
         for down in (-1, 0, 1)
