@@ -171,10 +171,11 @@ def _find_regions(
     first       the correction that ignores none.
     """
     whole: Cells | None = None
+    known = [difference.known for difference in gains.measured.differences]
     for _ in range(_SEAM_ROUNDS):
         correction = (first if whole is None else gains.strict(whole)).result()
         scene.device.give_back()
-        residual = seam.residuals(scene, correction, single)
+        residual = seam.residuals(scene, correction, known, single)
         found = seam.regions(residual, scene.grid, aligned=settings.flow, single=single)
         grown = found if whole is None else found | whole
         if not grown.any() or (whole is not None and np.array_equal(grown, whole)):

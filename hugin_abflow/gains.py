@@ -72,6 +72,11 @@ class Difference:
     level: npt.NDArray[np.float64]
     cells: tuple[slice, slice] = (slice(None), slice(None))
 
+    @property
+    def known(self) -> bool:
+        """Whether more cells tell by how much exposures differ than have one layer clipped."""
+        return bool(np.count_nonzero(self.values[..., 3]) > np.count_nonzero(self.beyond[..., 3]))
+
 
 @dataclass(frozen=True)
 class Measured:

@@ -58,7 +58,7 @@ _DARKER = 0.05
 # What is clipped here and, by the exposures of both, darker there than what would just clip here by more than
 # this, of full scale, is something else for certain.
 _CERTAINLY_DARKER = 0.1
-# The same where layers are not aligned, whose exposures are not known well enough.
+# The same where their exposures are not known well enough.
 _NEVER = 1e6
 # What is left of a layer's weight where it yields: a pixel that no other layer can fill stays opaque.
 _TRACE = 1e-12
@@ -87,16 +87,23 @@ def room(grid: Grid, aligned: bool, layers: int, shared: float) -> int:
     return math.ceil(layers * cells.width * cells.height * (_CELL_BYTES + shared * _SHARED_BYTES))
 
 
-def residuals(scene: Scene, correction: Correction, single: Cells | None = None) -> Residuals:
+def residuals(
+    scene: Scene,
+    correction: Correction,
+    known: Sequence[bool] | None = None,
+    single: Cells | None = None,
+) -> Residuals:
     """What flow and exposure do not explain.
 
+    known       of each of `scene.pairs`, whether by how much their exposures differ is known; None: of none.
     single      cells that are to be taken from one layer in any case, whatever explains them.
     """
     cells = seam_grid(scene.grid)
     mean, square, smooth_square = (np.zeros(cells.shape) for _ in range(3))
     measured, unrelated = (np.zeros(cells.shape, bool) for _ in range(2))
     limits = [clipping(layer) for layer in scene.layers]
-    for its, found in _differences(scene, correction, cells, limits, _CERTAINLY_DARKER):
+    darker = [_CERTAINLY_DARKER if its else _NEVER for its in known] if known else None
+    for its, found in _differences(scene, correction, cells, limits, darker):
         smooth = comparison.smoothed(found, cells)
         other = ~comparison.in_another_light(found, smooth, cells)
         if single is not None:
@@ -309,17 +316,17 @@ def _differences(
     correction: Correction,
     cells: Grid,
     limits: Sequence[tuple[float, ...]] | None = None,
-    darker: float = _NEVER,
+    darker: Sequence[float] | None = None,
 ) -> Iterator[tuple[tuple[slice, slice], Comparison]]:
     """Of each two corrected layers, rows and columns of the cells that both may be in, and what is found
     of these, of the pixels that are not brighter than their layer's limits (r, g, b, 1), unless the other is
-    darker for certain by more than `darker`; None: of all.
+    darker for certain by more than `darker`, one for each of `scene.pairs`; None: of all.
     """
     device, layers, fields, grid = scene.device, scene.layers, scene.fields, scene.grid
     limits = [(math.inf,) * 4] * len(layers) if limits is None else limits
     no_gain = device.zeros((*correction.grid.shape, 4))
 
-    def start(pair: Pair) -> tuple[Box, Buffer, Buffer, Buffer]:
+    def start(pair: Pair, darker: float) -> tuple[Box, Buffer, Buffer, Buffer]:
         part = shared_cells(layers[pair.a], layers[pair.b], grid, cells)
         difference = device.empty((part.height, part.width, 4))
         square = device.empty((part.height, part.width))
@@ -343,10 +350,11 @@ def _differences(
 
     if not scene.pairs:
         return
-    started = start(scene.pairs[0])
-    for pair in scene.pairs[1:]:
+    first, *others = zip(scene.pairs, darker or [_NEVER] * len(scene.pairs), strict=True)
+    started = start(*first)
+    for pair in others:
         found = fetch(*started)
-        started = start(pair)  # the device goes on while the caller looks at what is found
+        started = start(*pair)  # the device goes on while the caller looks at what is found
         device.flush()
         yield found
     yield fetch(*started)

@@ -8,6 +8,7 @@ from grids import plane
 from pictures import masked, merged, one_device
 from test_seam_panoramas import CANVASES, DISC, RADIUS, distance, fields_of, halves, off, prepared, wall
 
+from hugin_abflow.gains import Difference
 from hugin_abflow.layer import Canvas
 from hugin_abflow.opencl import Device
 
@@ -38,6 +39,16 @@ def test_what_is_clipped_tells_where_the_other_is_darker_for_certain(
             (0, 0, 1, 1), 1.0, (0.98,) * 4, (0.98,) * 4, 0.1, out, square, texture,
         )  # fmt: skip
         assert (out.get()[0, 0, 3] > 0) == tells
+
+
+@pytest.mark.parametrize("clips", [0.3, 0.7])
+def test_exposures_are_known_where_most_cells_tell(clips: float) -> None:
+    """Where one layer is white nearly all over nobody knows how much lighter it is."""
+    values, beyond = np.zeros((2, 10, 10, 4))
+    white = np.arange(100).reshape(10, 10) < 100 * clips
+    values[~white, 3], beyond[white, 3] = 1, -1
+    none = np.zeros((10, 10))
+    assert Difference(0, 1, values, beyond, none, none).known == (clips < 0.5)
 
 
 def test_what_is_clipped_in_one_layer_changes_over_as_ever(device: Device) -> None:

@@ -17,6 +17,7 @@ from hugin_abflow.geometry import Pair
 from hugin_abflow.opencl import Device
 from hugin_abflow.regions import Residuals
 from hugin_abflow.scene import Scene
+from hugin_abflow.working import on_cells
 
 COLUMNS, ROWS = 12, 8
 SIDE, STEP = 72, 48  # px of layers
@@ -49,7 +50,7 @@ def test_cuts_take_no_more_memory_than_is_reckoned(device: Device, aligned: bool
     cells = seam.seam_grid(its.grid)
     correction = Correction(its.grid.resized(4, 4), 1.0, (None,) * len(its.layers))
     room = seam.room(its.grid, aligned, len(its.layers), its.masks.shared)
-    whole = coefficient.on_cells(its.masks.host, cells, np.logical_or).sum(0) > 1
+    whole = on_cells(its.masks.host, cells, np.logical_or).sum(0) > 1
     residual = Residuals(*np.random.default_rng(2).random((2, *cells.shape)))
     tracemalloc.start()
     try:
