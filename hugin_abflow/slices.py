@@ -35,15 +35,23 @@ class Band:
 
 def coarse_rows(box: Place, part: Box, scale: float) -> Span:
     """Rows of a coarse grid in `box` that a band reads, at least one; scale: band rows per coarse row."""
-    _, top, _, height = box
     start, end = _read(part, scale)
-    first = min(max(start, top), top + height - 1)
-    return first, min(max(end, first + 1), top + height)
+    first, last = _within(np.array([box]), start, end)
+    return int(first[0]), int(last[0])
 
 
 def _read(part: Box, scale: float) -> Span:
     """Rows of a coarse grid, and beyond it, that a band reads between."""
     return math.floor(part.top / scale) - 1, math.ceil(part.bottom / scale) + 2
+
+
+def _within(boxes: npt.NDArray[np.int_], start: int, end: int) -> tuple[npt.NDArray[np.int_], ...]:
+    """Of rows from `start` up to `end` those of each of some boxes (n, 4), at least one: the first, and that
+    after the last.
+    """
+    top, height = boxes[:, 1], boxes[:, 3]
+    first = np.minimum(np.maximum(start, top), top + height - 1)
+    return first, np.minimum(np.maximum(end, first + 1), top + height)
 
 
 class Slices:
@@ -74,9 +82,8 @@ class Slices:
         read, where they begin, -1 where there is no array, and three zeros: (arrays, 8).
         """
         places = self._places(band)
-        for k in np.flatnonzero(
-            places[:, 3]
-        ).tolist():  # of 300 layers few: each copy takes as long as a small kernel
+        read = np.flatnonzero(places[:, 3])  # of 300 layers few: each copy takes as long as a small kernel
+        for k in read.tolist():
             array, (_, first, width, height, start) = self._arrays[k], places[k, :5].tolist()
             if array is not None:
                 self.values.copy(start, array[1], (first - array[0][1]) * width, height * width)
@@ -85,8 +92,7 @@ class Slices:
     def _places(self, band: Band) -> npt.NDArray[np.int32]:
         left, top, width, height = self._boxes.T
         start, end = _read(band.part, self._scale)
-        first = np.minimum(np.maximum(start, top), top + height - 1)
-        last = np.minimum(np.maximum(end, first + 1), top + height)
+        first, last = _within(self._boxes, start, end)
         # of a layer that is sampled beside its array the nearest row is read
         read = band.samples | (self._everywhere & (top < end) & (top + height > start))
         rows = np.where(read & self._there, last - first, 0)

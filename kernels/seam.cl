@@ -1,8 +1,8 @@
 /* Where one layer is taken whole. */
 
-/* Whether a sample a tells how much it differs from b though it may be clipped: b is by more than `darker`
-   darker than what has that brightness in its layer, by a gain, theirs less b's, on the exposure scale. What both would show of a grey tells by
-   how much exposures differ: towards white some cameras' curves level off, and bring them closer. */
+/* Whether a sample a tells how much it differs from b though it may be clipped: b is darker, by more than `darker`,
+   than what just clips in a would be in b's layer. gain: a's less b's, on the exposure scale; by how much exposures differ
+   what both would show of a grey tells: towards white some cameras' curves level off, and bring them closer. */
 static inline int seam_tells(float3 a, float3 clipped, float3 b, float3 gain, float shoulder, float darker) {
     const float3 ratio = 2.0f * exposure_shift((float3)(0.5f), gain, shoulder);
     const float3 darkest = LEAST(ratio, (float3)(1.0f)) * clipped - darker;
@@ -10,9 +10,9 @@ static inline int seam_tells(float3 a, float3 clipped, float3 b, float3 gain, fl
 }
 
 /* Mean difference a - b of two aligned, corrected layers over the pixels of a cell (every second one in x and y)
-   that both show, where neither clips, or the other is darker for certain, the share of these, the mean square of the channel that differs most, and what tells of
-   their textures, means of the channels: the variance of what each shows; and of the means of blocks of up to four
-   such pixels, in which noise is less, the variances and their covariance. */
+   that both show, where neither clips or the other is darker for certain, the share of these, the mean square of the
+   channel that differs most, and what tells of their textures, means of the channels: the variance of what each shows;
+   and of the means of blocks of up to four such pixels, in which noise is less, the variances and their covariance. */
 __kernel void seam_difference(__global const float4 *layer_a, __global const float4 *field_a, int4 box_a,
                               __global const float4 *gain_a, /* (colours.y, colours.x) */
                               __global const float4 *layer_b, __global const float4 *field_b, int4 box_b,
