@@ -219,13 +219,13 @@ def _alone(
     def price(labels: Labels) -> float:
         return _energy(graph, labels)
 
-    def seen(labels: Labels) -> float:
+    def shown(labels: Labels) -> float:
         return price(labels) - unseen(labels)
 
     cuts = graph.cut[labels[graph.first] != labels[graph.second]]
     alone = [np.where(one, k, labels) for k, one in enumerate(graph.possible) if one.mean() > _MOSTLY]
     is_cut = cuts.sum() > faint * cuts.size
-    clean = [one for one in alone if is_cut and seen(one) <= _CLEAN * seen(labels)]
+    clean = [one for one in alone if is_cut and shown(one) <= _CLEAN * shown(labels)]
     cheap = [one for one in alone if price(one) <= factor * price(labels)]
     return min(clean or cheap, key=price, default=labels)
 

@@ -58,7 +58,7 @@ _DARKER = 0.05
 # What is clipped here and, by the exposures of both, darker there than what would just clip here by more than
 # this, of full scale, is something else for certain.
 _CERTAINLY_DARKER = 0.1
-# The same where their exposures are not known well enough.
+# More than anything is: where their exposures are not known well enough.
 _NEVER = 1e6
 # What is left of a layer's weight where it yields: a pixel that no other layer can fill stays opaque.
 _TRACE = 1e-12
@@ -102,8 +102,7 @@ def residuals(
     mean, square, smooth_square = (np.zeros(cells.shape) for _ in range(3))
     measured, unrelated = (np.zeros(cells.shape, bool) for _ in range(2))
     limits = [clipping(layer) for layer in scene.layers]
-    darker = [_CERTAINLY_DARKER if its else _NEVER for its in known] if known else None
-    for its, found in _differences(scene, correction, cells, limits, darker):
+    for its, found in _differences(scene, correction, cells, limits, known):
         smooth = comparison.smoothed(found, cells)
         other = ~comparison.in_another_light(found, smooth, cells)
         if single is not None:
@@ -316,17 +315,18 @@ def _differences(
     correction: Correction,
     cells: Grid,
     limits: Sequence[tuple[float, ...]] | None = None,
-    darker: Sequence[float] | None = None,
+    known: Sequence[bool] | None = None,
 ) -> Iterator[tuple[tuple[slice, slice], Comparison]]:
     """Of each two corrected layers, rows and columns of the cells that both may be in, and what is found
-    of these, of the pixels that are not brighter than their layer's limits (r, g, b, 1), unless the other is
-    darker for certain by more than `darker`, one for each of `scene.pairs`; None: of all.
+    of these, of the pixels that are not brighter than their layer's limits (r, g, b, 1), or where the other
+    is certainly darker, if their exposures are `known` (of each of `scene.pairs`; None: of none). No limits:
+    of all.
     """
     device, layers, fields, grid = scene.device, scene.layers, scene.fields, scene.grid
     limits = [(math.inf,) * 4] * len(layers) if limits is None else limits
     no_gain = device.zeros((*correction.grid.shape, 4))
 
-    def start(pair: Pair, darker: float) -> tuple[Box, Buffer, Buffer, Buffer]:
+    def start(pair: Pair, known: bool) -> tuple[Box, Buffer, Buffer, Buffer]:
         part = shared_cells(layers[pair.a], layers[pair.b], grid, cells)
         difference = device.empty((part.height, part.width, 4))
         square = device.empty((part.height, part.width))
@@ -337,7 +337,7 @@ def _differences(
         device.run(
             "seam", "seam_difference", (part.width, part.height), *sides, grid.border, grid.lonlat,
             correction.grid.border, cells.border, part.place, correction.shoulder, limits[pair.a],
-            limits[pair.b], darker, difference, square, texture,
+            limits[pair.b], _CERTAINLY_DARKER if known else _NEVER, difference, square, texture,
         )  # fmt: skip
         return part, difference, square, texture
 
@@ -350,7 +350,7 @@ def _differences(
 
     if not scene.pairs:
         return
-    first, *others = zip(scene.pairs, darker or [_NEVER] * len(scene.pairs), strict=True)
+    first, *others = zip(scene.pairs, known or [False] * len(scene.pairs), strict=True)
     started = start(*first)
     for pair in others:
         found = fetch(*started)

@@ -22,9 +22,7 @@ def test_what_is_clipped_tells_where_the_other_is_darker_for_certain(
 ) -> None:
     """A layer with half the light shows half of white, or more, where the other one just clips."""
     grid, box = plane(16, 16), (0, 0, 16, 16)
-    gain = (
-        np.log(light) if light == 1 else np.log(light / (2 - light)) if light < 1 else 2.0
-    )  # odds of half of it
+    gain = np.log(light / (2 - light)) if light < 2 else 2.0  # of a grey's odds
     for turned in (1, -1):
         sides: list = []
         for value, raised in ((1.0, 0.0), (other, -gain))[::turned]:
