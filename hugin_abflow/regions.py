@@ -17,6 +17,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 import numpy.typing as npt
@@ -60,6 +61,9 @@ _MOSTLY = 0.5
 # favour of the softmax, which grows with the area, is no reason to cut. A car across the middle of an overlap
 # was cut in two.
 _CLEAN = 1 / 3
+# How bare a cut may be, in cells times full scale, before another one is looked for: by how much the residual
+# of low frequencies is more than _STRONG along it. No texture hides where white stone ends before dark glass.
+_BARE = 1.0
 
 Cells = npt.NDArray[np.bool_]  # (height, width) on the seam grid
 Prices = npt.NDArray[np.float64]  # (layers, height, width) on the seam grid
@@ -103,6 +107,8 @@ class Choice:
     whole_factor    (height, width): how many times as much as a cut it may cost to take a region from one
                     layer, the largest of its cells; None: it is cut wherever that is cheapest.
     clipping    h e_k: what each layer costs in a cell besides, for what it clips; None: nothing.
+    otherwise   the choice by which a region is cut whose cut would be bare by this one, if that is much less
+                so; None: there is none.
     """
 
     whole: Cells
@@ -114,6 +120,7 @@ class Choice:
     whole_factor: npt.NDArray[np.float64] | None = None
     clipping: Prices | None = None
     cut_share: float = 0.0
+    otherwise: Choice | None = None
 
     def owners(self, unwanted: Prices | None = None) -> tuple[npt.NDArray[np.intp], float]:
         """The layer of each cell, (height, width): in the regions the one it is taken from, elsewhere the one
@@ -149,14 +156,21 @@ class Choice:
         One layer is taken, as far as it goes, if that costs no more than `whole_factor` allows: somebody may
         stand there twice, and a cut between his two places, or where these overlap, is as cheap as one beside
         him. So it is, whatever the softmax favours, if a cut is seen much better.
+
+        A cut is short, and where the softmax favours neither layer. Where it would be bare, that of
+        `otherwise` is taken if it is much less so.
         """
         candidates = np.flatnonzero(self.cover[:, rows, columns].any(1))
         if candidates.size < 2:
             return np.full(rows.size, candidates[0] if candidates.size else 0), 0.0
-        plain = wanted = self._graph(rows, columns, candidates)
-        if unwanted is not None:
-            wanted = replace(plain, price=plain.price + unwanted[candidates][:, rows, columns])
+        more = None if unwanted is None else unwanted[candidates][:, rows, columns]
+        plain = self._graph(rows, columns, candidates)
+        wanted = _dearer(plain, more)
         labels = least(wanted)
+        bare = partial(_bareness, plain, self.residual.mean[rows, columns])
+        if self.otherwise is not None and bare(labels) > _BARE:
+            other = least(_dearer(self.otherwise._graph(rows, columns, candidates), more))
+            labels = other if bare(other) <= _CLEAN * bare(labels) else labels
         if self.whole_factor is not None:
 
             def unseen(labels: Labels) -> float:
@@ -203,6 +217,18 @@ class Choice:
         first, second = np.concatenate(links, 1)
         cuts = cut_price * (rough[first] + rough[second]) / 2
         return Graph(rows, columns, price, present, first, second, cuts)
+
+
+def _dearer(graph: Graph, more: Prices | None) -> Graph:
+    """With what labels cost besides, (labels, nodes); None: nothing."""
+    return graph if more is None else replace(graph, price=graph.price + more)
+
+
+def _bareness(graph: Graph, mean: npt.NDArray[np.float64], labels: Labels) -> float:
+    """How bare the cuts of a labelling are, see `_BARE`. mean: r of each node."""
+    cut = labels[graph.first] != labels[graph.second]
+    along = (mean[graph.first[cut]] + mean[graph.second[cut]]) / 2
+    return float(np.maximum(along - _STRONG, 0).sum())
 
 
 def _alone(

@@ -43,6 +43,10 @@ _FINE_CELL = 4
 _CUT = 10.0
 # The same of large regions, as a share of their size.
 _CUT_SHARE = 0.25
+# How many times as dear cuts are, by the residual itself, where short ones would be bare: then what the
+# softmax favours says little. White stone ended before dark glass in a cut of 14 cells; one of 40 goes from
+# stone to stone.
+_LONG = 4
 # _CUT without flow, where the softmax has little to say: overlaps are some hundred cells wide, and the cut
 # that is seen least may lie anywhere in them.
 _FINE_CUT = 400.0
@@ -66,6 +70,8 @@ _TRACE = 1e-12
 # a graph of prices with what finds the least of them.
 _CELL_BYTES = 8 + 2
 _SHARED_BYTES = 16
+# The same of prices for another cut, and of where layers are.
+_OTHER_BYTES = 8 + 1
 # How many times as much as a cut it may cost to take a region from one layer that has most of it, which shows
 # things once and whole.
 _WHOLE_FACTOR = 1.65
@@ -84,7 +90,8 @@ def room(grid: Grid, aligned: bool, layers: int, shared: float) -> int:
     grid        the working grid. layers: how many. shared: the share of the grid that several of them cover.
     """
     cells = grid.coarser(_CELL if aligned else _FINE_CELL)
-    return math.ceil(layers * cells.width * cells.height * (_CELL_BYTES + shared * _SHARED_BYTES))
+    several = _SHARED_BYTES + (_OTHER_BYTES if aligned else 0)
+    return math.ceil(layers * cells.width * cells.height * (_CELL_BYTES + shared * several))
 
 
 def residuals(
@@ -173,10 +180,10 @@ def cut(
     factor = np.full(whole.shape, _WHOLE_FACTOR)
     if single is not None:
         factor = np.where(single, _SINGLE_FACTOR, _WHOLE_FACTOR)
-    choice = replace(
-        _choice(scene, seen(residual), whole, cells, _shown(scene, cells), _CUT),
-        cut_share=_CUT_SHARE, whole_factor=factor, clipping=clipping_price,
-    )  # fmt: skip
+    plain = _choice(scene, residual, whole, cells, _shown(scene, cells), _CUT)
+    plain = replace(plain, cut_share=_CUT_SHARE, whole_factor=factor, clipping=clipping_price)
+    long = replace(plain, cut_price=_LONG * _CUT, cut_share=_LONG * _CUT_SHARE)
+    choice = replace(plain, residual=seen(plain.residual), otherwise=long)
     owner, gone = choose(choice) if choose else (choice.owners()[0], Gone())
 
     def yields(k: int) -> npt.NDArray[np.float32]:
