@@ -70,9 +70,9 @@ def report(
     whole       where one layer was taken, on the grid `cells`; None: nowhere.
     """
     for number, pair in enumerate(pairs):
-        names = layers[pair.a].layer.name, layers[pair.b].layer.name
+        a, b = layers[pair.a].layer, layers[pair.b].layer
         one_layer = share(overlaps[number], cells, whole) if parallaxes else 1.0
-        found: dict[str, object] = {"layers": list(names), "one_layer": round(one_layer, 4)}
+        found: dict[str, object] = {"layers": [a.name, b.name], "one_layer": round(one_layer, 4)}
         said = f"{one_layer:.0%} from one layer"
         if parallaxes:
             shift = parallaxes[number]
@@ -82,4 +82,4 @@ def report(
                 f"parallax {shift.median:.1f} px, up to {shift.largest:.1f} px; "
                 f"{shift.consistent:.0%} consistent; {said}"
             )
-        _log.info("overlap of %s and %s: %s", *names, said, extra={"overlap": found})
+        _log.info("overlap of %s and %s: %s", a.called, b.called, said, extra={"overlap": found})

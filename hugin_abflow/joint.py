@@ -271,7 +271,7 @@ def _loading_ahead(device: Device, first: Layer, settings: Settings) -> Iterator
 
 def _redundant(index: int, layers: Sequence[WorkingLayer], masks: Masks) -> bool:
     """A layer wholly inside another has no area of its own; equal ones share."""
-    own, name = masks.host[index], layers[index].layer.name
+    own, name = masks.host[index], layers[index].layer.called
     some = own[::_SAMPLED, ::_SAMPLED]  # of 300 layers nearly all can be told apart by them
     for other, mask in enumerate(masks.host):
         if other == index or (some & ~mask[::_SAMPLED, ::_SAMPLED]).any():
@@ -281,7 +281,7 @@ def _redundant(index: int, layers: Sequence[WorkingLayer], masks: Masks) -> bool
                 _unused_log.warning(
                     "%s is not used: it lies wholly inside %s, so nothing is its own; where it shall show, "
                     "mask the other photos in Hugin",
-                    name, layers[other].layer.name,
+                    name, layers[other].layer.called,
                 )  # fmt: skip
             else:
                 _unused_log.info("%s is not used: it shows nothing, or next to nothing", name)

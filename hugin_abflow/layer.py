@@ -135,6 +135,7 @@ class Layer:
     has_alpha   False for a file without alpha: every pixel is valid.
     strip       rows that `read` decodes together, from row 0 on: it is fastest asked for whole ones.
     compressed  True for a file that is: to read rows again is to decode them again.
+    photo       the name of the photo, if the file was made of it for this run alone.
     """
 
     name: str
@@ -148,6 +149,12 @@ class Layer:
     has_alpha: bool = True
     strip: int = 1
     compressed: bool = False
+    photo: str | None = None
+
+    @property
+    def called(self) -> str:
+        """What messages call it."""
+        return self.photo or self.name
 
     def rows(self, top: int, bottom: int) -> npt.NDArray[Any]:
         """What `read` gives, which is not trusted: kernels would read beyond it. Raises `ImageReadError`."""

@@ -237,7 +237,8 @@ def _report(canvas: Canvas, projection: str, layers: Sequence[Layer], writer: Im
     kind = {1: "grey", 3: "RGB"}[layers[0].channels]
     _log.info("layers: %d, %s, %s", len(layers), kind, layers[0].dtype)
     for layer in layers:
-        name, box = layer.file.with_name(layer.name) if layer.file else layer.name, layer.box
+        file, box = layer.file, layer.box
+        name = layer.photo or (file.with_name(layer.name) if file else layer.name)
         _log.info("  %s: %d x %d at (%d, %d)", name, box.width, box.height, box.left, box.top)
     _log.info("output: %s, %s, %s, %s", writer.path, writer.format, writer.compression, writer.stored)
 

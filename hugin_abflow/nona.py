@@ -106,7 +106,9 @@ def open_layers(
         opened = [layer for file in files for layer in read_layers(file)]
         names = {image.index: image.name for image in plan.images}
         photos = {str(file): names[index] for index, file in _made(plan, folder).items()}
-        called = [photos.get(str(layer.file), str(layer.file)) for layer in opened]  # what was made will go
+        # what was made will go: messages name the photo
+        opened = [replace(one, photo=photos.get(str(one.file))) for one in opened]
+        called = [one.photo or str(one.file) for one in opened]
         try:
             check_layers(plan.canvas, opened, called)
         except LayersMismatchError as error:

@@ -156,7 +156,7 @@ def _relay(
     for a, b in sorted(mended | known_by_others):
         _log.info(
             "flow of %s and %s: by way of other layers, which %s",
-            solver.layers[a].layer.name, solver.layers[b].layer.name,
+            solver.layers[a].layer.called, solver.layers[b].layer.called,
             "show what they share" if (a, b) in known_by_others else "contradict it or know more",
         )  # fmt: skip
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -89,7 +90,7 @@ def test_layer_inside_another_takes_no_part(exposure, caplog):
     canvas = CANVASES["plane"]
     layers = with_parallax(canvas)
     without = merged(layers, canvas, exposure=exposure)
-    inner = Layer.from_array("patch", noise(41, 57), 31, 47)
+    inner = replace(Layer.from_array("inner", noise(41, 57), 31, 47), photo="patch")
     with caplog.at_level(logging.WARNING, "hugin_abflow"):
         result = merged([inner, *layers], canvas, exposure=exposure)
     np.testing.assert_array_equal(result, without)

@@ -61,6 +61,16 @@ KINDS = {
 }
 
 
+def test_layers_that_will_go_are_called_as_their_photos(make_project, nona):
+    """Nobody finds a layer that was made for the run."""
+    plan = read_plan(make_project())
+    with open_layers(plan) as layers:
+        assert [layer.called for layer in layers] == [image.name for image in plan.images]
+    remap(plan, str(plan.folder / plan.stem))
+    with open_layers(plan) as layers:
+        assert [layer.called for layer in layers] == names_of(layers)
+
+
 @pytest.mark.parametrize("kind", KINDS)
 def test_layers_are_what_nona_makes(make_project, nona, kind):
     """Depth, channels, position, canvas, colours: as tifffile sees nona's own files, run by hand."""
