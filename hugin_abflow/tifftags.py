@@ -25,7 +25,8 @@ FULL_WIDTH, FULL_HEIGHT = 33300, 33301
 MAIN, EXIF, GPS = 0, 34665, 34853  # directories, by the tag in the main one that points to them
 ASCII, SHORT, LONG, RATIONAL, UNDEFINED = 2, 3, 4, 5, 7  # TIFF types
 # Software, DateTime, Artist, XMP, Photoshop's own, EXIF: editors and exiftool write some of these, nona none.
-_EDITORS = frozenset({305, 306, 315, 700, 34377, EXIF})
+# FillOrder, WhitePoint, PrimaryChromaticities: ImageMagick writes nothing else that nona does not.
+_EDITORS = frozenset({266, 305, 306, 315, 318, 319, 700, 34377, EXIF})
 _NUMBERS = {3: "H", 4: "I", 5: "II", 9: "i", 10: "ii", 11: "f", 12: "d", 16: "Q"}  # TIFF type -> struct
 _RATIONALS = (5, 10)
 _IFD8 = 18

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import struct
 from contextlib import suppress
 from pathlib import Path
 
@@ -17,7 +18,7 @@ from hugin_abflow.found import candidates, layers_by_prefix
 from hugin_abflow.merge import refuse_input
 from hugin_abflow.nona import open_layers
 from hugin_abflow.project import Plan, file_key, read_plan
-from hugin_abflow.tifftags import ASCII, EXIF, MAIN, UNDEFINED, Value, add_directories, is_edited
+from hugin_abflow.tifftags import ASCII, EXIF, MAIN, RATIONAL, UNDEFINED, Value, add_directories, is_edited
 
 pytestmark = pytest.mark.usefixtures("temporary")
 
@@ -213,6 +214,8 @@ def test_what_nona_writes_was_not_edited(edited, tmp_path):
     assert [is_edited(file) for file in files] == [False, True, False]
     add_directories(files[0], {EXIF: {36864: Value(UNDEFINED, b"0230")}})
     assert is_edited(files[0])
+    add_directories(files[2], {MAIN: {318: Value(RATIONAL, struct.pack("<4I", 3127, 10000, 3290, 10000))}})
+    assert is_edited(files[2])  # by ImageMagick
     for data in (b"", b"II*\0", b"no TIFF at all"):
         (tmp_path / "x").write_bytes(data)
         assert not is_edited(tmp_path / "x")
