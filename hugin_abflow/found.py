@@ -99,7 +99,12 @@ def _find_under(plan: Plan, prefix: str) -> Found | None:
     photos = {file_key(photo) for photo in plan.photos}  # may be named alike: img0000.tif of img.pto
     for ending in endings:
         paths = {image.index: layer_path(prefix, image.index, ending) for image in plan.images}
-        files = {i: path for i, path in paths.items() if is_file(path) and file_key(path) not in photos}
+        there = {index: path for index, path in paths.items() if is_file(path)}
+        files = {
+            index: path
+            for index, path in there.items()
+            if file_key(path) not in photos and not _is_another(plan, path.with_suffix(".pto"))
+        }
         if files:
             return Found(prefix, files)
     for ending in (".tif", ".tiff"):
@@ -107,6 +112,13 @@ def _find_under(plan: Plan, prefix: str) -> Found | None:
         if file_key(pages) not in photos and _is_multilayer(pages):
             return Found(prefix, {}, pages)
     return None
+
+
+def _is_another(plan: Plan, project: Path) -> bool:
+    """Whether a file is there, and another project than the plan's: what it gives its name to is its own, its
+    layers and its panorama, which may be called as a layer of this one: pano0000.tif.
+    """
+    return project.is_file() and not project.samefile(plan.file)
 
 
 def _is_multilayer(path: Path) -> bool:
@@ -119,9 +131,8 @@ def _is_multilayer(path: Path) -> bool:
 
 def candidates(plan: Plan) -> list[Found]:
     """Layers under the project's stem and under Hugin's default prefix, in this order."""
-    other = plan.folder / f"{plan.hugin_prefix}.pto"  # layers of its name are its own
-    shared = not other.is_file() or other.samefile(plan.file)
-    stems = [plan.stem, plan.hugin_prefix] if shared else [plan.stem]
+    taken = _is_another(plan, plan.folder / f"{plan.hugin_prefix}.pto")
+    stems = [plan.stem] if taken else [plan.stem, plan.hugin_prefix]
     names = [plan.layer_prefix(name) for name in stems]
     names += stems if plan.hdr else []
     found = [layers for name in names if (layers := _find_under(plan, str(plan.folder / name)))]
@@ -164,7 +175,7 @@ def layers_by_prefix(plan: Plan, prefix: str | Path) -> Found:
                     "no layer of image %d (%s) under %s: it is left out", image.index, image.name, prefix
                 )
             return found
-    _refuse_photos(plan, prefix)
+    _refuse_others(plan, prefix)
     first = layer_name(prefix, plan.images[0].index, ".tif")
     raise LayersMissingError(
         f"no layer {first} (nor .exr, nor of another active image) here or in {plan.folder}; "
@@ -172,13 +183,15 @@ def layers_by_prefix(plan: Plan, prefix: str | Path) -> Found:
     )
 
 
-def _refuse_photos(plan: Plan, prefix: str) -> None:
-    """Raise `LayersMissingError` where files of such names are there after all: then they are photos."""
+def _refuse_others(plan: Plan, prefix: str) -> None:
+    """Raise `LayersMissingError` where files of such names are there after all: then they are no layers."""
     names = itertools.product(_places(plan, prefix), (image.index for image in plan.images), _ENDINGS)
-    if photo := next(filter(is_file, itertools.starmap(layer_path, names)), None):
+    if file := next(filter(is_file, itertools.starmap(layer_path, names)), None):
+        other = file.with_suffix(".pto")
+        another = f"is named after {other.name}, another project"
+        what = another if _is_another(plan, other) else "is a photo of the project"
         raise LayersMissingError(
-            f"{photo} is a photo of the project, and no layer; check --prefix, or leave it out to have nona "
-            "make the layers"
+            f"{file} {what}, and no layer; check --prefix, or leave it out to have nona make the layers"
         )
 
 

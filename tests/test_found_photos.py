@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shutil
 import struct
 from contextlib import suppress
 from pathlib import Path
@@ -15,7 +16,8 @@ from layer_files import write_layer
 
 from hugin_abflow.errors import LayersMismatchError, LayersMissingError, OutputError
 from hugin_abflow.found import candidates, layers_by_prefix
-from hugin_abflow.merge import refuse_input
+from hugin_abflow.images import write_image
+from hugin_abflow.merge import default_target, refuse_input
 from hugin_abflow.nona import open_layers
 from hugin_abflow.project import Plan, file_key, read_plan
 from hugin_abflow.tifftags import ASCII, EXIF, MAIN, RATIONAL, UNDEFINED, Value, add_directories, is_edited
@@ -57,6 +59,25 @@ def test_a_prefix_that_photos_have_is_told(developed, tmp_path, monkeypatch, pre
         (developed.parent / f"pano{index:04d}.tif").unlink()
     with pytest.raises(LayersMissingError, match=r"no layer .*pano0000\.tif"):
         layers_by_prefix(read_plan(developed), prefix)
+
+
+@pytest.mark.parametrize("ending", [".tif", ".exr"])
+def test_what_is_named_after_another_project_is_no_layer(make_project, caplog, ending):
+    """Its panorama, pano0000.tif, has alpha and the canvas's size: nothing else tells it from a layer."""
+    plan = read_plan(make_project())
+    pixels = np.full((401, 802, 4), 255, np.uint8 if ending == ".tif" else np.float32)
+    files = [plan.folder / f"pano000{index}{ending}" for index in (0, 1)]
+    for file in files:
+        write_image(file, pixels)
+    shutil.copy2(plan.file, plan.folder / "pano0000.pto")
+    [found] = candidates(plan)
+    assert found.in_order() == files[1:] and to_make(plan) == ("pano", [0, 2])
+    assert layers_by_prefix(plan, "pano").in_order() == files[1:]
+    assert "no layer of image 0 (photo 0.tif) under pano" in caplog.text
+    files[1].unlink()
+    assert candidates(plan) == [] and default_target(plan) == plan.folder / "pano.tif"
+    with pytest.raises(LayersMissingError, match=r"pano0000\.\w+ is named after pano0000\.pto, another proj"):
+        layers_by_prefix(plan, "pano")
 
 
 def test_a_photo_of_pages_is_no_file_of_layers(developed):
