@@ -84,7 +84,7 @@ class Prepared:
     full        the canvas's grid at full resolution; grid, gain_grid, offset_grid: those of the layers'
                 fields, gains and offsets.
     shoulder    of the exposure scale (colour.py).
-    unit        of floats, the value that counts as full scale of what they are coded as (unit.py).
+    light_unit  of floats, the value that counts as full scale of what they are coded as (unit.py).
     unlike      where layers show different things, by which offsets were made; None: nowhere.
     """
 
@@ -94,7 +94,7 @@ class Prepared:
     gain_grid: Grid
     offset_grid: Grid
     shoulder: float
-    unit: float = 1.0
+    light_unit: float = 1.0
     unlike: Unlike | None = None
 
 
@@ -220,7 +220,7 @@ def _bands(
                 "blend", "blend_band", groups, store.rows, touched, used.size, fields.values, gains.values,
                 offsets.values, longitudes, latitudes, full.border, full.lonlat, grid.border,
                 prepared.gain_grid.border, prepared.offset_grid.border, (part.left, part.top, *size),
-                (region.left, region.top), prepared.shoulder, math.sqrt(prepared.unit),
+                (region.left, region.top), prepared.shoulder, math.sqrt(prepared.light_unit),
                 int(settings.interpolation == "nearest"), share, marks, marks.shape[-1], out, options=options,
             )  # fmt: skip
             yield _stored(out.get(), first.dtype)

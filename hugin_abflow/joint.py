@@ -125,7 +125,7 @@ def prepare(
     full = working.full_grid(canvas, layers)
     grid = working.working_grid(full, settings)
     reduced = reading.read(device, layers, grid, progress, settings)
-    full_scale = unit.code_floats(device, reduced)
+    light_unit = unit.code_floats(device, reduced)
     used, unused = _parted(device, reduced, layers, grid)
     flows, parallaxes, singles = _flow(device, used, full, grid, guides, settings, progress, abreast)
     with progress("align", 1) as advance:
@@ -140,7 +140,7 @@ def prepare(
         advance(1)
     gains = aligned.correction
     return Prepared(
-        tuple(final), full, grid, gains.grid, offsets.grid, gains.shoulder, full_scale, aligned.unlike
+        tuple(final), full, grid, gains.grid, offsets.grid, gains.shoulder, light_unit, aligned.unlike
     )
 
 

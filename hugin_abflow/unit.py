@@ -26,18 +26,24 @@ _MIDDLE = 0.18
 def code_floats(device: Device, layers: Sequence[WorkingLayer]) -> float:
     """Code the pixels of float layers, in place, and leave those of integers.
 
-    Returns the value of the layers' light that counts as full scale then.
+    Returns the light unit: the value of the layers' light that counts as full scale then; without floats 1.
     """
     floats = [one for one in layers if one.layer.dtype.kind == "f"]
-    full = _full_scale([one.pixels.get()[::_EVERY, ::_EVERY].copy() for one in floats])  # the rest is freed
+    light_unit = _light_unit([one.pixels.get()[::_EVERY, ::_EVERY].copy() for one in floats])  # rest is freed
     for one in floats:
-        size = one.box[2:]
-        device.run("unit", "unit_code", size, one.pixels, size, 1 / math.sqrt(full))
-    return full
+        code(device, one, light_unit)
+    return light_unit
 
 
-def _full_scale(picked: Sequence[np.ndarray]) -> float:
-    """What counts as full scale. picked: some of each layer's pixels, float32 (height, width, 4)."""
+def code(device: Device, layer: WorkingLayer, light_unit: float) -> None:
+    """Code the pixels of one, in place, if it is of floats, by a unit that is known."""
+    if layer.layer.dtype.kind == "f":
+        size = layer.box[2:]
+        device.run("unit", "unit_code", size, layer.pixels, size, 1 / math.sqrt(light_unit))
+
+
+def _light_unit(picked: Sequence[np.ndarray]) -> float:
+    """Of floats alike. picked: some of each layer's pixels, float32 (height, width, 4)."""
     brightest = [one[..., :3].max(-1)[one[..., 3] > 0] for one in picked]
     values = np.concatenate(brightest) if brightest else np.zeros(0, np.float32)
     values = values[(values > 0) & np.isfinite(values)]

@@ -45,10 +45,10 @@ def test_coded_as_by_the_twin(device: Device) -> None:
     for one in pixels:
         one[..., 3] = one[..., 3] > 0
     coded = [working(device, one) for one in pixels]
-    full = unit.code_floats(device, coded)
-    assert 0 < full < 1
+    light_unit = unit.code_floats(device, coded)
+    assert 0 < light_unit < 1
     for one, before in zip(coded, pixels, strict=True):
-        np.testing.assert_allclose(one.pixels.get(), unit_code(before, full**-0.5), rtol=1e-5)
+        np.testing.assert_allclose(one.pixels.get(), unit_code(before, light_unit**-0.5), rtol=1e-5)
     picked = [one.pixels.get()[::8, ::8] for one in coded]
     seen = np.concatenate([one[..., :3].max(-1)[one[..., 3] > 0] for one in picked])
     assert np.median(seen[seen > 0]) ** 2 == pytest.approx(0.18, rel=1e-5)
@@ -66,7 +66,7 @@ def test_integers_stay(device: Device) -> None:
 def test_what_shows_nothing_has_no_unit(values: list[float]) -> None:
     picked = np.zeros((1, len(values), 4), np.float32)
     picked[0, :, :3], picked[..., 3] = np.array(values)[:, None], 1
-    assert unit._full_scale([picked]) == 1
+    assert unit._light_unit([picked]) == 1
 
 
 def test_light_beyond_what_floats_hold_is_none(device: Device) -> None:

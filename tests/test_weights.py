@@ -50,11 +50,17 @@ def test_masks_are_the_weights(layers: list[str]) -> None:
     assert np.abs(total - 65535).max() <= 1
 
 
-def test_masks_that_were_saved_give_the_same_picture(layers: list[str]) -> None:
+@pytest.mark.parametrize("light", [False, True])
+def test_masks_that_were_saved_give_the_same_picture(layers: list[str], light: bool) -> None:
+    """Of floats, too, which are coded where all is seen from afar, and whose exposures differ."""
+    for file, left, exposure in zip(layers * light, (0, 80), (1.0, 0.8), strict=False):
+        pixels = tifffile.imread(file).astype(np.float32) / 255
+        pixels[..., :3] *= exposure
+        write_layer(Path(file), pixels, left, 0, (WIDTH, HEIGHT))
     assert run("--save-masks=m%n.tif", *layers) == 0
-    first = tifffile.imread("out.tif").astype(int)
+    first = tifffile.imread("out.tif").astype(float)
     assert run("--load-masks=m%n.tif", *layers) == 0
-    assert np.abs(tifffile.imread("out.tif") - first).max() <= 1
+    assert np.abs(tifffile.imread("out.tif") - first).max() <= (1 / 255 if light else 1)
 
 
 def test_a_layer_that_takes_no_part_gets_no_weight(

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from hugin_abflow import joint, multiband, working
+from hugin_abflow import joint, multiband, unit, working
 from hugin_abflow.blend import BlendLayer, Prepared
 from hugin_abflow.colour import Correction
 from hugin_abflow.errors import CommandLineError, LayersMismatchError, LayersMissingError
@@ -189,6 +189,8 @@ def _offset(device: Device, prepared: Prepared) -> Prepared:
         working.reduce_layer(device, one.layer, prepared.grid, lambda units: None, checked=False)
         for one in blended
     ]
+    for one in reduced:
+        unit.code(device, one, prepared.light_unit)  # as those are that gains were measured with
     gains = Correction(prepared.gain_grid, prepared.shoulder, tuple(one.gain for one in blended))
     fields = [one.field for one in blended]
     offsets = multiband.offsets(device, reduced, fields, gains, prepared.grid, prepared.unlike)
