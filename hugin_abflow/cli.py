@@ -328,7 +328,7 @@ def command(projects: tuple[Path, ...], **given: Any) -> ExitCode:
     if len(found) > 1:
         for file, values in chosen.values():
             for_several(values, f"there are {len(found)}", file)
-        refuse_same_output({project: its["prefix"] for project, its in keywords.items()})
+        refuse_same_output(keywords)
     remember = resume or force or len(found) > 1 or any(map(is_folder, projects))
     tasks = [Task(project, its, remember and not force, remember) for project, its in keywords.items()]
     if given["dry_run"]:

@@ -136,7 +136,7 @@ class SettingsError(AbflowError):
 
 
 class SameOutputError(AbflowError):
-    """Two projects of a run would write the same panorama, or two options name the same file."""
+    """Two projects of a run would write the same file, or two options name one."""
 
     exit_code = ExitCode.USAGE
 

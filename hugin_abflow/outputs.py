@@ -61,6 +61,12 @@ _NEEDS = {
 }
 # What follows the project's name in those of panoramas, before the ending.
 _PANORAMAS = {Kind.FUSED_LAYERS: "_blended_fused", Kind.FUSED_STACKS: "_fused", Kind.HDR: "_hdr"}
+# The same of those of which there are several, numbered from 0, and the ending.
+_NUMBERED = {
+    Kind.EXPOSURE_LAYERS: "_exposure_{:04d}.tif",
+    Kind.STACKS: "_stack_ldr_{:04d}.tif",
+    Kind.HDR_STACKS: "_stack_hdr_{:04d}.exr",
+}
 # Which outputs are made of layers of one kind; and which of them are the layers themselves.
 _CORRECTED = frozenset({Kind.PANORAMA, Kind.LAYERS})
 _UNCORRECTED = frozenset(
@@ -145,7 +151,7 @@ class Branch:
         groups = exposure_layers(self.plan, images)
         wanted = Kind.EXPOSURE_LAYERS in self.kinds
         steps = [
-            self._step(BLEND, f"_exposure_{number:04d}.tif", [[image] for image in group], wanted)
+            self._step(BLEND, self._numbered(Kind.EXPOSURE_LAYERS, number), group, wanted)
             for number, group in enumerate(groups)
         ]
         if Kind.FUSED_LAYERS in self.kinds:
@@ -156,30 +162,39 @@ class Branch:
         """Photos of one view are fused or merged, then these stacks blended."""
         if not self.kinds & {stacked, blended}:
             return []
-        name = "_stack_hdr_{:04d}.exr" if self.plan.hdr else "_stack_ldr_{:04d}.tif"
         steps = [
-            self._step(program, name.format(number), [[image] for image in group], stacked in self.kinds)
+            self._step(program, self._numbered(stacked, number), group, stacked in self.kinds)
             for number, group in enumerate(stacks(self.plan, images))
         ]
         if blended in self.kinds:
             steps.append(self._gather(BLEND, blended, steps))
         return steps
 
-    def _step(self, program: str, suffix: str, images: Sequence[Sequence[int]], wanted: bool) -> Step:
+    def _step(self, program: str, result: str, images: Sequence[int], wanted: bool) -> Step:
         """A step that takes layers."""
-        inputs = tuple(self.layer(image) for group in images for image in group)
-        return Step(
-            program,
-            self._options(program, final=False),
-            f"{self.plan.stem}{suffix}",
-            inputs,
-            tuple(tuple(group) for group in images),
-            wanted,
-        )
+        inputs = tuple(map(self.layer, images))
+        options = self._options(program, final=False)
+        return Step(program, options, result, inputs, tuple((image,) for image in images), wanted)
+
+    def _numbered(self, kind: Kind, number: int) -> str:
+        """The name of one of several outputs of a kind."""
+        return f"{self.plan.stem}{_NUMBERED[kind].format(number)}"
 
     def panorama(self, kind: Kind) -> str:
         """The name of a panorama that is made of several files."""
         return f"{self.plan.stem}{_PANORAMAS[kind]}{self.plan.output.ending}"
+
+    def results(self, keep_layers: bool) -> list[str]:
+        """Names of what may be made, but for that of exposure-corrected layers; keep_layers: these as well.
+
+        How many there are of several is not known before layers are made: one of each photo, at most.
+        """
+        several = sorted(self.kinds & _NUMBERED.keys())
+        names = [self.panorama(kind) for kind in sorted(self.kinds & _PANORAMAS.keys())]
+        for number, image in enumerate(self.plan.images):
+            names += [self.layer(image.index)] if keep_layers or self.keeps_layers else []
+            names += [self._numbered(kind, number) for kind in several]
+        return names
 
     def _gather(self, program: str, kind: Kind, steps: Sequence[Step]) -> Step:
         """A step that makes a panorama of the results of others."""
@@ -252,13 +267,15 @@ def branches(plan: Plan, kinds: Sequence[Kind]) -> list[Branch]:
     return found
 
 
-def panoramas(plan: Plan) -> list[Path]:
-    """The panoramas that are checked, whether or not they can be made here; not the layers and stacks."""
+def results(plan: Plan, keep_layers: bool) -> list[Path]:
+    """Files that may be made for a project, whether or not they can be made here: what is checked, and its
+    layers, if these are kept.
+    """
     found = []
     for branch in branches(plan, checked_outputs(plan)):
         if Kind.PANORAMA in branch.kinds:
             found.append(plan.default_output())
-        found += [plan.folder / branch.panorama(kind) for kind in branch.kinds if kind in _PANORAMAS]
+        found += [plan.folder / name for name in branch.results(keep_layers)]
     return found
 
 

@@ -79,19 +79,57 @@ def test_hidden_files_fit_a_pattern_that_names_them(shoot: Path) -> None:
     ]
 
 
+def chosen(prefix: str | None = None, keep_layers: bool = False) -> dict[str, Any]:
+    return {"prefix": prefix, "keep_layers": keep_layers}
+
+
+def refuse(*projects: Path) -> None:
+    refuse_same_output({project: chosen() for project in projects})
+
+
 def test_two_projects_with_one_panorama_are_refused(shoot: Path) -> None:
     """Also where it is the fused panorama of one, and the ordinary one of the other."""
     one, two, fused = (write_project(shoot / "new" / name) for name in ("n.pto", "n.PTO", "n_fused.pto"))
-    refuse_same_output({one: None, fused: None, shoot / "gone.pto": None, shoot / "b.pto": None})
+    refuse(one, fused, shoot / "gone.pto", shoot / "b.pto")
     with pytest.raises(SameOutputError, match=r"n\.pto and .*n\.PTO would both write .*n\.tif; .* -o"):
-        refuse_same_output({one: None, fused: None, two: None})
+        refuse(one, fused, two)
     assert cli.main([str(shoot / "new")]) == ExitCode.USAGE and not (shoot / "new" / "n.tif").exists()
     two.write_text(two.read_text().replace("ImageType tif", "ImageType jpg"))
-    refuse_same_output({one: None, two: None})
+    refuse(one, two)
     one.write_text(one.read_text() + "#hugin_outputLDRExposureBlended true\n")
     with pytest.raises(SameOutputError, match=r"n_fused\.tif"):
-        refuse_same_output({one: None, fused: None})
-    refuse_same_output({one: "layer", fused: None})
+        refuse(one, fused)
+    refuse_same_output({one: chosen(prefix="layer"), fused: chosen()})
+
+
+@pytest.mark.parametrize(
+    ("kind", "other"),
+    [
+        ("LDRLayers", "n0001.pto"),
+        ("LDRExposureRemapped", "n_exposure_layers_0000.pto"),
+        ("LDRExposureLayers", "n_exposure_0001.pto"),
+        ("LDRStacks", "n_stack_ldr_0000.pto"),
+        ("HDRLayers", "n_hdr_0001.pto"),
+        ("HDRStacks", "n_stack_hdr_0001.pto"),
+    ],
+)
+def test_outputs_that_are_no_panoramas_are_not_replaced_by_some(shoot: Path, kind: str, other: str) -> None:
+    one, two = write_project(shoot / "new" / "n.pto"), write_project(shoot / "new" / other)
+    if "HDR" in kind:
+        two.write_text(two.read_text().replace("ImageType tif", "ImageType exr"))
+    refuse(one, two)
+    one.write_text(f"{one.read_text()}#hugin_output{kind} true\n")
+    with pytest.raises(SameOutputError, match=f"would both write .*{two.stem}[.]"):
+        refuse(one, two)
+
+
+def test_kept_layers_are_not_replaced_by_panoramas(shoot: Path) -> None:
+    one, two = write_project(shoot / "new" / "n.pto"), write_project(shoot / "new" / "n0001.pto")
+    refuse_same_output({one: chosen(), two: chosen(keep_layers=True)})
+    with pytest.raises(SameOutputError, match=r"n0001\.tif"):
+        refuse_same_output({one: chosen(keep_layers=True), two: chosen()})
+    refuse_same_output({one: chosen(prefix="n", keep_layers=True), two: chosen()})
+    assert cli.main(["--keep-layers", "-q", str(one), str(two)]) == ExitCode.USAGE
 
 
 def test_folder_that_cannot_be_listed_is_told(

@@ -8,9 +8,10 @@ import os
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import suppress
 from pathlib import Path
+from typing import Any
 
 from hugin_abflow.errors import ProjectError, SameOutputError
-from hugin_abflow.outputs import panoramas
+from hugin_abflow.outputs import results
 from hugin_abflow.project import read_plan
 from hugin_abflow.scratch import is_file, is_folder, is_special
 from hugin_abflow.terminal import label, say
@@ -41,16 +42,19 @@ def _key(file: Path) -> str:
     return os.path.normcase(file.parent.resolve() / file.name)
 
 
-def refuse_same_output(projects: Mapping[Path, str | None]) -> None:
-    """Raise `SameOutputError` for projects that would write the same panorama.
+def refuse_same_output(projects: Mapping[Path, Mapping[str, Any]]) -> None:
+    """Raise `SameOutputError` for projects that would write the same file, by the names that files have where
+    no layers are there yet.
 
-    projects    with the prefix of their layers, if that is named: then the ordinary panorama alone is made.
+    projects    with the keywords of `stitch.stitch_project`; where a prefix is named, the ordinary panorama
+                alone is made.
     """
     writers: dict[str, Path] = {}
-    for project, prefix in projects.items():
+    for project, its in projects.items():
         with suppress(ProjectError, OSError):  # it will fail by itself
             plan = read_plan(project)
-            for output in [plan.default_output()] if prefix else panoramas(plan):
+            alone = [plan.default_output()] if its["prefix"] else None
+            for output in alone or results(plan, its["keep_layers"]):
                 other = writers.setdefault(_key(output), project)
                 if other != project:
                     remedy = "rename one, or stitch it alone with -o"
