@@ -1,9 +1,11 @@
-"""The commands: to load what they need takes a while, in which Ctrl-C may come."""
+"""The commands: to load what they need takes a while, in which Ctrl-C or SIGTERM may come."""
 
 import gc
 import os
 import sys
 from importlib import import_module
+
+from hugin_abflow.signals import interruptible
 
 
 def main() -> int:
@@ -26,7 +28,8 @@ def _run(program: str, module: str) -> int:
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     gc.disable()  # what is loaded stays: there is nothing to be found, now or later
     try:
-        command = import_module(module).main
+        with interruptible():
+            command = import_module(module).main
     except KeyboardInterrupt:
         print(f"{program}: interrupted", file=sys.stderr)
         return 130  # ExitCode.INTERRUPTED

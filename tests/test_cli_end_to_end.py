@@ -306,11 +306,13 @@ def test_verbose_says_what_is_merged(folder: Path, capsys: pytest.CaptureFixture
     assert lines[len(expected) + 1] == "read ..."
 
 
+@pytest.mark.parametrize("terminated", [False] if os.name == "nt" else [False, True])
 @pytest.mark.parametrize(("function", "program"), [("main", "hugin-abflow"), ("enblend", "abflow-enblend")])
 def test_interruption_while_modules_load_is_no_traceback(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, function: str, program: str
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, function: str, program: str, terminated: bool
 ) -> None:
-    stub = "import os; assert os.environ['OPENBLAS_NUM_THREADS'] == '1'; raise KeyboardInterrupt"
+    stub = "import os, signal; assert os.environ['OPENBLAS_NUM_THREADS'] == '1'; "
+    stub += "signal.raise_signal(signal.SIGTERM)" if terminated else "raise KeyboardInterrupt"
     (tmp_path / "numpy.py").write_text(stub)
     monkeypatch.delenv("OPENBLAS_NUM_THREADS", raising=False)
     command = [sys.executable, "-c", f"from hugin_abflow import __main__; exit(__main__.{function}())"]
