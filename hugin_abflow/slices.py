@@ -35,17 +35,17 @@ class Band:
 
 def coarse_rows(box: Place, part: Box, scale: float) -> Span:
     """Rows of a coarse grid in `box` that a band reads, at least one; scale: band rows per coarse row."""
-    start, end = _read(part, scale)
-    first, last = _within(np.array([box]), start, end)
+    start, end = _read_span(part, scale)
+    first, last = _clipped_spans(np.array([box]), start, end)
     return int(first[0]), int(last[0])
 
 
-def _read(part: Box, scale: float) -> Span:
+def _read_span(part: Box, scale: float) -> Span:
     """Rows of a coarse grid, and beyond it, that a band reads between."""
     return math.floor(part.top / scale) - 1, math.ceil(part.bottom / scale) + 2
 
 
-def _within(boxes: npt.NDArray[np.int_], start: int, end: int) -> tuple[npt.NDArray[np.int_], ...]:
+def _clipped_spans(boxes: npt.NDArray[np.int_], start: int, end: int) -> tuple[npt.NDArray[np.int_], ...]:
     """Of rows from `start` up to `end` those of each of some boxes (n, 4), at least one: the first, and that
     after the last.
     """
@@ -91,8 +91,8 @@ class Slices:
 
     def _places(self, band: Band) -> npt.NDArray[np.int32]:
         left, top, width, height = self._boxes.T
-        start, end = _read(band.part, self._scale)
-        first, last = _within(self._boxes, start, end)
+        start, end = _read_span(band.part, self._scale)
+        first, last = _clipped_spans(self._boxes, start, end)
         # of a layer that is sampled beside its array the nearest row is read
         read = band.samples | (self._everywhere & (top < end) & (top + height > start))
         rows = np.where(read & self._there, last - first, 0)

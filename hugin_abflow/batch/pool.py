@@ -141,7 +141,7 @@ class Pool:
         self,
         kind: type[BaseException] | None,
         error: BaseException | None,
-        trace: TracebackType | None,
+        traceback: TracebackType | None,
     ) -> None:
         for worker in self._workers:
             if kind is None:

@@ -26,7 +26,7 @@ from hugin_abflow.settings import Settings
 _WHITE = np.uint16(65535)
 # What is left of a weight that a mask takes away, far below a step of 16 bits: a pixel that no other layer
 # can fill stays opaque, and one that another's sample just reaches, from outside, is this layer's, as it was.
-_TRACE = 1e-7
+_LEAST_WEIGHT = 1e-7
 
 
 @dataclass(frozen=True)
@@ -176,7 +176,7 @@ def _weighted(device: Device, layer: BlendLayer, mask: Layer, prepared: Prepared
     reduced = working.reduce_layer(device, whole, prepared.grid, lambda units: None)
     left, top, width, height = layer.box
     weights = reduced.pixels.get()[top : top + height, left : left + width, 0]
-    field[..., 3] = np.maximum(weights, _TRACE)
+    field[..., 3] = np.maximum(weights, _LEAST_WEIGHT)
     return replace(layer, field=device.upload(field))
 
 
