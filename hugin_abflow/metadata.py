@@ -13,7 +13,7 @@ from hugin_abflow.exif import Metadata, comment, comment_of, read_exif, text, te
 from hugin_abflow.layer import Canvas
 from hugin_abflow.project import Plan
 from hugin_abflow.scratch import is_file
-from hugin_abflow.tifftags import EXIF, GPS, LONG, MAIN, RATIONAL, SHORT, UNDEFINED, Value
+from hugin_abflow.tifftags import EXIF, GPS, LONG, MAIN, RATIONAL, SHORT, UNDEFINED, Directories, Value
 
 PROGRAM = "hugin-abflow"
 
@@ -110,8 +110,19 @@ def is_photo(path: Path) -> bool:
     or else it names Hugin.
     """
     found = read_exif(path) if is_file(path) else {}
-    made_by = text_of(found.get(MAIN, {}).get(_SOFTWARE, text("")))
-    return _EXPOSURE_TIME in found.get(EXIF, {}) and "hugin" not in made_by.lower()
+    return _EXPOSURE_TIME in found.get(EXIF, {}) and "hugin" not in _software(found).lower()
+
+
+def saved_by(path: Path) -> str:
+    """The program that EXIF says has saved an image, if that is neither ours nor Hugin's; else nothing. Those
+    that Hugin calls, such as enblend, name none.
+    """
+    software = _software(read_exif(path) if is_file(path) else {})
+    return "" if "hugin" in software.lower() else software
+
+
+def _software(found: Directories) -> str:
+    return text_of(found.get(MAIN, {}).get(_SOFTWARE, text("")))
 
 
 def summary(plan: Plan) -> list[str]:

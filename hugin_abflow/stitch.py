@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import os
 import shlex
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from itertools import groupby
 from pathlib import Path
+from typing import Any
 
 from hugin_abflow.errors import LayersMismatchError, ProgramMissingError
 from hugin_abflow.exif import embed
@@ -42,11 +43,13 @@ from hugin_abflow.pano_trafo import images_of
 from hugin_abflow.programs import move_whole, run
 from hugin_abflow.progress import Progress, silent
 from hugin_abflow.project import Output, Plan, read_plan
-from hugin_abflow.scratch import work_folder
+from hugin_abflow.scratch import is_file, work_folder
 from hugin_abflow.settings import Settings
 
 # In commands of a script: what stands before files in its temporary folder. No argument can hold it.
 _TEMPORARY = "\0"
+# Outputs of one file each, whose names are known before there are layers.
+_PANORAMAS = (Kind.PANORAMA, Kind.FUSED_LAYERS, Kind.FUSED_STACKS, Kind.HDR)
 
 
 def stitch_project(
@@ -64,12 +67,14 @@ def stitch_project(
     progress: Progress = silent,
     open_device: OpenDevice | None = None,
     finished: Callable[[Path], None] = lambda file: None,
+    leave: Collection[Path] = (),
 ) -> list[Path]:
     """Make all outputs that are checked in Hugin for a project; returns their files, beside it.
 
     With `output`, `prefix` or `layers`: the one panorama of `merge.merge_project`, whose arguments these are.
 
     finished        is told each file when it is complete, so that it is known where a later one fails.
+    leave           outputs that are checked, but not to be made: what is there stays as it is.
 
     Outputs whose programs are not installed are left out, with a warning. Each file appears when it is
     complete; one that fails ends the run, and what was made before stays. Raises the `AbflowError` family,
@@ -89,7 +94,7 @@ def stitch_project(
     if output or prefix or layers:
         finish(one(remap=remap, keep_layers=keep_layers))
         return made
-    for branch in _branches(read_plan(path)):
+    for branch in _branches(read_plan(path), leave):
         if Kind.LAYERS in branch.kinds:
             with open_layers(branch.plan, remap=remap, keep_layers=True, progress=progress) as opened:
                 finish(*_files(opened))
@@ -100,8 +105,9 @@ def stitch_project(
         if branch.plan.hdr or branch.plan.ignore_exposure:
             stored = _stored(branch.plan, compression, jpeg_quality)
             maker = _Maker(
-                replace(branch, plan=stored), settings or Settings(), metadata, progress, open_device, finish
-            )
+                replace(branch, plan=stored), settings or Settings(), metadata, progress, open_device, finish,
+                leave,
+            )  # fmt: skip
             maker.make(remap, keep_layers)
     return made
 
@@ -119,6 +125,7 @@ def show_project(
     jpeg_quality: int | None = None,
     metadata: bool = True,
     options: Sequence[str] = (),
+    leave: Collection[Path] = (),
 ) -> list[str]:
     """What `stitch_project` would do, as lines of a shell script: a comment on the plan, then the commands.
 
@@ -132,46 +139,108 @@ def show_project(
     """
     plan = read_plan(path)
     name = no_option(plan.file.name)
+    script = partial(_script, plan, leave)
     stored = _storing(compression if output else storable(plan, compression), jpeg_quality)
     if output or prefix or layers:
-        if output:
-            target = str(Path(output).absolute())
-        else:
-            target = no_option(default_target(plan, layers_there(plan, prefix, layers, remap)).name)
+        (final,) = asked_panoramas(plan, output=output, prefix=prefix, layers=layers, remap=remap)
+        target = str(final) if output else no_option(final.name)
         merging = [BLEND, *options, *stored, "-o", target, name]
         if prefix:
-            return _script(plan, [[*merging, "--prefix", _from_anywhere(plan, prefix)]])
+            return script([final], [[*merging, "--prefix", _from_anywhere(plan, prefix)]])
         if layers:
-            return _script(plan, [[*merging, "--layers", *(str(Path(one).absolute()) for one in layers)]])
-        return _script(plan, _merging(merging, *_remapping(plan, remap, keep_layers)[:2]))
+            return script([final], [[*merging, "--layers", *(str(Path(one).absolute()) for one in layers)]])
+        return script([final], _merging(merging, *_remapping(plan, remap, keep_layers)[:2]))
     commands: list[Sequence[str]] = []
-    for branch in _branches(plan):
+    results: list[Path] = []
+    for branch in _branches(plan, leave):
         commands += [["#", WORDS[kind]] for kind in Kind if kind in branch.kinds]
         keep = keep_layers or branch.keeps_layers
         remapped, found, files = _remapping(branch.plan, _remap(branch.plan, remap), keep)
         if Kind.PANORAMA in branch.kinds:
-            target = no_option(default_target(plan).name)
+            results.append(default_target(plan))
+            target = no_option(results[-1].name)
             remapped = _merging([BLEND, *options, *stored, "-o", target, name], remapped, found)
         commands += remapped
         asked = _stored(branch.plan, compression, jpeg_quality)
         differs = _differing(asked.output, plan.output)
         names = {branch.layer(index): file for index, file in files.items()}
-        for step in replace(branch, plan=asked).steps([image.index for image in plan.images]):
+        for step in _steps(replace(branch, plan=asked), [image.index for image in plan.images], leave):
             if step.wanted:
-                refuse_input(plan.folder / step.result, [plan.file, *plan.photos])
+                results.append(plan.folder / step.result)
+                refuse_input(results[-1], [plan.file, *plan.photos])
             names[step.result] = step.result if step.wanted else _TEMPORARY + step.result
             inputs = tuple(names.get(file, file) for file in step.inputs)
             placed = replace(step, result=names[step.result], inputs=inputs)
             commands.append(placed.command(name, [*options, *(differs if step.final else [])]))
-    return _script(plan, commands)
+    return script(results, commands)
 
 
-def _script(plan: Plan, commands: Sequence[Sequence[str]]) -> list[str]:
-    """Commands as lines of a shell script, which ends at the first error; one "#" is a comment."""
+def asked_panoramas(
+    plan: Plan,
+    *,
+    output: Path | str | None = None,
+    prefix: str | Path | None = None,
+    layers: Sequence[str | Path] | None = None,
+    remap: Remap = "auto",
+    **others: object,
+) -> list[Path]:
+    """The panoramas that `stitch_project` is to make with these arguments, not the layers and stacks, whether
+    or not that can be done here.
+    """
+    if output:
+        return [Path(output).absolute()]
+    if prefix or layers:
+        return [default_target(plan, layers_there(plan, prefix, layers, remap))]
+    found = branches(plan, checked_outputs(plan))
+    return [_panorama(branch, kind) for branch in found for kind in _PANORAMAS if kind in branch.kinds]
+
+
+def is_more_asked(plan: Plan, options: Mapping[str, Any], leave: Collection[Path]) -> bool:
+    """Whether `stitch_project` would make anything but what is to be left; options: its keywords."""
+    if any(options.get(name) for name in ("output", "prefix", "layers")):
+        return not set(asked_panoramas(plan, **options)) <= set(leave)
+    kinds = checked_outputs(plan)
+    lacking = impossible(kinds)
+    return bool(_without(branches(plan, [kind for kind in kinds if kind not in lacking]), leave))
+
+
+def _panorama(branch: Branch, kind: Kind) -> Path:
+    """The file of a panorama that nobody names."""
+    if kind is Kind.PANORAMA:
+        return default_target(branch.plan)
+    return branch.plan.folder / branch.panorama(kind)
+
+
+def _without(found: Sequence[Branch], leave: Collection[Path]) -> list[Branch]:
+    """What has still to be made of branches if files are left."""
+    left = [{one for one in _PANORAMAS if one in b.kinds and _panorama(b, one) in leave} for b in found]
+    rest = [replace(branch, kinds=branch.kinds - its) for branch, its in zip(found, left, strict=True)]
+    return [branch for branch in rest if branch.kinds]
+
+
+def _steps(branch: Branch, images: Sequence[int], leave: Collection[Path]) -> list[Step]:
+    """The steps of a branch. A stack that is left is made all the same where a panorama is made of it, but in
+    a temporary folder: the one that is there may be of other photos.
+    """
+    steps = branch.steps(images)
+    folder = branch.plan.folder
+    placed = [replace(step, wanted=step.wanted and folder / step.result not in leave) for step in steps]
+    needed = {name for step in placed for name in step.inputs}
+    return [step for step in placed if step.wanted or step.result in needed]
+
+
+def _script(
+    plan: Plan, leave: Collection[Path], results: Sequence[Path], commands: Sequence[Sequence[str]]
+) -> list[str]:
+    """Commands as lines of a shell script, which ends at the first error; one "#" is a comment. So is what
+    becomes of files that are there: of `results`, which are made, and of those that are left.
+    """
     crop, canvas = plan.canvas.crop, plan.canvas
     head = [
         f"# {plan.file.name}: {len(plan.images)} photos, {plan.projection}, "
         f"{crop.width} x {crop.height} of {canvas.width} x {canvas.height}",
+        *(f"# {file.name} is there, and replaced" for file in results if is_file(file)),
+        *(f"# {file.name} is left as it is (--force: made anew)" for file in leave),
         "set -e",
         shlex.join(["cd", str(plan.folder)]),
     ]
@@ -224,13 +293,13 @@ def _from_anywhere(plan: Plan, prefix: str | Path) -> str:
     return here if layers_there(plan, here, None, "auto") else no_option(str(prefix))
 
 
-def _branches(plan: Plan) -> list[Branch]:
-    """What can be made of what is checked; says what cannot."""
+def _branches(plan: Plan, leave: Collection[Path]) -> list[Branch]:
+    """What can be made of what is checked, and is not to be left; says what cannot."""
     possible = possible_outputs(plan)
     if not possible:
         reason = next(iter(impossible(checked_outputs(plan)).values()))
         raise ProgramMissingError(f"{plan.file}: nothing can be made: {reason}")
-    return branches(plan, possible)
+    return _without(branches(plan, possible), leave)
 
 
 def _remap(plan: Plan, remap: Remap) -> Remap:
@@ -295,10 +364,11 @@ class _Maker:
         progress: Progress,
         open_device: OpenDevice | None,
         finish: Callable[..., None],
+        leave: Collection[Path],
     ) -> None:
         self.branch, self.plan, self.settings = branch, branch.plan, settings
         self.metadata = describe(branch.plan) if metadata else None
-        self.progress, self.open_device, self.finish = progress, open_device, finish
+        self.progress, self.open_device, self.finish, self.leave = progress, open_device, finish, leave
 
     def make(self, remap: Remap, keep_layers: bool) -> None:
         """Make the layers, if need be, then all that is made of them; `finish` is told the outputs."""
@@ -313,14 +383,15 @@ class _Maker:
             files = dict(zip(names, _files(opened), strict=True))
             if self.branch.keeps_layers:
                 self.finish(*_files(opened))
-            for program, steps in groupby(self.branch.steps(images), key=lambda step: step.program):
+            todo = _steps(self.branch, images, self.leave)
+            for program, steps in groupby(todo, key=lambda step: step.program):
                 if program == BLEND:
                     for step in steps:
                         files[step.result] = self._blend(step, files, scratch)
                     continue
-                todo = list(steps)
-                with self.progress(program, len(todo)) as advance:
-                    for step in todo:
+                alike = list(steps)
+                with self.progress(program, len(alike)) as advance:
+                    for step in alike:
                         files[step.result] = self._run(step, files, scratch)
                         advance(1)
 

@@ -56,6 +56,7 @@ def test_defaults_are_those_of_settings(calls: Calls) -> None:
     assert path == Path("a.pto")
     assert keywords.pop("settings") == Settings()
     assert callable(keywords.pop("progress")) and callable(keywords.pop("open_device"))
+    assert keywords.pop("leave") == []
     assert keywords == {
         "output": None,
         "prefix": None,

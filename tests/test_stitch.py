@@ -406,12 +406,12 @@ def test_dry_run_has_nona_make_what_is_missing_and_no_more(make_project: Project
     before = project.with_name("pano0000.tif").stat()
     alone = shlex.split(show_project(project)[-1])
     assert alone == ["hugin-abflow", "-o", "pano.tif", "pano.pto", "--remap", "auto"]
-    remapping, ours = (shlex.split(line) for line in show_project(project, keep_layers=True)[4:])
+    remapping, ours = (shlex.split(line) for line in show_project(project, keep_layers=True)[5:])
     assert remapping[remapping.index("-i") :] == ["-i", "1", "-o", "pano", "pano.pto"]
     subprocess.run(remapping, cwd=project.parent, check=True, capture_output=True)
     assert project.with_name("pano0001.tif").is_file()
     assert project.with_name("pano0000.tif").stat() == before
-    assert [shlex.split(line) for line in show_project(project)[4:]] == [ours]
+    assert [shlex.split(line) for line in show_project(project)[5:]] == [ours]
 
 
 def test_dry_run_names_the_panorama_as_the_run_does(make_project: ProjectMaker) -> None:

@@ -20,7 +20,8 @@ class Record:
 
     project     its file, absolute.
     result      "made", "skipped" (what was made before still holds, or was changed since) or "failed".
-    outputs     the files that were made, with "file" and "bytes"; of a failed one those before the failure.
+    outputs     the files that were made, with "file" and "bytes"; of a failed one those before the failure,
+                of a skipped one those that are left.
     inputs      the project, its photos, and layers that were there before, as `outputs`.
     message     what went wrong and what to do; empty if nothing.
     exit_code   what a run of this project alone ends with.

@@ -152,12 +152,14 @@ def show(tasks: Iterable[Task], words: Mapping[Path, Sequence[str]]) -> ExitCode
     with messages(logging.WARNING):
         for one in tasks:
             try:
-                if left := left_alone(one):
+                nothing, left = left_alone(one)
+                if nothing:
                     names = ", ".join(file.name for file in left)
                     print_result(f"# {one.project.name}: {names}: made before, left as it is (--force: anew)")
                 else:
                     options = words[one.project]
-                    print_result("\n".join(show_project(one.project, **one.options, options=options)))
+                    lines = show_project(one.project, **one.options, options=options, leave=left)
+                    print_result("\n".join(lines))
                 codes.append(ExitCode.OK)
             except AbflowError as error:
                 complain(str(error))

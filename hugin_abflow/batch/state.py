@@ -11,7 +11,7 @@ import hashlib
 import json
 import logging
 import os
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from contextlib import suppress
 from pathlib import Path
 from typing import Any, Literal
@@ -21,9 +21,10 @@ from hugin_abflow.errors import AbflowError, ImageReadError
 from hugin_abflow.found import layers_there
 from hugin_abflow.images import image_size, read_layers
 from hugin_abflow.jpeg import is_cut
-from hugin_abflow.metadata import version
+from hugin_abflow.metadata import saved_by, version
 from hugin_abflow.outputs import checked_outputs, impossible, possible_outputs
 from hugin_abflow.project import read_plan
+from hugin_abflow.stitch import asked_panoramas, is_more_asked
 
 _log = logging.getLogger(__name__)
 
@@ -34,12 +35,14 @@ RESOURCES = frozenset({"device", "band_rows", "remap", "threads", "max_memory"})
 _ROWS = 256  # that are decoded at a time
 
 Entry = dict[str, Any]
+_Look = Literal["made", "changed", "gone"]
 
 
 class State:
     """The memory of one project.
 
     project     its file. options: keywords of `stitch_project`. settings: all options as plain values.
+    left        the outputs that are left as they are, once `restore` was asked, though it said no.
 
     Raises the `AbflowError` family for a project that cannot be read.
     """
@@ -55,6 +58,12 @@ class State:
         self._known = self._load()
         self._inputs: list[Entry] = []
         self._noted: list[Entry] = []
+        self._left: list[Entry] = []
+
+    @property
+    def left(self) -> list[Path]:
+        """Outputs that somebody changed, or another program made."""
+        return [self._file(entry) for entry in self._left]
 
     def inputs(self) -> list[Path]:
         """The project, its photos and the layers that would be used, as far as they are there now."""
@@ -71,41 +80,62 @@ class State:
 
     def restore(self, record: Record) -> bool:
         """Make `record` that of what was made before, if project, inputs, settings and version are still the
-        same and the panorama is there. So too, with a warning, if somebody changed it since, whatever else
-        changed: nobody's work is lost unasked. Else do nothing. `begin` comes first.
+        same and the panorama is there. So too if there is nothing to be made but what is in `left`: what
+        somebody changed since, or another program saved, is left, with a warning, whatever else changed.
+        Nobody's work is lost unasked. Else do nothing more. `begin` comes first.
         """
-        known = self._known
-        try:
-            if known["schema"] != SCHEMA:
-                return False
-            found = [(entry, self._look(entry)) for entry in known["outputs"]]
-            there = [entry for entry, how in found if how != "gone"]
-            holds = bool(found) and len(there) == len(found) and known["hash"] == self._hash()
-            if set(known.get("left_out", [])) - set(self._left_out()):
-                holds = False  # its program has been installed
-            # layers are inputs as well; such as somebody changed are used, and replaced by none
-            inputs = set() if holds else {entry["file"] for entry in self._inputs}
-            changed = [
-                entry["file"] for entry, how in found if how == "changed" and entry["file"] not in inputs
-            ]
-            if not (holds or changed):
-                return False
-            outputs, device, overlaps = self._plain(there), known["device"], known["overlaps"]
-            if not (isinstance(device, str) and isinstance(overlaps, list)):
-                return False
-        except (KeyError, TypeError, ValueError, OverflowError):  # damaged, or written by somebody else
+        found = self._found()
+        there = [entry for entry, how in found if how != "gone"]
+        same = bool(found) and self._known["hash"] == self._hash()
+        # what was left out is to be made once its program is installed
+        holds = same and len(there) == len(found) and set(self._known["left_out"]) <= set(self._left_out())
+        # layers are inputs as well; such as somebody changed are used, and replaced by none
+        inputs = set() if holds else {entry["file"] for entry in self._inputs}
+        changed = [entry for entry, how in found if how == "changed" and entry["file"] not in inputs]
+        foreign = [] if holds else self._foreign({entry["file"] for entry, _ in found} | inputs)
+        for entry in changed + foreign:
+            self._warn(entry, same)
+        # where the others are made anew, even what it was before somebody changed it is out of date
+        self._left = [entry if same else {**entry, "blake2b": ""} for entry in changed] + foreign
+        if not holds and (not self._left or is_more_asked(self._plan, self._options, self.left)):
             return False
-        record.outputs, record.device, record.overlaps = outputs, device, overlaps
-        also = "" if holds else ", and so were project, photos, layers, settings or another output"
-        for name in changed:
-            _log.warning(
-                "%s was changed since it was made%s; it is left as it is (--force makes it anew)",
-                self._folder / name, also,
-            )  # fmt: skip
+        record.outputs = self._plain(there + foreign)
+        record.device, record.overlaps = self._known.get("device", ""), self._known.get("overlaps", [])
         if self._left_out():
             possible_outputs(self._plan)  # warns of them
         record.result = "skipped"
         return True
+
+    def _found(self) -> list[tuple[Entry, _Look]]:
+        """The outputs that were made, and what became of them; nothing, and nothing is known any more, where
+        that is damaged, or written by somebody else.
+        """
+        known = self._known
+        with suppress(KeyError, TypeError, ValueError, OverflowError):
+            found = [(entry, self._look(entry)) for entry in known["outputs"]]
+            self._plain(entry for entry, _ in found)
+            texts = [known["device"], known["hash"], *known.setdefault("left_out", [])]
+            whole = isinstance(known["overlaps"], list) and all(isinstance(one, str) for one in texts)
+            if known["schema"] == SCHEMA and whole:
+                return found
+        self._known = {}
+        return []
+
+    def _foreign(self, known: Collection[str]) -> list[Entry]:
+        """Panoramas that would be replaced, of which nothing is known, and which another program saved."""
+        files = [file for file in asked_panoramas(self._plan, **self._options) if saved_by(file)]
+        unknown = [file for file in files if self._name(file) not in known and _decodes(file)]
+        return [{**entry, "blake2b": ""} for entry in self._entries(unknown, [])]
+
+    def _warn(self, entry: Entry, same: bool) -> None:
+        """Tell of an output that is left; same: project, inputs, settings and version are as they were."""
+        file = self._file(entry)
+        if not entry["blake2b"] and (program := saved_by(file)):
+            what = f"was saved by {program}"  # which is all that is known of it
+        else:
+            what = "was changed since it was made"
+            what += "" if same else ", and so were project, photos, layers or settings"
+        _log.warning("%s %s; it is left as it is (--force makes it anew)", file, what)
 
     def note(self, file: Path) -> None:
         """Remember that an output was made just now, though not yet of what: where the run is killed, or is
@@ -124,7 +154,8 @@ class State:
         new = [file for file in self.inputs() if self._name(file) not in kept]
         try:
             self._inputs += self._entries(new, [])  # layers that were made and kept
-            for file in record.files:
+            made = [file for file in record.files if file not in self.left]
+            for file in made:
                 _flush(file)
             self.file.parent.mkdir(exist_ok=True)
             values = {
@@ -135,7 +166,7 @@ class State:
                 "device": record.device,
                 "settings": self._settings,
                 "inputs": self._inputs,
-                "outputs": self._entries(record.files, self._noted),
+                "outputs": self._entries(made, self._noted) + self._left,
                 "left_out": self._left_out(),
                 "overlaps": record.overlaps,
             }
@@ -189,17 +220,18 @@ class State:
 
     def _plain(self, entries: Iterable[Entry]) -> list[Entry]:
         """Entries as they stand in records."""
-        return [
-            {"file": str(Path(os.path.normpath(self._folder / entry["file"]))), "bytes": int(entry["bytes"])}
-            for entry in entries
-        ]
+        return [{"file": str(self._file(entry)), "bytes": int(entry["bytes"])} for entry in entries]
 
-    def _look(self, entry: Entry) -> Literal["made", "changed", "gone"]:
+    def _file(self, entry: Entry) -> Path:
+        """The file that an entry is about."""
+        return Path(os.path.normpath(self._folder / entry["file"]))
+
+    def _look(self, entry: Entry) -> _Look:
         """Whether an output is there as it was made, or as somebody changed it; a damaged one is gone."""
         file = self._folder / entry["file"]
         if not file.is_file():
             return "gone"
-        if self._entries([file], [entry])[0]["blake2b"] == entry["blake2b"]:
+        if entry["blake2b"] and self._entries([file], [entry])[0]["blake2b"] == entry["blake2b"]:
             return "made"
         return "changed" if _decodes(file) else "gone"
 

@@ -112,11 +112,13 @@ def perform(task: Task, listener: Listener, level: int = logging.WARNING, turn: 
     return record
 
 
-def left_alone(task: Task) -> list[Path]:
-    """The outputs that `perform` leaves as they are; none: it makes them."""
+def left_alone(task: Task) -> tuple[bool, list[Path]]:
+    """Whether `perform` makes nothing, and the outputs that it leaves as they are."""
     record = Record(task.project.absolute())
     state = _state(task, record) if task.resume else None
-    return record.files if state and state.restore(record) else []
+    if state is None:
+        return False, []
+    return (True, record.files) if state.restore(record) else (False, state.left)
 
 
 def _state(task: Task, record: Record) -> State | None:
@@ -135,6 +137,7 @@ def _state(task: Task, record: Record) -> State | None:
 def _stitch(task: Task, record: Record, listener: Listener, turn: Turn | None, state: State | None) -> None:
     """Fill in the record while the panorama is made."""
     record.versions = _versions()
+    leave = state.left if state else []
     shared = False  # a processor serves several at a time; a graphics card's memory may not hold two
 
     def open_device(wanted: str | None, threads: int) -> Device:
@@ -166,11 +169,12 @@ def _stitch(task: Task, record: Record, listener: Listener, turn: Turn | None, s
     try:
         stitch_project(
             task.project, **task.options,
-            progress=trace.phases(progress), open_device=open_device, finished=finished,
+            progress=trace.phases(progress), open_device=open_device, finished=finished, leave=leave,
         )  # fmt: skip
-        record.result = "made"
+        record.result = "made" if made or not leave else "skipped"
     finally:
-        record.outputs = _sizes(made)  # what comes before one that fails is there, too
+        # what comes before one that fails is there, too
+        record.outputs = _sizes(leave if record.result == "skipped" else made)
 
 
 def settings_of(task: Task) -> dict[str, Any]:

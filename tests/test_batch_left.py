@@ -1,0 +1,217 @@
+"""What somebody retouched is left by runs over many projects, what else is missing or stale is made."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import tifffile
+from conftest import ProjectMaker, names_in, require_program
+from shoots import write_project
+
+from hugin_abflow import cli
+from hugin_abflow.batch import task
+from hugin_abflow.batch.record import Record
+from hugin_abflow.batch.task import Task, perform
+from hugin_abflow.exif import Metadata, embed, text
+from hugin_abflow.images import ENDINGS, write_image
+from hugin_abflow.metadata import saved_by
+from hugin_abflow.outputs import Kind
+from hugin_abflow.project import read_plan
+from hugin_abflow.settings import Settings
+from hugin_abflow.stitch import asked_panoramas, show_project, stitch_project
+from hugin_abflow.tifftags import MAIN
+
+GIMP = "GIMP 2.10"
+PICTURE = np.full((120, 120, 3), 7, np.uint8)
+BOTH = "#hugin_outputLDRBlended true\n#hugin_outputLDRExposureLayersFused true\n"
+
+
+class Deaf:
+    def phase_began(self, name: str, total: int) -> None: ...
+    def advanced(self, name: str, units: int) -> None: ...
+    def phase_ended(self, name: str, seconds: float) -> None: ...
+    def message(self, level: int, text: str) -> None: ...
+
+
+@pytest.fixture
+def made(monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """The names of panoramas as they are made, which happens quickly, in this process."""
+    names: list[str] = []
+
+    def stitch(
+        path: Path, finished: Callable[[Path], None], leave: Collection[Path] = (), **options: Any
+    ) -> None:
+        for file in asked_panoramas(read_plan(path), **options):
+            if file not in leave:
+                save(file, "Hugin 2023.0.0")
+                names.append(file.name)
+                finished(file)
+
+    monkeypatch.setattr(task, "stitch_project", stitch)
+    monkeypatch.setattr("hugin_abflow.outputs.missing", lambda program: None)
+    return names
+
+
+@pytest.fixture
+def project(tmp_path: Path) -> Path:
+    """Of which a panorama and one that is fused are asked for."""
+    file = write_project(tmp_path / "tiny.pto")
+    file.write_text(file.read_text() + BOTH)
+    return file
+
+
+def save(file: Path, program: str | bool) -> bytes:
+    tifffile.imwrite(file, PICTURE, software=program)
+    return file.read_bytes()
+
+
+def make(project: Path, resume: bool = True, **options: object) -> Record:
+    return perform(Task(project, {"settings": Settings()} | options, resume, remember=True), Deaf())
+
+
+@pytest.mark.parametrize("remembered", [False, True])
+def test_only_what_was_retouched_is_left(project: Path, made: list[str], remembered: bool) -> None:
+    """Whether it is known how it was made, or another program's name is all that tells."""
+    fused = project.with_name("tiny_blended_fused.tif")
+    if remembered:
+        make(project)
+    retouched = save(fused, GIMP)
+    project.with_name("tiny.tif").unlink(missing_ok=True)
+    made.clear()
+    said = "was changed since it was made" if remembered else f"was saved by {GIMP}"
+    record = make(project)
+    assert record.result == "made" and made == ["tiny.tif"]
+    assert [file.name for file in record.files] == ["tiny.tif"]
+    assert record.warnings == [f"{fused} {said}; it is left as it is (--force makes it anew)"]
+    again = make(project)
+    assert again.result == "skipped" and again.warnings == record.warnings
+    assert sorted(again.files) == sorted([project.with_name("tiny.tif"), fused])
+    project.write_text(project.read_text() + "# a comment\n")
+    for result in ("made", "skipped"):
+        record = make(project)
+        assert record.result == result and len(record.warnings) == 1
+    assert made == ["tiny.tif"] * 2 and fused.read_bytes() == retouched
+    fused.unlink()
+    assert make(project).result == "made" and fused.is_file()
+    assert make(project).result == "skipped" and make(project).warnings == []
+
+
+def test_what_it_was_before_is_stale_where_something_else_was_made_since(
+    project: Path, made: list[str]
+) -> None:
+    """Somebody may take the retouched one for a copy of the one before."""
+    make(project)
+    fused = project.with_name("tiny_blended_fused.tif")
+    before = fused.read_bytes()
+    save(fused, GIMP)
+    project.write_text(project.read_text() + "# a comment\n")
+    make(project)
+    fused.write_bytes(before)
+    assert "tiny_blended_fused.tif was changed since it was made; it is left" in make(project).warnings[0]
+
+
+@pytest.mark.parametrize("options", [{}, {"output": "out.tif"}, {"prefix": "tiny"}], ids=str)
+def test_nothing_is_made_where_all_is_left(
+    project: Path, made: list[str], monkeypatch: pytest.MonkeyPatch, options: dict[str, str]
+) -> None:
+    monkeypatch.chdir(project.parent)
+    files = asked_panoramas(read_plan(project), **options)
+    content = [save(file, GIMP) for file in files]
+    record = make(project, **options)
+    assert record.result == "skipped" and record.files == files and len(record.warnings) == len(files)
+    assert made == [] and [file.read_bytes() for file in files] == content
+    assert make(project, resume=False, **options).result == "made"
+    assert made == [file.name for file in files] and make(project, **options).warnings == []
+
+
+@pytest.mark.parametrize("program", ["hugin-abflow 0.1.0", "Hugin 2023.0.0.d88dc56ded0e", False])
+def test_what_nobody_retouched_is_replaced(project: Path, made: list[str], program: str | bool) -> None:
+    save(project.with_name("tiny.tif"), program)
+    assert make(project).warnings == [] and "tiny.tif" in made
+
+
+def test_what_is_damaged_is_made(project: Path, made: list[str]) -> None:
+    file = project.with_name("tiny.tif")
+    content = save(file, GIMP)
+    file.write_bytes(content[: len(content) - PICTURE.size // 2])
+    assert saved_by(file) == GIMP
+    assert make(project).warnings == [] and "tiny.tif" in made
+
+
+def test_painted_layers_of_a_panorama_s_name_are_no_panorama(tmp_path: Path, made: list[str]) -> None:
+    project = write_project(tmp_path / "tiny.pto")
+    for number in range(2):
+        project.with_name(f"tiny{number:04}.tif").unlink()
+    page = np.zeros((125, 250, 4), np.uint8)
+    with tifffile.TiffWriter(project.with_name("tiny.tif")) as pages:
+        for _ in range(2):
+            pages.write(page, photometric="rgb", extrasamples=["unassalpha"], software=GIMP, subfiletype=2)
+    record = make(project)
+    assert record.result == "made" and record.warnings == [] and made == ["tiny_abflow.tif"]
+
+
+@pytest.mark.parametrize("ending", ["tif", "jpg", "png"])
+def test_the_program_is_told_by_software(tmp_path: Path, ending: str) -> None:
+    file = tmp_path / f"a.{ending}"
+    write_image(file, np.ones((5, 7, 4), np.uint8))
+    assert saved_by(file) == saved_by(tmp_path / "none") == saved_by(tmp_path) == ""
+    embed(file, ENDINGS[file.suffix], Metadata({MAIN: {305: text(GIMP)}}, b""))
+    assert saved_by(file) == GIMP
+
+
+def test_dry_run_tells_what_becomes_of_what_is_there(
+    project: Path, made: list[str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    save(project.with_name("tiny_blended_fused.tif"), GIMP)
+    save(project.with_name("tiny.tif"), False)
+    for arguments, lines in (
+        (
+            [str(project.parent)],
+            ["tiny.tif is there, and replaced", "tiny_blended_fused.tif is left as it is"],
+        ),
+        (
+            [str(project)],
+            ["tiny.tif is there, and replaced", "tiny_blended_fused.tif is there, and replaced"],
+        ),
+        (["-o", str(project.with_name("tiny.tif")), str(project)], ["tiny.tif is there, and replaced"]),
+    ):
+        assert cli.main(["--dry-run", *arguments]) == 0
+        shown = capsys.readouterr()
+        comments = [line for line in shown.out.splitlines() if "is there" in line or "is left" in line]
+        assert [line.removesuffix(" (--force: made anew)") for line in comments] == [f"# {x}" for x in lines]
+        assert ("enfuse" in shown.out) == (len(lines) == 2 and "left" not in lines[1])
+        assert ("was saved by GIMP" in shown.err) == ("left" in lines[-1])
+    assert made == []
+
+
+@pytest.mark.parametrize("scripted", [False, True])
+def test_stacks_that_are_left_are_not_what_a_panorama_is_made_of(
+    make_project: ProjectMaker, temporary: Path, scripted: bool
+) -> None:
+    """They are made in a temporary folder for it: those that are there may be of other photos."""
+    for name in ("nona", "enfuse", "pano_trafo"):
+        require_program(name)
+    kinds = (Kind.PANORAMA, Kind.STACKS, Kind.FUSED_STACKS)
+    lines = "".join(f"#hugin_output{kind} {str(kind in kinds).lower()}\n" for kind in Kind)
+    project = make_project(panorama='f2 w200 h100 v360 n"TIFF_m"', yaws=(0, 60), extra=lines)
+    photos = set(names_in(project.parent))
+    leave = [project.with_name(name) for name in ("pano.tif", "pano_stack_ldr_0000.tif")]
+    for file in leave:
+        file.write_bytes(b"retouched")
+    if scripted:
+        script = "\n".join(show_project(project, leave=leave, options=["--no-flow"]))
+        assert "pano_stack_ldr_0000.tif is left" in script and '"$layers"/pano_stack_ldr_0000.tif' in script
+        assert "-o pano.tif" not in script
+    else:
+        files = stitch_project(project, Settings(flow=False), leave=leave)
+        assert [file.name for file in files] == ["pano_stack_ldr_0001.tif", "pano_fused.tif"]
+        assert tifffile.imread(project.with_name("pano_fused.tif")).any()
+        new = {file.name for file in [*files, *leave]}
+        assert set(names_in(project.parent)) == photos | new
+    assert all(file.read_bytes() == b"retouched" for file in leave)
+    rest = [*leave, *(project.with_name(name) for name in ("pano_fused.tif", "pano_stack_ldr_0001.tif"))]
+    assert stitch_project(project, Settings(flow=False), leave=rest) == []
