@@ -87,6 +87,36 @@ def test_log_has_everything_whatever_is_shown(
     assert timeless(log.read_text("utf-8").splitlines()[-1]).endswith("a.pto: made a.tif (0.0 s, 0 bytes)")
 
 
+def test_projects_of_one_name_are_told_by_their_folders(
+    replace: Callable[..., None],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    """As in the table: from here, if that is shorter. All of the lines of two `pano.pto` were alike."""
+    replace(working)
+    monkeypatch.chdir(tmp_path)
+    named = ["day1/pano.pto", str(tmp_path / "day2" / "pano.pto"), "/elsewhere/b.pto"]
+    assert cli.main([*named, "-v", "--log", "log.txt"]) == ExitCode.PARTIAL
+    said = timeless(capsys.readouterr().err)
+    logged = timeless((tmp_path / "log.txt").read_text("utf-8"))
+    for name in ("day1/pano.pto", "day2/pano.pto", "/elsewhere/b.pto"):
+        for part in (f"{name}: flow ...", f"{name}: canvas [bold]", f"{name}: flow: 0.0 s"):
+            assert re.search(f"^{STAMP}{re.escape(part)}$", said, re.MULTILINE)
+            assert re.search(f"^{LOG_STAMP}INFO    {re.escape(part)}$", logged, re.MULTILINE)
+    for text in (said, logged):
+        assert "[2/3] day2/pano.pto: made pano.tif" in text
+    assert "error: /elsewhere/b.pto: no picture" in said
+
+
+def test_a_long_name_leaves_room_for_its_bar(tmp_path: Path) -> None:
+    task = Task(tmp_path / ("a long way " * 9) / "pano.pto")
+    with Bars(quiet=False, verbose=False, log=None) as bars:
+        bars.began(task).phase_began("flow", 4)
+        text = str(bars._bars.tasks[1].description)
+    assert text.endswith("a long way /pano.pto: flow") and len(text) == len(": flow") + 40
+
+
 def test_log_that_cannot_be_written_ends_the_run_before_it_starts(
     replace: Callable[..., None], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

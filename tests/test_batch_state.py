@@ -70,7 +70,7 @@ def test_dry_run_leaves_out_what_holds(make: Make, shoot: Path, capsys: pytest.C
     """By the options of the run; with --force, and of one project without --resume, it is made."""
     options = {**cli_options(), "settings": Settings()}
     make(**options)
-    holds = "# tiny.pto: tiny.tif: made before, left as it is (--force: anew)\n"
+    holds = f"# {shoot / 'tiny.pto'}: tiny.tif: made before, left as it is (--force: anew)\n"
     for arguments, shown in (
         ([str(shoot)], True),
         (["--resume", str(shoot / "tiny.pto")], True),

@@ -18,6 +18,8 @@ from hugin_abflow.memory import size
 from hugin_abflow.progress import Advance
 from hugin_abflow.terminal import console, display_progress, label, on_terminal, say
 
+_WIDEST = 40  # characters of a project's name before a bar
+
 
 def duration(seconds: float) -> str:
     """A time for people: ``3.2 s``, ``4:05``, ``1:02:03``."""
@@ -26,6 +28,14 @@ def duration(seconds: float) -> str:
     minutes, rest = divmod(round(seconds), 60)
     hours, minutes = divmod(minutes, 60)
     return f"{hours}:{minutes:02}:{rest:02}" if hours else f"{minutes}:{rest:02}"
+
+
+def name_of(project: Path) -> str:
+    """What a project is called from here, with its folder: others may have its name."""
+    shown = project
+    with suppress(ValueError, OSError):  # it lies elsewhere, or the current folder is gone
+        shown = project.relative_to(Path.cwd()) if project.is_absolute() else project
+    return str(shown).encode("utf-8", "replace").decode("utf-8")
 
 
 def outcome(record: Record) -> str:
@@ -98,7 +108,7 @@ class Display:
         if record.result == "failed":
             self.failed += 1
         self._tell_end(task, record)
-        line = f"[{self.done}/{self.total}] {task.project.name}: {outcome(record)}"
+        line = f"[{self.done}/{self.total}] {name_of(task.project)}: {outcome(record)}"
         self.write_log(logging.INFO, line)
         if not self.quiet:
             self._show(line)
@@ -113,7 +123,7 @@ class Display:
 
     def tell(self, task: Task, level: int, text: str) -> None:
         """A message about a task."""
-        self.write_log(level, f"{task.project.name}: {text}")
+        self.write_log(level, f"{name_of(task.project)}: {text}")
         if level >= logging.WARNING or (self.verbose and not self.quiet):
             self._show(f"{label(level)}{self._heading(task, text)}{text}")
 
@@ -146,7 +156,7 @@ class Display:
                 )
 
     def _heading(self, task: Task, text: str) -> str:
-        return "" if task.project.name in text else f"{task.project.name}: "
+        return "" if name_of(task.project) in text else f"{name_of(task.project)}: "
 
     def _show(self, text: str) -> None:
         say(f"{time.strftime('%Y-%m-%d %H:%M:%S')} {text}")
@@ -184,7 +194,7 @@ class Bars(Display):
     def began(self, task: Task) -> Voice:
         """A task begins."""
         if task.project not in self._rows:
-            self._rows[task.project] = self._bars.add_task(task.project.name, total=None)
+            self._rows[task.project] = self._bars.add_task(self._row(task), total=None)
         return super().began(task)
 
     def ended(self, task: Task, record: Record) -> None:
@@ -195,8 +205,8 @@ class Bars(Display):
 
     def phase_began(self, task: Task, name: str, total: int) -> None:
         """A phase of a task begins."""
-        self.write_log(logging.INFO, f"{task.project.name}: {name} ...")
-        self._bars.reset(self._rows[task.project], total=total, description=f"{task.project.name}: {name}")
+        self.write_log(logging.INFO, f"{name_of(task.project)}: {name} ...")
+        self._bars.reset(self._rows[task.project], total=total, description=f"{self._row(task)}: {name}")
 
     def advanced(self, task: Task, name: str, units: int) -> None:
         """So many more units of a phase are done."""
@@ -204,7 +214,12 @@ class Bars(Display):
 
     def phase_ended(self, task: Task, name: str, seconds: float) -> None:
         """A phase of a task is done."""
-        self.write_log(logging.INFO, f"{task.project.name}: {name}: {seconds:.2f} s")
+        self.write_log(logging.INFO, f"{name_of(task.project)}: {name}: {seconds:.2f} s")
+
+    def _row(self, task: Task) -> str:
+        """What stands before a bar, for which a long name would leave no room: the end of it."""
+        name = name_of(task.project)
+        return name if len(name) <= _WIDEST else f"\N{HORIZONTAL ELLIPSIS}{name[1 - _WIDEST :]}"
 
     def _update(self) -> None:
         failed = f", {self.failed} failed" if self.failed else ""
@@ -232,11 +247,11 @@ class Lone(Display):
     def ended(self, task: Task, record: Record) -> None:
         """The task is done."""
         self._tell_end(task, record)
-        self.write_log(logging.INFO, f"{task.project.name}: {outcome(record)}")
+        self.write_log(logging.INFO, f"{name_of(task.project)}: {outcome(record)}")
 
     def phase_began(self, task: Task, name: str, total: int) -> None:
         """A phase begins."""
-        self.write_log(logging.INFO, f"{task.project.name}: {name} ...")
+        self.write_log(logging.INFO, f"{name_of(task.project)}: {name} ...")
         phase = ExitStack()
         self._phases[name] = phase, phase.enter_context(self._progress(name, total))
 
@@ -246,7 +261,7 @@ class Lone(Display):
 
     def phase_ended(self, task: Task, name: str, seconds: float) -> None:
         """A phase is done."""
-        self.write_log(logging.INFO, f"{task.project.name}: {name}: {seconds:.2f} s")
+        self.write_log(logging.INFO, f"{name_of(task.project)}: {name}: {seconds:.2f} s")
         self._phases.pop(name)[0].close()
 
     def _heading(self, task: Task, text: str) -> str:

@@ -7,7 +7,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from hugin_abflow.batch.display import duration
+from hugin_abflow.batch.display import duration, name_of
 from hugin_abflow.batch.record import Record, write_json
 from hugin_abflow.errors import OutputError
 from hugin_abflow.memory import size
@@ -31,7 +31,7 @@ def print_table(records: Sequence[Record]) -> None:
     table.add_column("what went wrong, what to do", overflow="fold")
     for record in records:
         table.add_row(
-            Text(_shown(record.project)),
+            Text(name_of(record.project)),
             record.result,
             duration(record.seconds),
             size(record.bytes) if record.outputs else "",
@@ -41,15 +41,6 @@ def print_table(records: Sequence[Record]) -> None:
     if not shown_on.is_terminal:
         shown_on.width = 160  # a file is read in an editor, which does not mind
     shown_on.print(table)
-
-
-def _shown(project: Path) -> str:
-    """The project's name from here, where that is shorter."""
-    try:
-        shown = str(project.relative_to(Path.cwd()))
-    except ValueError:
-        shown = str(project)
-    return shown.encode("utf-8", "replace").decode("utf-8")
 
 
 def write_report(path: Path, records: Sequence[Record], arguments: Sequence[str]) -> None:

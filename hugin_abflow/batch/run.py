@@ -11,7 +11,7 @@ from pathlib import Path
 
 from hugin_abflow import trace
 from hugin_abflow.batch.cluster import Cluster
-from hugin_abflow.batch.display import Display, choose_display, open_log
+from hugin_abflow.batch.display import Display, choose_display, name_of, open_log
 from hugin_abflow.batch.pool import Alone, Pool
 from hugin_abflow.batch.record import Record
 from hugin_abflow.batch.report import print_table, write_report
@@ -155,7 +155,8 @@ def show(tasks: Iterable[Task], words: Mapping[Path, Sequence[str]]) -> ExitCode
                 nothing, left = left_alone(one)
                 if nothing:
                     names = ", ".join(file.name for file in left)
-                    print_result(f"# {one.project.name}: {names}: made before, left as it is (--force: anew)")
+                    what = f"{names}: made before, left as it is (--force: anew)"
+                    print_result(f"# {name_of(one.project)}: {what}")
                 else:
                     options = words[one.project]
                     lines = show_project(one.project, **one.options, options=options, leave=left)
