@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import logging
 import os
 import signal
 import subprocess
@@ -20,6 +21,7 @@ from shoots import write_project
 from hugin_abflow import cli
 from hugin_abflow.batch import run
 from hugin_abflow.batch.display import Display
+from hugin_abflow.batch.record import Record
 from hugin_abflow.batch.task import Task
 from hugin_abflow.batch.watch import watch
 from hugin_abflow.errors import ExitCode
@@ -71,6 +73,25 @@ def test_warnings_are_shown_and_logged(tmp_path: Path, capsys: pytest.CaptureFix
     assert run.run(iter(["card is no longer there"]), how) == ExitCode.OK
     assert capsys.readouterr().err.endswith("hugin-abflow: warning: card is no longer there\n")
     assert (tmp_path / "log").read_text().endswith("WARNING card is no longer there\n")
+
+
+def test_a_panorama_that_is_left_is_told_once(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Not each time its project is saved, until something else is to be told of it. All is logged."""
+    task = Task(tmp_path / "a.pto")
+    with (tmp_path / "log").open("w") as log, Display(quiet=False, verbose=False, log=log) as display:
+        for result, text, shown in (
+            ("skipped", "a.tif was changed", True),
+            ("skipped", "a.tif was changed", False),
+            ("skipped", "a.tif and a.pto were changed", True),
+            ("made", "a.tif has a hole", True),
+            ("made", "a.tif has a hole", True),
+            ("skipped", "a.tif was changed", True),
+            ("skipped", "a.tif was changed", False),
+        ):
+            display.began(task).message(logging.WARNING, text)
+            display.ended(task, Record(task.project, result))
+            assert (f"{text}\n" in capsys.readouterr().err) == shown
+    assert (tmp_path / "log").read_text().count("a.tif was changed\n") == 4
 
 
 def test_project_that_is_still_being_saved_waits(tmp_path: Path) -> None:

@@ -87,6 +87,9 @@ class Display:
     def __init__(self, quiet: bool, verbose: bool, log: TextIO | None) -> None:
         self.quiet, self.verbose, self._log = quiet, verbose, log
         self.total = self.done = self.failed = 0
+        # warnings of each project: of what is left as it is, and so far of what is going on
+        self._known: dict[Path, set[str]] = {}
+        self._said: dict[Path, set[str]] = {}
 
     def __enter__(self) -> Display:
         return self
@@ -100,6 +103,7 @@ class Display:
 
     def began(self, task: Task) -> Voice:
         """A task begins."""
+        self._said[task.project] = set()
         return Voice(self, task)
 
     def ended(self, task: Task, record: Record) -> None:
@@ -107,6 +111,9 @@ class Display:
         self.done += 1
         if record.result == "failed":
             self.failed += 1
+        # a watched folder's project is looked at each time it is saved: no warning is news then
+        said = self._said.pop(task.project, set())
+        self._known[task.project] = said if record.result == "skipped" else set()
         self._tell_end(task, record)
         line = f"[{self.done}/{self.total}] {name_of(task.project)}: {outcome(record)}"
         self.write_log(logging.INFO, line)
@@ -122,8 +129,12 @@ class Display:
                 self.tell(task, logging.INFO, line)
 
     def tell(self, task: Task, level: int, text: str) -> None:
-        """A message about a task."""
+        """A message about a task. Warnings about what was left as it is and still is are not shown again."""
         self.write_log(level, f"{name_of(task.project)}: {text}")
+        if level == logging.WARNING:
+            self._said.setdefault(task.project, set()).add(text)
+            if text in self._known.get(task.project, ()):
+                return
         if level >= logging.WARNING or (self.verbose and not self.quiet):
             self._show(f"{label(level)}{self._heading(task, text)}{text}")
 
