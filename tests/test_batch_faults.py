@@ -243,7 +243,10 @@ def test_control_c_reaches_all_and_leaves_nothing(shoot: Path, tmp_path: Path) -
     os.killpg(child.pid, signal.SIGINT)
     _, said = child.communicate(timeout=30)
     assert child.returncode == ExitCode.INTERRUPTED and "Traceback" not in said, said
-    assert said.splitlines()[-1] == "hugin-abflow: interrupted"
+    *_, rest, last = filter(None, said.splitlines())
+    assert last == "hugin-abflow: interrupted"
+    left = 8 - len(results(report))
+    assert rest.endswith(f" {left} of 8 projects left; the same command goes on from here")
     assert group_is_gone(child.pid) and temporary(shoot) == []
     made = [name for name, record in results(report).items() if record["result"] == "made"]
     assert made and set(made) <= set(whole(shoot))

@@ -106,6 +106,32 @@ def test_report_that_cannot_be_written_hides_no_other_end(
     assert "--report" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize(
+    ("arguments", "told"),
+    [
+        ([], "2 of 3 projects left; the same command goes on from here"),
+        (["--force"], "2 of 3 projects left; with --force the same command begins anew"),
+        (["--quiet"], ""),
+    ],
+)
+def test_what_is_left_of_a_run_is_told(
+    replace: Callable[..., None], capsys: pytest.CaptureFixture[str], arguments: list[str], told: str
+) -> None:
+    """Behind the table."""
+
+    def interrupted(path: Path, **_: object) -> Path:
+        if path.stem == "b":
+            raise KeyboardInterrupt
+        return path.with_suffix(".tif")
+
+    replace(interrupted)
+    assert cli.main(["a.pto", "b.pto", "c.pto", *arguments]) == ExitCode.INTERRUPTED
+    said = capsys.readouterr().err.removesuffix("hugin-abflow: interrupted\n").strip()
+    assert said.endswith(told) and ("left" in said) == bool(told)
+    assert cli.main(["b.pto", "--resume"]) == ExitCode.INTERRUPTED
+    assert capsys.readouterr().err.strip() == "hugin-abflow: interrupted"
+
+
 def test_report_is_replaced_whole(tmp_path: Path) -> None:
     report = tmp_path / "r.json"
     report.write_text("older")

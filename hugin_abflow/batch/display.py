@@ -138,6 +138,12 @@ class Display:
         if level >= logging.WARNING or (self.verbose and not self.quiet):
             self._show(f"{label(level)}{self._heading(task, text)}{text}")
 
+    def note(self, text: str) -> None:
+        """A message about no task."""
+        self.write_log(logging.INFO, text)
+        if not self.quiet:
+            self._show(text)
+
     def warn(self, text: str) -> None:
         """A warning about no task."""
         self.write_log(logging.WARNING, text)

@@ -76,8 +76,9 @@ def run(tasks: Iterable[Task | str | None], how: Run, lone: bool = False) -> Exi
         stack.enter_context(trace.recording(how.profile))
         if how.report and not is_special(how.report):  # who reads a pipe expects one report
             write_report(how.report, [], how.arguments)  # now: a run may be long
+        display = choose_display(lone, how.quiet, how.verbose, log)
         try:
-            with choose_display(lone, how.quiet, how.verbose, log) as display:
+            with display:
                 if isinstance(tasks, Sequence):
                     display.expect(len(tasks))
                     order = {task.project.absolute(): place for place, task in enumerate(filter(None, tasks))}
@@ -98,6 +99,8 @@ def run(tasks: Iterable[Task | str | None], how: Run, lone: bool = False) -> Exi
             records.sort(key=lambda record: order.get(record.project, 0))
             if records and not lone and not how.quiet:
                 print_table(records)
+            if not complete and not lone and isinstance(tasks, Sequence):
+                display.note(_rest(tasks, len(records)))
             if how.report:
                 try:
                     write_report(how.report, records, how.arguments)
@@ -108,6 +111,13 @@ def run(tasks: Iterable[Task | str | None], how: Run, lone: bool = False) -> Exi
     if unprinted:
         raise unprinted
     return combine([record.exit_code for record in records])
+
+
+def _rest(tasks: Sequence[Task | str | None], done: int) -> str:
+    """How much is left of a run over several projects that ends too early, and what to do."""
+    resumed = all(task.resume for task in tasks if isinstance(task, Task))
+    remedy = "the same command goes on from here" if resumed else "with --force the same command begins anew"
+    return f"{len(tasks) - done} of {len(tasks)} projects left; {remedy}"
 
 
 def _performers(how: Run, count: int, lone: bool, display: Display) -> Alone | Pool | Cluster:
