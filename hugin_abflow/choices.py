@@ -45,7 +45,7 @@ def choose(
 
     Raises `ConfigError` for what the file should not say, and `click.UsageError` for the arguments.
     """
-    values = {} if file is None else read_config(file, *_known(command))
+    values = {} if file is None else _read(command, file)
     names = long_names(command)
     whole = sorted(name for name in values if names[name].name in OF_THE_RUN)
     if whole and not alone:
@@ -115,11 +115,21 @@ def words(command: click.Command, values: Mapping[str, Any]) -> list[str]:
     return said
 
 
-def _known(command: click.Command) -> tuple[dict[str, str], list[str]]:
-    """Kinds of the options that a file may give, and which of them are files."""
-    names = {name: option for name, option in long_names(command).items() if name not in _UNSETTLED}
-    paths = [name for name, option in names.items() if isinstance(option.type, click.Path)]
-    return {name: kind_of(option) for name, option in names.items()}, paths
+def _known(command: click.Command) -> dict[str, str]:
+    """Kinds of the options that a file may give."""
+    return {name: kind_of(option) for name, option in long_names(command).items() if name not in _UNSETTLED}
+
+
+def _read(command: click.Command, file: Path) -> dict[str, Any]:
+    """What a file gives. Raises `ConfigError`."""
+    names = long_names(command)
+    kinds = _known(command)
+    types = {name: option.type for name, option in names.items()}
+    paths = [name for name in kinds if isinstance(types[name], click.Path)]
+    choices = {name: list(kind.choices) for name, kind in types.items() if isinstance(kind, click.Choice)}
+    options = [param for param in command.params if isinstance(param, click.Option)]
+    others = {max(option.opts, key=len).lstrip("-") for option in options} - kinds.keys()
+    return read_config(file, kinds, paths, choices, others)
 
 
 def config_texts(
@@ -133,6 +143,6 @@ def config_texts(
     for file in dict.fromkeys(file for file, _ in chosen.values()):
         projects = [project for project, (its_file, _) in chosen.items() if its_file == file]
         values = chosen[projects[0]][1]
-        plain = {name: values[str(names[name].name)] for name in _known(command)[0]}
+        plain = {name: values[str(names[name].name)] for name in _known(command)}
         origin = [f"# {file or f'no {NAME}'}", *(f"# for {one}" for one in projects if one.name)]
         yield "\n".join([*origin, write_config(plain)])

@@ -5,7 +5,7 @@ from __future__ import annotations
 import difflib
 import os
 import tomllib
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -31,14 +31,22 @@ def find_config(project: Path, places: Iterable[Path]) -> Path | None:
     return next((file for file in files if os.path.lexists(file) and not is_special(file)), None)
 
 
-def read_config(file: Path, kinds: Mapping[str, str], paths: Iterable[str]) -> dict[str, Any]:
+def read_config(
+    file: Path,
+    kinds: Mapping[str, str],
+    paths: Iterable[str],
+    choices: Mapping[str, Sequence[str]],
+    others: Collection[str],
+) -> dict[str, Any]:
     """The options that a file gives, by their names without dashes in front.
 
     kinds       of each option: "bool", "int", "float", "str" or "list" (of texts).
     paths       options that are files; relative ones are meant from the file's folder.
+    choices     of options that take one of a few texts.
+    others      options that only the command line can give.
 
-    Raises `ConfigError` for a file that cannot be read, an unknown option (with a suggestion), or a value of
-    another kind.
+    Raises `ConfigError` for a file that cannot be read, a section, an unknown option (with a suggestion), or
+    a value of another kind.
     """
     try:
         values = tomllib.loads(file.read_text("utf-8-sig"))
@@ -49,11 +57,19 @@ def read_config(file: Path, kinds: Mapping[str, str], paths: Iterable[str]) -> d
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
         raise ConfigError(f"{file} is no TOML: {error}") from None
     for name, value in values.items():
+        if isinstance(value, dict):
+            raise ConfigError(
+                f"{file}: such files have no sections; give options without [{name}] above them"
+            )
+        if name in others:
+            raise ConfigError(
+                f"{file}: there is no option {name!r} for such files; it is for the command line alone"
+            )
         if name not in kinds:
             raise ConfigError(
                 f"{file}: there is no option {name!r} for such files; {_suggestion(name, kinds)}"
             )
-        _check(file, name, value, kinds[name])
+        _check(file, name, value, kinds[name], choices.get(name, ()))
     for name in set(paths) & set(values):
         value = values[name]
         values[name] = (
@@ -94,8 +110,8 @@ _WORDS = {
 }
 
 
-def _check(file: Path, name: str, value: object, kind: str) -> None:
-    """Raise `ConfigError` unless a value is of its kind."""
+def _check(file: Path, name: str, value: object, kind: str, choices: Sequence[str]) -> None:
+    """Raise `ConfigError` unless a value is of its kind; which of its choices it is, is not asked."""
     number = isinstance(value, int) and not isinstance(value, bool)
     fits = {
         "bool": isinstance(value, bool),
@@ -105,4 +121,9 @@ def _check(file: Path, name: str, value: object, kind: str) -> None:
         "list": isinstance(value, list) and all(isinstance(one, str) and one for one in value),
     }[kind]
     if not fits:
-        raise ConfigError(f"{file}: {name} is {value!r}; give {_WORDS[kind]}")
+        *most, last = [f'"{choice}"' for choice in choices] or [_WORDS[kind]]
+        wanted = f"{', '.join(most)} or {last}" if most else last
+        if value == "":
+            raise ConfigError(f"{file}: {name} is empty; give {wanted}, or leave it out")
+        shown = str(value).lower() if isinstance(value, bool) else repr(value)  # as TOML has it
+        raise ConfigError(f"{file}: {name} is {shown}; give {wanted}")
