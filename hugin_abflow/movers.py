@@ -6,6 +6,10 @@ bent, as it did not move along. Flow that leads clearly away from parallax, in a
 parallax, and over a place where the photos differ without it, is of something that moved. If one photo shows
 all of it that the other one does, consistency.py fills its place with the flow of what is around, and seam.py
 takes it from that photo, whole.
+
+What repeats, as bars of a railing, fits the next ones nearly as well, and that leads elsewhere than parallax.
+So flow that hardly leads back from a thing tells of nobody. Nor does flow that a search found and nothing
+uses, unless it explains clearly more than that of what is around, and than the flow that is used.
 """
 
 from __future__ import annotations
@@ -50,11 +54,15 @@ _WEAK = 0.3
 # The share of a thing's cells that have to miss it so far, and be shown by both photos: of a near thing an
 # edge may, where flow errs.
 _CLEAR = 0.125
+# The share from which flow has to lead back, for it to know of the thing: else nothing is matched.
+_KNOWN = 0.125
 # By how much the photos have to differ in a thing's place without its own flow: mean deviation of differences
 # of log brightness from their median. Plain walls and floors are matched with anything.
 _DIFFERS = 0.12
 # The same, times what they differ by around the thing.
 _MORE = 2.0
+# The share of that, or of what the flow that is used leaves, that flow which nothing uses may leave.
+_REMAINS = 0.75
 # Cells from a thing up to which others are around it.
 _RING = 4
 # Of a mask, between pixels: all of them show something.
@@ -96,7 +104,7 @@ def find(
         here, there = one.index, 1 - one.index
         moved = _moved(
             chart, one.flow, off_parallax, (views[here], views[there]),
-            (control_points[here], control_points[there]),
+            (control_points[here], control_points[there]), matches[here].flow,
         )  # fmt: skip
         found[here] |= moved
         found[there] |= reached(one.flow.ends[moved & one.flow.consistent], moved.shape, chart)
@@ -140,16 +148,24 @@ class _Matches:
 
 def _moved(
     chart: Chart, flow: CellFlow, off_parallax: Places, views: tuple[View, View],
-    control_points: tuple[Places, Places],
+    control_points: tuple[Places, Places], used: CellFlow,
 ) -> Mask:  # fmt: skip
-    """The cells of what moved by itself; off_parallax: by how much each misses parallax, of the limit."""
+    """The cells of what moved by itself.
+
+    off_parallax    by how much each misses parallax, of the limit.
+    used            the flow that is used: `flow` itself, or another one.
+    """
     things = connected(off_parallax > _WEAK, flow.wraps)
-    clear = np.bincount(things[(off_parallax > 1) & flow.shown], minlength=things.max() + 1)
-    kept = clear >= np.maximum(LEAST_CELLS, _CLEAR * np.bincount(things.ravel()))
+    sizes = np.bincount(things.ravel())
+    clear, known = (
+        np.bincount(things[its], minlength=sizes.size)
+        for its in ((off_parallax > 1) & flow.shown, flow.consistent)
+    )
+    kept = (clear >= np.maximum(LEAST_CELLS, _CLEAR * sizes)) & (known >= _KNOWN * sizes)
     kept[flow.confirmed(things, control_points)] = False
     for thing in np.flatnonzero(kept):
         its = things == thing
-        kept[thing] = _ends_within(chart, flow, views, its) and _differs(*views, flow, its)
+        kept[thing] = _ends_within(chart, flow, views, its) and _differs(*views, flow, used, its)
     moved: Mask = kept[things]
     return moved
 
@@ -165,8 +181,9 @@ def _ends_within(chart: Chart, flow: CellFlow, views: tuple[View, View], thing: 
     return bool(ends_within(shown, 2, masks, chart.wraps)[1])
 
 
-def _differs(here: View, there: View, flow: CellFlow, thing: Mask) -> bool:
-    """Whether the photos differ in a thing's place if it moves as what is around, more than they do there.
+def _differs(here: View, there: View, flow: CellFlow, used: CellFlow, thing: Mask) -> bool:
+    """Whether the photos differ in a thing's place if it moves as what is around, more than they do there. If
+    nothing uses its own flow, they have to differ clearly less by that than so, or by the flow that is used.
 
     What is across the border of a chart that wraps does not count as around. A plain thing that left its
     place wholly differs there by as much all over, as a place that one photo shows darker, and is not told.
@@ -182,9 +199,23 @@ def _differs(here: View, there: View, flow: CellFlow, thing: Mask) -> bool:
     inside = _difference(here, there, its, flow.vectors[tuple(nearest[:, its[0], its[1]])])
     if min(beside.size, inside.size) < LEAST_CELLS:
         return False
-    # each from its own median: exposure may be another one there, and change faster than anything tells
-    off, around = (np.abs(one - np.median(one)).mean() for one in (inside, beside))
-    return bool(off >= max(_DIFFERS, _MORE * around))
+    off = _deviation(inside)
+    if off < max(_DIFFERS, _MORE * _deviation(beside)):
+        return False
+    if used is flow:
+        return True
+    if np.count_nonzero(used.consistent[its]) >= _KNOWN * len(its[0]):
+        off = min(off, _deviation(_difference(here, there, its, used.vectors[its])))
+    return _deviation(_difference(here, there, its, flow.vectors[its])) < _REMAINS * off
+
+
+def _deviation(difference: npt.NDArray[np.float32]) -> float:
+    """By how much photos differ: from the median, as exposure may be another one in a place, and change
+    faster than anything tells. Without end if too few cells tell it.
+    """
+    if difference.size < LEAST_CELLS:
+        return np.inf
+    return float(np.abs(difference - np.median(difference)).mean())
 
 
 def _difference(
