@@ -353,8 +353,7 @@ def _final(path: Path) -> Path:
     final = Path(os.path.realpath(path))
     if not named_in_unicode(final.parent):
         raise OutputError(
-            f"{path} cannot be written: the path of its folder is not valid UTF-8; rename that, "
-            "or choose another with -o"
+            f"{path}: the path of its folder is not valid UTF-8; rename that, or choose another with -o"
         )
     with _explained(path, final):
         if final.is_dir():
@@ -362,6 +361,8 @@ def _final(path: Path) -> Path:
         # a device or a pipe, reached by a link: the rename would take its place
         if is_special(final):
             raise OutputError(f"{path} is no ordinary file; name one with -o")
+        if final.exists() and not final.stat().st_mode & 0o222:  # which a rename does not ask
+            raise OutputError(f"{path} is write-protected; allow writing, or name another file with -o")
     return final
 
 
@@ -382,10 +383,9 @@ def named_in_unicode(path: Path) -> bool:
 
 
 def _format_of(path: Path) -> str:
-    try:
-        return ENDINGS[path.suffix.lower()]
-    except KeyError:
-        raise OutputError(f"{path}: the ending must be one of {', '.join(ENDINGS)}") from None
+    if path.suffix.lower() not in ENDINGS:
+        raise OutputError(f"{path}: the ending must be one of {', '.join(ENDINGS)}")
+    return ENDINGS[path.suffix.lower()]
 
 
 def _stored_dtype(

@@ -15,7 +15,7 @@ import tifffile
 from conftest import DTYPES, names_in, noise, photo_pixels, whole
 from layer_files import write_layer
 
-from hugin_abflow.errors import ImageReadError
+from hugin_abflow.errors import ImageReadError, OutputError
 from hugin_abflow.images import read_layer, read_layers, write_image
 from hugin_abflow.layer import Box, full_scale
 
@@ -426,3 +426,17 @@ def open_files() -> int:
 def test_layer_tells_whether_its_file_has_alpha(tmp_path: Path, alpha: bool) -> None:
     write_layer(tmp_path / "a.tif", np.full((5, 7, 4), 255, np.uint8), alpha=alpha)
     assert read_layer(tmp_path / "a.tif").has_alpha == alpha
+
+
+def test_a_write_protected_file_is_not_replaced(tmp_path):
+    """A rename would, whoever may write into the folder."""
+    file = tmp_path / "a.tif"
+    write_image(file, np.zeros((3, 5, 4), np.uint8))
+    before = file.read_bytes()
+    file.chmod(0o444)
+    with pytest.raises(OutputError, match=r"a\.tif is write-protected"):
+        write_image(file, np.ones((3, 5, 4), np.uint8))
+    assert file.read_bytes() == before
+    file.chmod(0o644)
+    write_image(file, np.ones((3, 5, 4), np.uint8))
+    assert file.read_bytes() != before
