@@ -103,7 +103,7 @@ def _find_under(plan: Plan, prefix: str) -> Found | None:
         files = {
             index: path
             for index, path in there.items()
-            if file_key(path) not in photos and not _is_another(plan, path.with_suffix(".pto"))
+            if file_key(path) not in photos and not is_another_projects(plan, path)
         }
         if files:
             return Found(prefix, files)
@@ -114,11 +114,19 @@ def _find_under(plan: Plan, prefix: str) -> Found | None:
     return None
 
 
-def _is_another(plan: Plan, project: Path) -> bool:
-    """Whether a file is there, and another project than the plan's: what it gives its name to is its own, its
-    layers and its panorama, which may be called as a layer of this one: pano0000.tif.
+def is_another_projects(plan: Plan, file: Path) -> bool:
+    """Whether a project of the file's name lies beside it, and is not the plan's: then the file is that one's
+    panorama, or its layer, though it is called as one of this project: pano0000.tif. A link to a project is
+    one of its own, with a panorama of its own.
     """
-    return project.is_file() and not project.samefile(plan.file)
+    own = plan.file.parent.resolve() / plan.file.name
+    for project in (file.with_suffix(ending) for ending in (".pto", ".PTO")):
+        named = project.parent.resolve() / project.name
+        # where case is ignored both names may be the plan's
+        linked = own.is_symlink() or named.is_symlink()
+        if named.is_file() and named != own and (linked or not named.samefile(own)):
+            return True
+    return False
 
 
 def _is_multilayer(path: Path) -> bool:
@@ -131,7 +139,7 @@ def _is_multilayer(path: Path) -> bool:
 
 def candidates(plan: Plan) -> list[Found]:
     """Layers under the project's stem and under Hugin's default prefix, in this order."""
-    taken = _is_another(plan, plan.folder / f"{plan.hugin_prefix}.pto")
+    taken = is_another_projects(plan, plan.folder / f"{plan.hugin_prefix}.tif")
     stems = [plan.stem] if taken else [plan.stem, plan.hugin_prefix]
     names = [plan.layer_prefix(name) for name in stems]
     names += stems if plan.hdr else []
@@ -187,11 +195,10 @@ def _refuse_others(plan: Plan, prefix: str) -> None:
     """Raise `LayersMissingError` where files of such names are there after all: then they are no layers."""
     names = itertools.product(_places(plan, prefix), (image.index for image in plan.images), _ENDINGS)
     if file := next(filter(is_file, itertools.starmap(layer_path, names)), None):
-        other = file.with_suffix(".pto")
-        another = f"is named after {other.name}, another project"
-        what = another if _is_another(plan, other) else "is a photo of the project"
+        another = is_another_projects(plan, file)
+        why = f"is named after {file.stem}.pto, another project" if another else "is a photo of the project"
         raise LayersMissingError(
-            f"{file} {what}, and no layer; check --prefix, or leave it out to have nona make the layers"
+            f"{file} {why}, and no layer; check --prefix, or leave it out to have nona make the layers"
         )
 
 

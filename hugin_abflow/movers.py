@@ -61,7 +61,8 @@ _KNOWN = 0.125
 _DIFFERS = 0.12
 # The same, times what they differ by around the thing.
 _MORE = 2.0
-# The share of that, or of what the flow that is used leaves, that flow which nothing uses may leave.
+# Flow that nothing uses tells of somebody only if it leaves less than this share of the difference that flow
+# of what is around leaves, or the flow that is used, whichever explains more.
 _REMAINS = 0.75
 # Cells from a thing up to which others are around it.
 _RING = 4
@@ -183,7 +184,8 @@ def _ends_within(chart: Chart, flow: CellFlow, views: tuple[View, View], thing: 
 
 def _differs(here: View, there: View, flow: CellFlow, used: CellFlow, thing: Mask) -> bool:
     """Whether the photos differ in a thing's place if it moves as what is around, more than they do there. If
-    nothing uses its own flow, they have to differ clearly less by that than so, or by the flow that is used.
+    nothing uses its own flow, that has to leave clearly less than both what is around and the flow that is
+    used do.
 
     What is across the border of a chart that wraps does not count as around. A plain thing that left its
     place wholly differs there by as much all over, as a place that one photo shows darker, and is not told.

@@ -33,6 +33,7 @@ from hugin_abflow.found import (
     Found,
     Remap,
     find,
+    is_another_projects,
     layer_path,
     layers_by_prefix,
     named_files,
@@ -408,8 +409,11 @@ def refuse_to_keep(plan: Plan, images: Sequence[PlannedImage], prefix: str) -> N
     finals = [layer_path(prefix, image.index, plan.layer_ending) for image in images]
     for final in finals:
         if file_key(final) in photos:
+            raise OutputError(f"{final} is a photo, and no layer takes its place; rename the project")
+        if is_another_projects(plan, final):
             raise OutputError(
-                f"{final} is a photo, the layer cannot be kept by that name; rename the project"
+                f"{final} is the name of another project's panorama, {final.stem}.pto's, and no layer takes "
+                "it; rename one of both, or leave out --keep-layers"
             )
         if is_file(final) and _is_picture(final):
             raise OutputError(
@@ -418,9 +422,7 @@ def refuse_to_keep(plan: Plan, images: Sequence[PlannedImage], prefix: str) -> N
             )
     for final in finals:
         if is_special(final):  # who opens a pipe waits until somebody writes
-            raise OutputError(
-                f"{final} is a pipe or a device, the layer cannot be kept by that name; move it"
-            )
+            raise OutputError(f"{final} is a pipe or a device, and no layer takes its place; move it")
         if is_edited(final):
             raise OutputError(
                 f"{final} was changed by another program than nona, and no layer takes its place; move it, "

@@ -64,6 +64,8 @@ _CLEAN = 1 / 3
 # How bare a cut may be, in cells times full scale, before another one is looked for: by how much the residual
 # of low frequencies is more than _STRONG along it. No texture hides where white stone ends before dark glass.
 _BARE = 1.0
+# The share of that which the other one's may be, at most, for it to be taken.
+_LESS_BARE = 1 / 3
 
 Cells = npt.NDArray[np.bool_]  # (height, width) on the seam grid
 Prices = npt.NDArray[np.float64]  # (layers, height, width) on the seam grid
@@ -107,8 +109,8 @@ class Choice:
     whole_factor    (height, width): how many times as much as a cut it may cost to take a region from one
                     layer, the largest of its cells; None: it is cut wherever that is cheapest.
     clipping    h e_k: what each layer costs in a cell besides, for what it clips; None: nothing.
-    otherwise   the choice by which a region is cut whose cut would be bare by this one, if that is much less
-                so; None: there is none.
+    otherwise   a second choice, with longer cuts: a region whose cut by this one would be bare is cut by that
+                one, if that is much less bare. None: there is none.
     """
 
     whole: Cells
@@ -170,7 +172,7 @@ class Choice:
         bare = partial(_bareness, plain, self.residual.mean[rows, columns])
         if self.otherwise is not None and bare(labels) > _BARE:
             other = least(_dearer(self.otherwise._graph(rows, columns, candidates), more))
-            labels = other if bare(other) <= _CLEAN * bare(labels) else labels
+            labels = other if bare(other) <= _LESS_BARE * bare(labels) else labels
         if self.whole_factor is not None:
 
             def unseen(labels: Labels) -> float:

@@ -61,15 +61,28 @@ def test_a_prefix_that_photos_have_is_told(developed, tmp_path, monkeypatch, pre
         layers_by_prefix(read_plan(developed), prefix)
 
 
-@pytest.mark.parametrize("ending", [".tif", ".exr"])
-def test_what_is_named_after_another_project_is_no_layer(make_project, caplog, ending):
-    """Its panorama, pano0000.tif, has alpha and the canvas's size: nothing else tells it from a layer."""
+@pytest.mark.parametrize(
+    ("ending", "make", "other"),
+    [
+        (".tif", shutil.copy2, "pano0000.pto"),
+        (".exr", shutil.copy2, "pano0000.pto"),
+        (".tif", shutil.copy2, "pano0000.PTO"),
+        (".tif", os.symlink, "pano0000.pto"),
+    ],
+)
+def test_what_is_named_after_another_project_is_no_layer(make_project, caplog, ending, make, other):
+    """Its panorama, pano0000.tif, has alpha and the canvas's size: nothing else tells it from a layer. Nor is
+    it replaced by one.
+    """
     plan = read_plan(make_project())
     pixels = np.full((401, 802, 4), 255, np.uint8 if ending == ".tif" else np.float32)
     files = [plan.folder / f"pano000{index}{ending}" for index in (0, 1)]
     for file in files:
         write_image(file, pixels)
-    shutil.copy2(plan.file, plan.folder / "pano0000.pto")
+    make(plan.file, plan.folder / other)
+    kept = open_layers(plan, keep_layers=True)
+    with pytest.raises(OutputError, match=r"another project's panorama, pano0000\.pto"), kept:
+        pass
     [found] = candidates(plan)
     assert found.in_order() == files[1:] and to_make(plan) == ("pano", [0, 2])
     assert layers_by_prefix(plan, "pano").in_order() == files[1:]

@@ -118,26 +118,29 @@ def test_a_short_cut_through_what_differs_much_is_seen_less_than_a_long_one() ->
     assert np.allclose(regions.seen(alike(np.array([[0.0, 0.15]]))).rms, [[0, 0.15]])
 
 
-@pytest.mark.parametrize("alone", [False, True])
-def test_a_bare_cut_gives_way_to_a_long_one(alone: bool) -> None:
+@pytest.mark.parametrize(
+    ("differ", "at_edge", "gives_way"),
+    [(0.5, 0.02, True), (0.5, 0.45, False), (0.25, 0.02, False)],
+    ids=["bare", "no better", "not bare"],
+)
+def test_a_bare_cut_gives_way_to_a_long_one(differ: float, at_edge: float, gives_way: bool) -> None:
     """White stone before dark glass: the short way, where both layers are favoured alike, goes straight
     through, a long one along its edge.
     """
     rows, columns = (v.ravel() for v in np.mgrid[0:12, 0:40])
-    mean = np.full((12, 40), 0.5)
     edge = np.zeros((12, 40), bool)
     edge[:8, 2:4] = edge[6:8, 2:22] = edge[6:, 20:22] = True
-    mean[edge] = 0.02
+    mean = np.where(edge, at_edge, differ)
     residual = Residuals(mean, np.where(edge, 0.1, 0.5))
     share = np.clip(np.linspace(1.1, -0.1, 40), 0, 1) * np.ones((12, 1))
     cover = np.ones((2, 12, 40), bool)
     cover[1, :, 0] = cover[0, :, 39] = False
     plain = Choice(np.ones((12, 40), bool), residual, np.stack([share, 1 - share]), cover, False, CUT)
-    short = replace(plain, residual=regions.seen(residual))
-    long = replace(short, otherwise=None if alone else replace(plain, cut_price=4 * CUT))
-    found = long.label(rows, columns)[0]
-    bare = regions._bareness(plain._graph(rows, columns, np.arange(2)), mean[rows, columns], found)
-    assert bare > 1.5 if alone else bare < 0.5
+    short, long = replace(plain, residual=regions.seen(residual)), replace(plain, cut_price=8 * CUT)
+    straight, along = (one.label(rows, columns)[0] for one in (short, long))
+    found = replace(short, otherwise=long).label(rows, columns)[0]
+    assert not np.array_equal(straight, along)
+    assert np.array_equal(found, along if gives_way else straight)
 
 
 def test_how_bare_a_cut_is() -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from types import SimpleNamespace
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -17,7 +18,7 @@ from hugin_abflow import seam
 from hugin_abflow.cells import averaged, centres
 from hugin_abflow.geometry import Pair
 from hugin_abflow.opencl import Device
-from hugin_abflow.regions import Residuals
+from hugin_abflow.regions import Residuals, seen
 from hugin_abflow.scene import Scene
 from hugin_abflow.working import Grid, on_cells
 
@@ -415,6 +416,20 @@ def test_who_is_gone_is_wholly_gone(device: Device) -> None:
     assert (second == 1).all()
     rows, beside, beyond = slice(40, 56), slice(26, 30), slice(98, 102)  # centres of cells at each side
     assert (first[rows, beside] < 1e-3).all() and (first[rows, beyond] > 5e-3).all()
+
+
+def test_longer_cuts_are_dearer_and_priced_by_the_residual_itself(device: Device) -> None:
+    grid = plane(184, 104)
+    shape = seam.seam_grid(grid).shape
+    whole, residual = np.ones(shape, bool), Residuals(*np.random.default_rng(1).random((2, *shape)))
+    fields, layers = [device.zeros((104, 184, 4))] * 2, [whole_layer(device, 184, 104)] * 2
+    scene = Scene(device, layers, [], fields, SimpleNamespace(host=np.ones((2, 104, 184), bool)), grid)
+    choose = Mock(return_value=(np.zeros(shape, int), {}))
+    seam.cut(scene, residual, whole, choose=choose)
+    [choice] = choose.call_args.args
+    assert choice.otherwise.cut_price > choice.cut_price and choice.otherwise.cut_share > choice.cut_share
+    assert np.array_equal(choice.otherwise.residual.rms, residual.rms)
+    assert np.array_equal(choice.residual.rms, seen(residual).rms)
 
 
 def test_no_cell_comes_from_a_layer_that_covers_a_part_of_it(device: Device) -> None:
