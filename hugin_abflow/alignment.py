@@ -21,6 +21,7 @@ from hugin_abflow import (
     highlights,
     intermediate,
     membrane,
+    rim,
     seam,
     shadows,
     transition,
@@ -48,6 +49,8 @@ class Aligned:
     fields      where each is sampled, and its weight. reaches: how far from there, by rows (geometry.py).
     whole       where one layer was taken, on the seam grid; None: nowhere, or, without flow, everywhere.
     unlike      where they show different things, with flow there alone; None: nowhere.
+    carried     where geometry was carried into strips that one layer alone may show, as `rim.carry` gives it;
+                None: nowhere.
     """
 
     fields: list[Buffer]
@@ -55,6 +58,7 @@ class Aligned:
     correction: Correction
     whole: Cells | None
     unlike: Unlike | None
+    carried: Buffer | None = None
 
 
 def align(
@@ -72,8 +76,30 @@ def align(
     flows       of `pairs`; emptied.
     single      what single.py found, on the seam grid, to which shadows are added; None: nothing.
     """
+    strips = rim.find(masks) if transition.wanted(flows, settings) else None
+    aligned = _align(device, layers, pairs, flows, single, masks, strips, grid, settings)
+    if strips is None:
+        return aligned
+    carried = rim.carry(device, layers, aligned.fields, strips, grid)  # as they are at last, also beside cuts
+    geometry.keep_within(device, layers, aligned.fields, grid, fade=0.0)
+    reaches = [geometry.reach(device, *one, grid) for one in zip(layers, aligned.fields, strict=True)]
+    return replace(aligned, reaches=reaches, carried=carried)
+
+
+def _align(
+    device: Device,
+    layers: Sequence[WorkingLayer],
+    pairs: Sequence[Pair],
+    flows: list[PairFlow],
+    single: Cells | None,
+    masks: Masks,
+    strips: rim.Rim | None,
+    grid: Grid,
+    settings: Settings,
+) -> Aligned:
+    """`align`, but for what is carried into strips."""
     clipped = highlights.measure(device, layers, masks, grid, settings)
-    fields = _fields(device, layers, flows, clipped, masks, grid, settings)
+    fields = _fields(device, layers, flows, clipped, masks, strips, grid, settings)
     extra = highlights.reduce_weights(device, layers, fields, clipped, masks, grid)
     measured = colour.measure(device, layers, fields, pairs, grid, masks.host)
     if settings.flow and settings.seam:
@@ -107,6 +133,7 @@ def _fields(
     flows: list[PairFlow],
     clipped: Clipped,
     masks: Masks,
+    strips: rim.Rim | None,
     grid: Grid,
     settings: Settings,
 ) -> list[Buffer]:
@@ -115,7 +142,7 @@ def _fields(
     coefficients = coefficient.coefficients(device, layers, masks, grid, even=least_strain)
     if least_strain:
         uneven = clipped.excess.max(0)
-        transition.minimise_strain(device, layers, coefficients, flows, masks, grid, settings, uneven)
+        transition.minimise_strain(device, layers, coefficients, flows, masks, grid, settings, uneven, strips)
     intermediate.replace_flows(device, layers, coefficients, flows, grid, settings)
     fields = geometry.fields(device, layers, coefficients, flows, grid, settings)
     if settings.flow and settings.intermediate:  # else nothing is displaced, or as published

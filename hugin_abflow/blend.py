@@ -86,6 +86,8 @@ class Prepared:
     shoulder    of the exposure scale (colour.py).
     light_unit  of floats, the value that counts as full scale of what they are coded as (unit.py).
     unlike      where layers show different things, by which offsets were made; None: nowhere.
+    carried     on a grid, uint8 (height, width): where what one layer alone shows is sampled as its field
+                says, too (rim.py). None: nowhere.
     """
 
     layers: tuple[BlendLayer, ...]
@@ -96,6 +98,7 @@ class Prepared:
     shoulder: float
     light_unit: float = 1.0
     unlike: Unlike | None = None
+    carried: tuple[Grid, Buffer] | None = None
 
 
 def bands(
@@ -187,6 +190,8 @@ def _bands(
     share = _QUARTER_LEVEL.get(first.dtype, _QUARTER_FINE_LEVEL)
     whole = (0, 0, prepared.gain_grid.width, prepared.gain_grid.height)
     longitudes = _sines_cosines(device, full.lonlat[0], full.lonlat[1], crop.left - region.left, crop.width)
+    strips = (0, 0, 0, 0) if prepared.carried is None else prepared.carried[0].border
+    carried = device.zeros((1, 1), np.uint8) if prepared.carried is None else prepared.carried[1]
     plan = _plan(prepared, crop, height)
     # all that lie in a band tell what nobody sees
     fields = Slices(device, [(layer.box, layer.field) for layer in layers], grid, plan, everywhere=True)
@@ -221,7 +226,8 @@ def _bands(
                 offsets.values, longitudes, latitudes, full.border, full.lonlat, grid.border,
                 prepared.gain_grid.border, prepared.offset_grid.border, (part.left, part.top, *size),
                 (region.left, region.top), prepared.shoulder, math.sqrt(prepared.light_unit),
-                int(settings.interpolation == "nearest"), share, marks, marks.shape[-1], out, options=options,
+                int(settings.interpolation == "nearest"), share, marks, marks.shape[-1],
+                carried, strips, out, options=options,
             )  # fmt: skip
             yield _stored(out.get(), first.dtype)
 

@@ -19,6 +19,7 @@ there, round posts and letters. Where layers cannot be brought to one brightness
 transitions of layers that reach beyond each other are as wide as the overlap. Layers of one and the same mask
 share it evenly.
 
+Where a layer ends shortly before the panorama's rim the strip beyond counts as if it were there (rim.py).
 Layers end hard at their borders in overlaps that are thinner than a cell, as in holes of their masks. The sum
 is minimised by relaxation on a pyramid of cells. On the coarsest the well is deepened step by step, since
 without it there is a single minimum; the finer ones start from what the coarser ones have found.
@@ -38,6 +39,7 @@ from hugin_abflow.coefficient import Masks, divide
 from hugin_abflow.geometry import PairFlow
 from hugin_abflow.layer import Box
 from hugin_abflow.opencl import Buffer, Device
+from hugin_abflow.rim import Rim
 from hugin_abflow.settings import Settings
 from hugin_abflow.working import Grid, Place, WorkingLayer, cells_under, on_cells
 
@@ -101,16 +103,20 @@ def minimise_strain(
     grid: Grid,
     settings: Settings,
     uneven: Values,
+    rim: Rim | None = None,
 ) -> None:
     """Make coefficients those of least strain, in place; see `wanted`. What they were where several layers
     overlap does not count.
 
     uneven      where layers cannot be brought to one brightness, 0..1: (height, width) on any coarse grid
                 over the same region.
+    rim         strips that count as if layers reached over them; None: there are none.
     """
     grids = [grid.coarser(pixels) for pixels in _CELLS]
-    covers = _covers(masks, grids)
+    covers = _covers(masks.host if rim is None else masks.host | rim.strips, grids)
     price, bent = _prices(device, layers, flows, masks, grid, grids[-1], covers[-1])
+    if rim is not None:
+        price, bent = _over_strips((price, bent), rim, grids[-1])
     shares: Shares | None = None
     for cells, cover in zip(grids, covers, strict=True):
         finer = Shares.equal(device, cells, cover)
@@ -132,9 +138,12 @@ def minimise_strain(
     _expand(device, layers, coefficients, shares, grid)
 
 
-def _covers(masks: Masks, grids: Sequence[Grid]) -> list[Mask]:
-    """Which layers have a share in which cells of each grid, (layers, height, width)."""
-    whole = part = masks.host
+def _covers(cover: Mask, grids: Sequence[Grid]) -> list[Mask]:
+    """Which layers have a share in which cells of each grid, (layers, height, width).
+
+    cover       where they are, on the masks' grid.
+    """
+    whole = part = cover
     result = []
     for cells in reversed(grids):
         whole, part = on_cells(whole, cells, np.logical_and), on_cells(part, cells, np.logical_or)
@@ -172,6 +181,20 @@ def _prices(
     )
     counts = np.maximum(around, 1e-6)
     return np.square(length / counts) + _LEAST_PARALLAX**2, _BENT * (bent / counts)
+
+
+def _over_strips(
+    prices: tuple[npt.NDArray[np.float64], ...], rim: Rim, cells: Grid
+) -> tuple[npt.NDArray[np.float64], ...]:
+    """Prices (height, width) in strips as they are beside them: flow is not known there, and nothing would
+    cost less than to lead a transition along a strip.
+    """
+    covered = on_cells(rim.covered[None], cells, np.logical_or)[0]
+    unknown = on_cells(rim.strips, cells, np.logical_or).any(0) | ~covered
+    if unknown.all():
+        return prices
+    near = scipy.ndimage.distance_transform_edt(unknown, return_distances=False, return_indices=True)
+    return tuple(np.where(unknown & covered, price[tuple(near)], price) for price in prices)
 
 
 def _texture(device: Device, layer: WorkingLayer, grid: Grid, cells: Grid) -> tuple[Buffer, Place]:

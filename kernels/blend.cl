@@ -225,7 +225,7 @@ __kernel void blend_mark(
 
 /* One band of the panorama: each pixel is the mean of the layers that cover it, sampled where their fields say and
    weighted as they say. The sum is of differences from the first of these samples, so that equal colours stay equal
-   to the bit. Where only one covers it, or none weighs anything, a pixel is the first layer's own. */
+   to the bit. Where only one covers it (but for thin strips), or none weighs anything, a pixel is the first layer's own. */
 __kernel void blend_band(
     __global const pixel_stored *stored, /* a ring of rows for each layer: (ring, width) */
     __global const blend_layer *layers, int count, /* those that the band may touch */
@@ -243,6 +243,8 @@ __kernel void blend_band(
     int nearest,                         /* 1: nearest-neighbour sampling */
     float share,                         /* of all weight, below which a layer is hidden */
     __global const uint *marks, int words, /* from blend_mark */
+    __global const uchar *carried,       /* (strips.y, strips.x) where one layer alone is sampled so as well */
+    int4 strips,                         /* a grid over the region; zeros: nowhere */
     __global pixel_stored *out)          /* (band.w, band.z) */
 {
     const int x = PIXELS * get_global_id(0), y = get_global_id(1);
@@ -264,6 +266,11 @@ __kernel void blend_band(
         const blend_int seen = blend_valid(stored, layers + k, place);
         several |= seen & known;
         known |= seen;
+    }
+    if (strips.x) {
+        __global const uchar *line = carried + LEAST((int)(py * strips.y / border.y), strips.y - 1) * strips.x;
+#define BLEND_STRIP(n, i) (line[LEAST((int)(px.i * strips.x / border.x), strips.x - 1)] ? -1 : 0)
+        several |= known & (blend_int)(BLEND_LIST(BLEND_STRIP));
     }
     blend_int corrected = (blend_int)(0);
     blend_samples reference = (blend_samples)(0.0f), sum = reference;

@@ -159,20 +159,24 @@ def test_a_band_of_three_layers_equals_its_twin(
     ]
     assert np.array_equal(marks.get(), np.concatenate([marked[0], np.full((1, blocks, 2, 1), MARK)]))
     assert 0 < (marked[0] != 0b111).mean() < 1
+    strips = full.resized(39, 20)
+    told = np.zeros(strips.shape, np.uint8)
+    told[:, 9:17] = 1
+    carried = device.upload(told)
     made = []
     for given in marked:
         device.run(
             "blend", "blend_band", (-(-width // together), band[3]), rows, touched, 3, lines, factors,
             summands, *axes, full.border, full.lonlat, grid.border, cells.border, halves.border, band, origin,
-            shoulder, unit**0.5, nearest, share, device.upload(given.astype(np.uint32)), 1, out,
-            options=options,
+            shoulder, unit**0.5, nearest, share, device.upload(given.astype(np.uint32)), 1,
+            carried, strips.border, out, options=options,
         )  # fmt: skip
         made.append(out.get())
     assert np.array_equal(*made)  # what is not marked changes nothing
     raised = [(spans[0], offsets[0]), None, (spans[1], offsets[1])]
     expected = twin.blend_band(
         stored, places, marked_fields, boxes, gains, raised, full.border, full.lonlat, grid.border,
-        cells.border, halves.border, band, origin, shoulder, unit, nearest, share, white,
+        cells.border, halves.border, band, origin, shoulder, unit, nearest, share, white, told,
     )  # fmt: skip
     result, beyond = np.split(made[0], [36])
     assert not beyond.any()

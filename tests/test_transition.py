@@ -257,7 +257,7 @@ def test_wells_are_as_large_as_their_cells() -> None:
 def test_cells_that_no_layer_covers_whole_are_shared_by_those_that_reach_into_them() -> None:
     masks = np.zeros((2, 8, 16), bool)
     masks[0, :, :6], masks[1, :, 6:] = True, True
-    (cover,) = transition._covers(Masks(plane(16, 8), (), masks), [plane(4, 2)])
+    (cover,) = transition._covers(masks, [plane(4, 2)])
     assert cover[:, 0].tolist() == [[True, True, False, False], [False, True, True, True]]
 
 

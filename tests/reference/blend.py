@@ -159,6 +159,7 @@ def blend_band(
     nearest: int,
     share: float,
     white: float,
+    carried: Array,
 ) -> Array:
     """Samples of the band, float64 but rounded and within 0..white for integer layers.
 
@@ -166,6 +167,7 @@ def blend_band(
     fields, boxes       of `hidden_mark`, and their boxes on the working grid.
     gains               on the whole colour grid.
     offsets             and their boxes on their grid.
+    carried             on any grid: where one layer alone is sampled as several are.
     """
     columns, rows = pixels(band[2], band[3], band[0], band[1])
     x, y = columns + 0.5, rows + 0.5
@@ -191,6 +193,8 @@ def blend_band(
         some = ((exposure != 0) | (raised != 0)).any(-1)
         seen.append((own[..., 3] > 0, looks, f[..., 3], colour[..., 3], some))
     count = sum(layer[0].astype(int) for layer in seen)
+    strips = carried.shape[0] / border[1], carried.shape[1] / border[0]
+    several = (count > 1) | (carried[(y * strips[0]).astype(int), (x * strips[1]).astype(int)] > 0)
     own, corrected, known = np.zeros((*x.shape, 3)), np.zeros(x.shape, bool), np.zeros(x.shape, bool)
     for covered, looks, _, _, exposed in seen:
         fresh = covered & ~known
@@ -200,7 +204,7 @@ def blend_band(
     def mean(hidden: Array) -> tuple[Array, Array, Array, Array]:
         total, weight, summed, touched = (np.zeros((*x.shape, n)) for n in (1, 1, 3, 1))
         for covered, looks, wanted, valid, exposed in seen:
-            w = np.where(covered & (count > 1), np.maximum(wanted + hidden, 0), 0)[..., None]
+            w = np.where(covered & several, np.maximum(wanted + hidden, 0), 0)[..., None]
             total, w = total + w, w * valid[..., None] ** 2
             weight, summed = weight + w, summed + looks[1] * w
             touched = touched + ((w > 0) & exposed[..., None])
