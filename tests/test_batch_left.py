@@ -114,6 +114,49 @@ def test_what_it_was_before_is_stale_where_something_else_was_made_since(
     assert "tiny_blended_fused.tif was changed since it was made; it is left" in make(project).warnings[0]
 
 
+@pytest.mark.parametrize("remembered", [False, True])
+def test_what_is_asked_for_no_more_is_nobody_s_business(
+    project: Path, made: list[str], remembered: bool
+) -> None:
+    """It was warned of for ever, with an advice that did nothing; and without it, all was made anew."""
+    project.write_text(project.read_text().removesuffix(BOTH))
+    panorama = project.with_name("tiny.tif")
+    if remembered:
+        make(project)
+    retouched = save(panorama, GIMP)
+    assert len(make(project).warnings) == 1
+    project.write_text(project.read_text() + "#hugin_outputImageType jpg\n")
+    made.clear()
+    record = make(project)
+    assert record.warnings == [] and [file.name for file in record.files] == made == ["tiny.jpg"]
+    for there in (True, False):
+        assert panorama.exists() == there and (not there or panorama.read_bytes() == retouched)
+        record = make(project)
+        assert record.result == "skipped" and record.warnings == [] and len(record.files) == 1
+        panorama.unlink(missing_ok=True)
+
+
+def test_stacks_that_were_retouched_are_left_as_long_as_they_are_checked(
+    project: Path, made: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    stack, stitch = project.with_name("tiny_stack_ldr_0001.tif"), task.stitch_project
+
+    def stitch_all(path: Path, finished: Callable[[Path], None], **options: Any) -> None:
+        stitch(path, finished=finished, **options)
+        save(stack, "Hugin 2023.0.0")
+        finished(stack)
+
+    monkeypatch.setattr(task, "stitch_project", stitch_all)
+    checked = "#hugin_outputLDRStacks true\n"
+    project.write_text(project.read_text() + checked)
+    make(project)
+    save(stack, GIMP)
+    (warning,) = make(project).warnings
+    assert f"{stack} was changed" in warning
+    project.write_text(project.read_text().removesuffix(checked))
+    assert make(project).warnings == []
+
+
 @pytest.mark.parametrize("options", [{}, {"output": "out.tif"}, {"prefix": "tiny"}], ids=str)
 def test_nothing_is_made_where_all_is_left(
     project: Path, made: list[str], monkeypatch: pytest.MonkeyPatch, options: dict[str, str]

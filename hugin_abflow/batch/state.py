@@ -22,7 +22,7 @@ from hugin_abflow.found import layers_there
 from hugin_abflow.images import image_size, read_layers
 from hugin_abflow.jpeg import is_cut
 from hugin_abflow.metadata import saved_by, version
-from hugin_abflow.outputs import checked_outputs, impossible, possible_outputs
+from hugin_abflow.outputs import checked_outputs, impossible, possible_outputs, results
 from hugin_abflow.project import read_plan
 from hugin_abflow.stitch import asked_panoramas, is_more_asked
 
@@ -84,7 +84,9 @@ class State:
         somebody changed since, or another program saved, is left, with a warning, whatever else changed.
         Nobody's work is lost unasked. Else do nothing more. `begin` comes first.
         """
-        found = self._found()
+        asked = self._asked()
+        # what somebody changed and nobody asks for any more is not ours: no run would make it anew
+        found = [(entry, how) for entry, how in self._found() if how != "changed" or entry["file"] in asked]
         there = [entry for entry, how in found if how != "gone"]
         same = bool(found) and self._known["hash"] == self._hash()
         # what was left out is to be made once its program is installed
@@ -120,6 +122,13 @@ class State:
                 return found
         self._known = {}
         return []
+
+    def _asked(self) -> set[str]:
+        """Names of the outputs that are asked for now, whether or not they can be made here."""
+        files = asked_panoramas(self._plan, **self._options)
+        if not self._names_one():
+            files += results(self._plan, keep_layers=False)
+        return {self._name(file) for file in files}
 
     def _foreign(self, known: Collection[str]) -> list[Entry]:
         """Panoramas that would be replaced, of which nothing is known, and which another program saved."""
@@ -178,9 +187,11 @@ class State:
 
     def _left_out(self) -> list[str]:
         """Outputs that are checked in the project, but lack a program here."""
-        if any(self._options.get(name) for name in ("output", "prefix", "layers")):
-            return []
-        return sorted(impossible(checked_outputs(self._plan)))
+        return [] if self._names_one() else sorted(impossible(checked_outputs(self._plan)))
+
+    def _names_one(self) -> bool:
+        """Whether the options ask for one panorama, whatever is checked in the project."""
+        return any(self._options.get(name) for name in ("output", "prefix", "layers"))
 
     def _load(self) -> dict[str, Any]:
         """What was remembered; nothing if it is unreadable."""
