@@ -34,7 +34,7 @@ class Deaf:
     def phase_began(self, name: str, total: int) -> None: ...
     def advanced(self, name: str, units: int) -> None: ...
     def phase_ended(self, name: str, seconds: float) -> None: ...
-    def message(self, level: int, text: str) -> None: ...
+    def message(self, level: int, text: str, left: str = "") -> None: ...
 
 
 @pytest.fixture
@@ -98,6 +98,19 @@ def test_only_what_was_retouched_is_left(project: Path, made: list[str], remembe
     fused.unlink()
     assert make(project).result == "made" and fused.is_file()
     assert make(project).result == "skipped" and make(project).warnings == []
+
+
+def test_a_warning_tells_a_display_which_file_is_left(project: Path, made: list[str]) -> None:
+    told: list[str] = []
+
+    class Ear(Deaf):
+        def message(self, level: int, text: str, left: str = "") -> None:
+            told.append(left)
+
+    file = project.with_name("tiny.tif")
+    save(file, GIMP)
+    perform(Task(project, {"settings": Settings()}, resume=True), Ear())
+    assert str(file) in told
 
 
 def test_what_it_was_before_is_stale_where_something_else_was_made_since(

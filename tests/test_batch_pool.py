@@ -42,7 +42,7 @@ class Ear:
     def phase_ended(self, name: str, seconds: float) -> None:
         self.phases.append(f"{name} done")
 
-    def message(self, level: int, text: str) -> None:
+    def message(self, level: int, text: str, left: str = "") -> None:
         self.messages.append(text)
 
 

@@ -94,6 +94,27 @@ def test_a_panorama_that_is_left_is_told_once(tmp_path: Path, capsys: pytest.Cap
     assert (tmp_path / "log").read_text().count("a.tif was changed\n") == 4
 
 
+def test_a_file_that_is_left_is_told_once_whatever_becomes_of_others(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """And whatever is the reason: what was changed was saved by GIMP once others are made."""
+    task = Task(tmp_path / "a.pto")
+    with Display(quiet=False, verbose=False, log=None) as display:
+        for result, text, left, shown in (
+            ("made", "a.tif was changed, and so was a.pto", "a.tif", True),
+            ("made", "a.tif was saved by GIMP", "a.tif", False),
+            ("failed", "a.tif was saved by GIMP", "a.tif", False),
+            ("skipped", "a.tif was saved by GIMP", "a.tif", False),
+            ("made", "a_fused.tif was saved by GIMP", "a_fused.tif", True),
+            ("made", "a.tif was saved by GIMP", "a.tif", True),
+            ("made", "a.tif has a hole", "", True),
+            ("made", "a.tif was saved by GIMP", "a.tif", True),
+        ):
+            display.began(task).message(logging.WARNING, text, left)
+            display.ended(task, Record(task.project, result))
+            assert (f"{text}\n" in capsys.readouterr().err) == shown, (result, text)
+
+
 def test_project_that_is_still_being_saved_waits(tmp_path: Path) -> None:
     saved = start(tmp_path)
     for part in range(6):

@@ -61,8 +61,8 @@ class _Voice:
     def phase_ended(self, name: str, seconds: float) -> None:
         self.tell("phase_ended", name, seconds)
 
-    def message(self, level: int, text: str) -> None:
-        self.tell("message", level, text)
+    def message(self, level: int, text: str, left: str = "") -> None:
+        self.tell("message", level, text, left)
 
 
 def _perform(task: Task, key: str, topic: str, level: int, its_version: str) -> Record:

@@ -87,9 +87,11 @@ class Display:
     def __init__(self, quiet: bool, verbose: bool, log: TextIO | None) -> None:
         self.quiet, self.verbose, self._log = quiet, verbose, log
         self.total = self.done = self.failed = 0
-        # warnings of each project: of what is left as it is, and so far of what is going on
+        # warnings of each project that are no news, and those so far of what is going on: their texts, but of
+        # outputs that are left as they are the files, since the reason may be another each time
         self._known: dict[Path, set[str]] = {}
         self._said: dict[Path, set[str]] = {}
+        self._left: dict[Path, set[str]] = {}  # those files alone
 
     def __enter__(self) -> Display:
         return self
@@ -104,6 +106,7 @@ class Display:
     def began(self, task: Task) -> Voice:
         """A task begins."""
         self._said[task.project] = set()
+        self._left[task.project] = set()
         return Voice(self, task)
 
     def ended(self, task: Task, record: Record) -> None:
@@ -111,9 +114,10 @@ class Display:
         self.done += 1
         if record.result == "failed":
             self.failed += 1
-        # a watched folder's project is looked at each time it is saved: no warning is news then
-        said = self._said.pop(task.project, set())
-        self._known[task.project] = said if record.result == "skipped" else set()
+        # a watched folder's project is looked at each time it is saved: no warning is news where nothing is
+        # made, and where other outputs are, none of one that is left
+        said, left = self._said.pop(task.project, set()), self._left.pop(task.project, set())
+        self._known[task.project] = said if record.result == "skipped" else left
         self._tell_end(task, record)
         line = f"[{self.done}/{self.total}] {name_of(task.project)}: {outcome(record)}"
         self.write_log(logging.INFO, line)
@@ -128,12 +132,16 @@ class Display:
             for line in phase_table(record):
                 self.tell(task, logging.INFO, line)
 
-    def tell(self, task: Task, level: int, text: str) -> None:
-        """A message about a task. Warnings about what was left as it is and still is are not shown again."""
+    def tell(self, task: Task, level: int, text: str, left: str = "") -> None:
+        """A message about a task. Warnings about what was left as it is (the file `left`, or all that there
+        is) and still is are not shown again.
+        """
         self.write_log(level, f"{name_of(task.project)}: {text}")
         if level == logging.WARNING:
-            self._said.setdefault(task.project, set()).add(text)
-            if text in self._known.get(task.project, ()):
+            self._said.setdefault(task.project, set()).add(left or text)
+            if left:
+                self._left.setdefault(task.project, set()).add(left)
+            if (left or text) in self._known.get(task.project, ()):
                 return
         if level >= logging.WARNING or (self.verbose and not self.quiet):
             self._show(f"{label(level)}{self._heading(task, text)}{text}")
@@ -307,9 +315,9 @@ class Voice:
         """A phase is done."""
         self.display.phase_ended(self.task, name, seconds)
 
-    def message(self, level: int, text: str) -> None:
-        """A message."""
-        self.display.tell(self.task, level, text)
+    def message(self, level: int, text: str, left: str = "") -> None:
+        """A message; left: the output that it says is left as it is."""
+        self.display.tell(self.task, level, text, left)
 
 
 def choose_display(lone: bool, quiet: bool, verbose: bool, log: TextIO | None) -> Display:

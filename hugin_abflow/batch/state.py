@@ -144,7 +144,8 @@ class State:
         else:
             what = "was changed since it was made"
             what += "" if same else ", and so were project, photos, layers or settings"
-        _log.warning("%s %s; it is left as it is (--force makes it anew)", file, what)
+        extra = {"left": str(file)}  # by which a display knows that it has told so before
+        _log.warning("%s %s; it is left as it is (--force makes it anew)", file, what, extra=extra)
 
     def note(self, file: Path) -> None:
         """Remember that an output was made just now, though not yet of what: where the run is killed, or is

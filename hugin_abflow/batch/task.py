@@ -70,8 +70,8 @@ class Listener(Protocol):
     def phase_ended(self, name: str, seconds: float) -> None:
         """A phase is done."""
 
-    def message(self, level: int, text: str) -> None:
-        """A message of `logging`'s level."""
+    def message(self, level: int, text: str, left: str = "") -> None:
+        """A message of `logging`'s level; left: the output that it says is left as it is."""
 
 
 def perform(task: Task, listener: Listener, level: int = logging.WARNING, turn: Turn | None = None) -> Record:
@@ -90,7 +90,7 @@ def perform(task: Task, listener: Listener, level: int = logging.WARNING, turn: 
             record.warnings.append(said.getMessage())
         if hasattr(said, "overlap"):
             record.overlaps.append(said.overlap)
-        listener.message(said.levelno, said.getMessage())
+        listener.message(said.levelno, said.getMessage(), getattr(said, "left", ""))
 
     with messages(level, show=show):
         try:

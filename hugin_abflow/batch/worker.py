@@ -46,8 +46,8 @@ class _Sender:
     def phase_ended(self, name: str, seconds: float) -> None:
         self.send("phase_ended", name, seconds)
 
-    def message(self, level: int, text: str) -> None:
-        self.send("message", level, text)
+    def message(self, level: int, text: str, left: str = "") -> None:
+        self.send("message", level, text, left)
 
 
 # What the pool answers to "turn_wanted".
