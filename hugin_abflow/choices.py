@@ -10,6 +10,7 @@ import click
 
 from hugin_abflow.batch.config import NAME, read_config, write_config
 from hugin_abflow.errors import ConfigError
+from hugin_abflow.oneline import commented
 from hugin_abflow.options import kind_of, long_names
 
 # Options that a file of settings cannot give.
@@ -144,5 +145,5 @@ def config_texts(
         projects = [project for project, (its_file, _) in chosen.items() if its_file == file]
         values = chosen[projects[0]][1]
         plain = {name: values[str(names[name].name)] for name in _known(command)}
-        origin = [f"# {file or f'no {NAME}'}", *(f"# for {one}" for one in projects if one.name)]
-        yield "\n".join([*origin, write_config(plain)])
+        origin = [str(file or f"no {NAME}"), *(f"for {one}" for one in projects if one.name)]
+        yield "\n".join([*map(commented, origin), write_config(plain)])

@@ -11,6 +11,7 @@ from pathlib import Path
 from hugin_abflow import pto
 from hugin_abflow.exif import Metadata, comment, comment_of, read_exif, text, text_of
 from hugin_abflow.layer import Canvas
+from hugin_abflow.oneline import one_line
 from hugin_abflow.project import Plan
 from hugin_abflow.scratch import is_file
 from hugin_abflow.tifftags import EXIF, GPS, LONG, MAIN, RATIONAL, SHORT, UNDEFINED, Directories, Value
@@ -118,7 +119,7 @@ def saved_by(path: Path) -> str:
     that Hugin calls, such as enblend, name none.
     """
     software = _software(read_exif(path) if is_file(path) else {})
-    return "" if "hugin" in software.lower() else software
+    return "" if "hugin" in software.lower() else one_line(software)
 
 
 def _software(found: Directories) -> str:

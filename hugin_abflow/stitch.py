@@ -27,6 +27,7 @@ from hugin_abflow.merge import (
 )
 from hugin_abflow.metadata import describe
 from hugin_abflow.nona import open_layers, planned_layers, refuse_to_keep, remapping
+from hugin_abflow.oneline import commented
 from hugin_abflow.outputs import (
     BLEND,
     WORDS,
@@ -236,15 +237,14 @@ def _script(
     becomes of files that are there: of `results`, which are made, and of those that are left.
     """
     crop, canvas = plan.canvas.crop, plan.canvas
-    head = [
-        f"# {plan.file.name}: {len(plan.images)} photos, {plan.projection}, "
+    said = [
+        f"{plan.file.name}: {len(plan.images)} photos, {plan.projection}, "
         f"{crop.width} x {crop.height} of {canvas.width} x {canvas.height}",
-        *(f"# {file.name} is there, and replaced" for file in results if is_file(file)),
-        *(f"# {file.name} is left as it is (--force: made anew)" for file in leave),
-        "set -e",
-        shlex.join(["cd", str(plan.folder)]),
+        *(f"{file.name} is there, and replaced" for file in results if is_file(file)),
+        *(f"{file.name} is left as it is (--force: made anew)" for file in leave),
     ]
-    lines = ["# " + words[1] if words[0] == "#" else " ".join(map(_quoted, words)) for words in commands]
+    head = [*map(commented, said), "set -e", shlex.join(["cd", str(plan.folder)])]
+    lines = [commented(words[1]) if words[0] == "#" else " ".join(map(_quoted, words)) for words in commands]
     if any(word.startswith(_TEMPORARY) for words in commands for word in words):
         remove = 'rm -rf "$layers"'
         # another project's script may follow, with a folder of its own

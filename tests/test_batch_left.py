@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import shlex
 from collections.abc import Callable, Collection
 from pathlib import Path
 from typing import Any
@@ -217,6 +219,8 @@ def test_the_program_is_told_by_software(tmp_path: Path, ending: str) -> None:
     assert saved_by(file) == saved_by(tmp_path / "none") == saved_by(tmp_path) == ""
     embed(file, ENDINGS[file.suffix], Metadata({MAIN: {305: text(GIMP)}}, b""))
     assert saved_by(file) == GIMP
+    embed(file, ENDINGS[file.suffix], Metadata({MAIN: {305: text("GIMP\nerror: \x1b[2J")}}, b""))
+    assert saved_by(file) == "GIMP?error: ?[2J"
 
 
 def test_dry_run_tells_what_becomes_of_what_is_there(
@@ -242,6 +246,21 @@ def test_dry_run_tells_what_becomes_of_what_is_there(
         assert ("enfuse" in shown.out) == (len(lines) == 2 and "left" not in lines[1])
         assert ("was saved by GIMP" in shown.err) == ("left" in lines[-1])
     assert made == []
+
+
+@pytest.mark.skipif(os.name == "nt", reason="no such names there")
+def test_a_line_break_in_a_name_runs_nothing(
+    tmp_path: Path, made: list[str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    """What follows it was a command of the script that is shown."""
+    project = write_project(tmp_path / "a\ntouch harm\n.pto")
+    for left in (False, True):
+        save(project.with_suffix(".tif"), GIMP if left else False)
+        assert cli.main(["--dry-run", str(tmp_path)]) == 0
+        shown = capsys.readouterr().out
+        tokens = shlex.shlex(shown, posix=True, punctuation_chars=False)
+        assert [line for line in shown.splitlines() if "left as it is" in line or "is there" in line]
+        assert "touch" not in list(tokens) and "# a?touch harm?" in shown.replace(f"{tmp_path}/", "")
 
 
 @pytest.mark.parametrize("scripted", [False, True])

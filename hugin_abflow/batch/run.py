@@ -17,6 +17,7 @@ from hugin_abflow.batch.record import Record
 from hugin_abflow.batch.report import print_table, write_report
 from hugin_abflow.batch.task import Task, left_alone
 from hugin_abflow.errors import AbflowError, ExitCode, OutputError, SameOutputError
+from hugin_abflow.oneline import commented
 from hugin_abflow.scratch import is_special
 from hugin_abflow.stitch import show_project
 from hugin_abflow.terminal import complain, messages, print_path, print_result
@@ -166,7 +167,7 @@ def show(tasks: Iterable[Task], words: Mapping[Path, Sequence[str]]) -> ExitCode
                 if nothing:
                     names = ", ".join(file.name for file in left)
                     what = f"{names}: made before, left as it is (--force: anew)"
-                    print_result(f"# {name_of(one.project)}: {what}")
+                    print_result(commented(f"{name_of(one.project)}: {what}"))
                 else:
                     options = words[one.project]
                     lines = show_project(one.project, **one.options, options=options, leave=left)
