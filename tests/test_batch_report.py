@@ -15,9 +15,10 @@ import tifffile
 from shoots import HEIGHT, WIDTH, textured, write_project
 
 from hugin_abflow import cli
+from hugin_abflow.batch import run
 from hugin_abflow.batch.record import Record
 from hugin_abflow.batch.report import SCHEMA, summary, write_report
-from hugin_abflow.errors import ExitCode, OutputError
+from hugin_abflow.errors import ClusterError, ExitCode, OutputError
 
 PAGE = (Path(__file__).resolve().parent.parent / "docs" / "report.md").read_text("utf-8")
 
@@ -130,6 +131,21 @@ def test_what_is_left_of_a_run_is_told(
     assert said.endswith(told) and ("left" in said) == bool(told)
     assert cli.main(["b.pto", "--resume"]) == ExitCode.INTERRUPTED
     assert capsys.readouterr().err.strip() == "hugin-abflow: interrupted"
+
+
+def test_what_is_left_after_an_error_is_not_what_the_same_command_makes(
+    replace: Callable[..., None], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The error says what to do."""
+
+    def fail(*_: object) -> None:
+        raise ClusterError("no scheduler answers; start one")
+
+    replace(lambda path, **keywords: path.with_suffix(".tif"))
+    monkeypatch.setattr(run, "_performers", fail)
+    assert cli.main(["a.pto", "b.pto"]) == ExitCode.CLUSTER
+    rest, error = capsys.readouterr().err.splitlines()
+    assert rest.endswith("2 of 2 projects left") and error.endswith("no scheduler answers; start one")
 
 
 def test_report_is_replaced_whole(tmp_path: Path) -> None:

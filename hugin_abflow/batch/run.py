@@ -71,7 +71,7 @@ def run(tasks: Iterable[Task | str | None], how: Run, lone: bool = False) -> Exi
     order: dict[Path, int] = {}
     running: set[Path] = set()
     unprinted: OutputError | None = None
-    complete = False
+    complete = interrupted = False
     with ExitStack() as stack:
         log = stack.enter_context(open_log(how.log))
         stack.enter_context(trace.recording(how.profile))
@@ -96,12 +96,15 @@ def run(tasks: Iterable[Task | str | None], how: Run, lone: bool = False) -> Exi
                             except OutputError as error:
                                 unprinted = error  # the panoramas are there, and others wait
             complete = True
+        except KeyboardInterrupt:
+            interrupted = True
+            raise
         finally:
             records.sort(key=lambda record: order.get(record.project, 0))
             if records and not lone and not how.quiet:
                 print_table(records)
             if not complete and not lone and isinstance(tasks, Sequence):
-                display.note(_rest(tasks, len(records)))
+                display.note(_rest(tasks, len(records), interrupted))
             if how.report:
                 try:
                     write_report(how.report, records, how.arguments)
@@ -114,11 +117,16 @@ def run(tasks: Iterable[Task | str | None], how: Run, lone: bool = False) -> Exi
     return combine([record.exit_code for record in records])
 
 
-def _rest(tasks: Sequence[Task | str | None], done: int) -> str:
-    """How much is left of a run over several projects that ends too early, and what to do."""
+def _rest(tasks: Sequence[Task | str | None], done: int, interrupted: bool) -> str:
+    """How much is left of a run over several projects that ends too early; if somebody interrupted it, what
+    to do, too. An error says that itself, and the same command might end in the same.
+    """
+    left = f"{len(tasks) - done} of {len(tasks)} projects left"
+    if not interrupted:
+        return left
     resumed = all(task.resume for task in tasks if isinstance(task, Task))
     remedy = "the same command goes on from here" if resumed else "with --force the same command begins anew"
-    return f"{len(tasks) - done} of {len(tasks)} projects left; {remedy}"
+    return f"{left}; {remedy}"
 
 
 def _performers(how: Run, count: int, lone: bool, display: Display) -> Alone | Pool | Cluster:
