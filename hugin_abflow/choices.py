@@ -130,7 +130,8 @@ def _read(command: click.Command, file: Path) -> dict[str, Any]:
     choices = {name: list(kind.choices) for name, kind in types.items() if isinstance(kind, click.Choice)}
     options = [param for param in command.params if isinstance(param, click.Option)]
     others = {max(option.opts, key=len).lstrip("-") for option in options} - kinds.keys()
-    return read_config(file, kinds, paths, choices, others)
+    short = {one.lstrip("-"): name for name, option in names.items() for one in option.opts}
+    return read_config(file, kinds, paths, choices, others, short)
 
 
 def config_texts(

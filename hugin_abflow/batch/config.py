@@ -37,6 +37,7 @@ def read_config(
     paths: Iterable[str],
     choices: Mapping[str, Sequence[str]],
     others: Collection[str],
+    short: Mapping[str, str],
 ) -> dict[str, Any]:
     """The options that a file gives, by their names without dashes in front.
 
@@ -44,6 +45,7 @@ def read_config(
     paths       options that are files; relative ones are meant from the file's folder.
     choices     of options that take one of a few texts.
     others      options that only the command line can give.
+    short       other names that options have on the command line, without dashes, and the options' names.
 
     Raises `ConfigError` for a file that cannot be read, a section, an unknown option (with a suggestion), or
     a value of another kind.
@@ -67,7 +69,7 @@ def read_config(
             )
         if name not in kinds:
             raise ConfigError(
-                f"{file}: there is no option {name!r} for such files; {_suggestion(name, kinds)}"
+                f"{file}: there is no option {name!r} for such files; {_suggestion(name, kinds, short)}"
             )
         _check(file, name, value, kinds[name], choices.get(name, ()))
     for name in set(paths) & set(values):
@@ -93,8 +95,11 @@ def write_config(values: Mapping[str, Any]) -> str:
     return tomli_w.dumps(plain) + (f"# not given: {silent}\n" if silent else "")
 
 
-def _suggestion(name: str, known: Iterable[str]) -> str:
+def _suggestion(name: str, known: Collection[str], short: Mapping[str, str]) -> str:
     """What may have been meant."""
+    meant = short.get(name.lstrip("-"))
+    if meant in known:
+        return f"did you mean {meant!r}?"
     close = difflib.get_close_matches(
         name.replace("_", "-").lstrip("-").lower(), list(known), n=1, cutoff=0.5
     )
@@ -125,5 +130,15 @@ def _check(file: Path, name: str, value: object, kind: str, choices: Sequence[st
         wanted = f"{', '.join(most)} or {last}" if most else last
         if value == "":
             raise ConfigError(f"{file}: {name} is empty; give {wanted}, or leave it out")
-        shown = str(value).lower() if isinstance(value, bool) else repr(value)  # as TOML has it
-        raise ConfigError(f"{file}: {name} is {shown}; give {wanted}")
+        raise ConfigError(f"{file}: {name} is {_as_written(value)}; give {wanted}")
+
+
+def _as_written(value: object) -> str:
+    """A value as TOML has it."""
+    if isinstance(value, bool):
+        return str(value).lower()
+    if isinstance(value, list):
+        return f"[{', '.join(map(_as_written, value))}]"
+    if isinstance(value, dict):
+        return f"{{{', '.join(f'{name} = {_as_written(one)}' for name, one in value.items())}}}"
+    return repr(value) if isinstance(value, str) else str(value)
