@@ -42,7 +42,8 @@ class State:
     """The memory of one project.
 
     project     its file. options: keywords of `stitch_project`. settings: all options as plain values.
-    left        the outputs that are left as they are, once `restore` was asked, though it said no.
+    left        outputs that must not be replaced; known after `restore`, whether or not there is anything to
+                make.
 
     Raises the `AbflowError` family for a project that cannot be read.
     """
@@ -82,7 +83,7 @@ class State:
         """Make `record` that of what was made before, if project, inputs, settings and version are still the
         same and the panorama is there. So too if there is nothing to be made but what is in `left`: what
         somebody changed since, or another program saved, is left, with a warning, whatever else changed.
-        Nobody's work is lost unasked. Else do nothing more. `begin` comes first.
+        Nobody's work is lost unasked. Else return False; `left` is known then, too. `begin` comes first.
         """
         asked = self._asked()
         # what somebody changed and nobody asks for any more is not ours: no run would make it anew
