@@ -192,6 +192,43 @@ def test_what_nobody_retouched_is_replaced(project: Path, made: list[str], progr
     assert make(project).warnings == [] and "tiny.tif" in made
 
 
+def test_what_lacks_its_program_is_not_more_to_be_made(
+    project: Path, made: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A run for nothing would end in an error."""
+    monkeypatch.setattr("hugin_abflow.outputs.missing", {"enfuse": "install it"}.get)
+    save(project.with_name("tiny.tif"), GIMP)
+    record = make(project)
+    assert record.result == "skipped" and record.files == [project.with_name("tiny.tif")] and made == []
+
+
+def test_what_is_left_is_never_remembered_as_made(
+    project: Path, made: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Where a run finds that nothing is to be made: how many stacks there are is known no sooner."""
+    stack, stitch = project.with_name("tiny_stack_ldr_0000.tif"), task.stitch_project
+
+    def stitch_all(path: Path, finished: Callable[[Path], None], **options: Any) -> None:
+        stitch(path, finished=finished, **options)
+        if stack not in options["leave"]:
+            save(stack, "Hugin 2023.0.0")
+            finished(stack)
+
+    monkeypatch.setattr(task, "stitch_project", stitch_all)
+    text = project.read_text().removesuffix(BOTH)
+    project.write_text(text + "#hugin_outputLDRBlended true\n#hugin_outputLDRStacks true\n")
+    files = [project.with_name("tiny.tif"), stack]
+    assert make(project).files == files
+    for file in files:
+        save(file, GIMP)
+    for comment in ("", "# a comment\n", "# another\n"):
+        project.write_text(project.read_text() + comment)
+        for _ in range(2):
+            record = make(project)
+            assert record.result == "skipped" and record.files == files and len(record.warnings) == 2
+    assert made == ["tiny.tif"]
+
+
 def test_what_is_damaged_is_made(project: Path, made: list[str]) -> None:
     file = project.with_name("tiny.tif")
     content = save(file, GIMP)

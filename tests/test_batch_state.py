@@ -244,6 +244,21 @@ def test_output_that_lacked_its_program_is_made_once_that_is_there(
     assert make().result == "skipped"
 
 
+def test_what_nobody_is_to_make_is_nobody_s_to_leave(
+    make: Make, shoot: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Somebody made himself what was left out; where all holds, it would not be replaced."""
+    with (shoot / "tiny.pto").open("a") as file:
+        file.write("#hugin_outputLDRBlended true\n#hugin_outputLDRExposureBlended true\n")
+    monkeypatch.setattr(outputs, "missing", lambda program: "install it" if program == "enfuse" else None)
+    make()
+    tifffile.imwrite(shoot / "tiny_fused.tif", PHOTO, software="GIMP 2.10")
+    record = make()
+    assert record.result == "skipped" and record.files == [shoot / "tiny.tif"]
+    (warning,) = record.warnings
+    assert "left out" in warning
+
+
 def test_panorama_that_was_retouched_is_left_as_it_is(make: Make, shoot: Path) -> None:
     make()
     retouch(shoot / "tiny.tif")
