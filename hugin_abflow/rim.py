@@ -11,7 +11,7 @@ from those that are there; the layer that ends fades out before.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -37,12 +37,28 @@ class Rim:
     """On the masks' grid.
 
     covered     what any layer covers, (height, width).
-    strips      of it, for each layer, thin strips beyond its border: (layers, height, width).
+    strips      of it, thin strips beyond a layer's border, of those of `Masks` that have some: of many they
+                are few, and all would take as much memory as the masks.
     """
 
     grid: Grid
     covered: Mask
-    strips: Mask
+    strips: Mapping[int, Mask]
+
+    @property
+    def anywhere(self) -> Mask:
+        """The strips of all layers, (height, width)."""
+        found = np.zeros_like(self.covered)
+        for strip in self.strips.values():
+            found |= strip
+        return found
+
+    def reached(self, masks: Masks) -> Mask:
+        """What layers cover, with their strips, (layers, height, width)."""
+        cover = masks.host.copy()
+        for k, strip in self.strips.items():
+            cover[k] |= strip
+        return cover
 
 
 def find(masks: Masks) -> Rim | None:
@@ -52,12 +68,14 @@ def find(masks: Masks) -> Rim | None:
     rim. Where these meet at the sides of photos that is a few pixels.
     """
     grid, covered = masks.grid, np.asarray(masks.host.any(0))
+    if covered.all() and grid.wraps and grid.poles == 3:
+        return None  # nothing ends
     thick = _THICK * min(grid.shape)
     around = math.ceil(thick) + 2
-    strips = np.zeros_like(masks.host)
+    strips: dict[int, Mask] = {}
     inner = slice(around, around + grid.height), slice(around, around + grid.width)
     anything = _padded(covered, grid, around)
-    for mask, strip in zip(masks.host, strips, strict=True):
+    for k, mask in enumerate(masks.host):
         its = _padded(mask, grid, around)
         if not its.any():
             continue
@@ -65,8 +83,9 @@ def find(masks: Masks) -> Rim | None:
         part = tuple(slice(max(at[0] - around, 0), at[-1] + around + 1) for at in (rows, columns))
         found = np.zeros_like(its)
         found[part] = _thin(its[part], anything[part], thick)
-        strip[:] = found[inner]
-    return Rim(grid, covered, strips) if strips.any() else None
+        if found[inner].any():
+            strips[k] = found[inner].copy()
+    return Rim(grid, covered, strips) if strips else None
 
 
 def _thin(mask: Mask, covered: Mask, thick: float) -> Mask:
@@ -126,12 +145,9 @@ def carry(
     """
     source, outward = _sources(rim, grid)
     told = device.upload(source), device.upload(outward)
-    for layer, field, strip in zip(layers, fields, rim.strips, strict=True):
-        if strip.any():
-            faded = device.upload(_fading(strip, rim.grid, grid))
-            device.run(
-                "rim", "rim_fade", layer.box[2:], field, layer.box, grid.border, faded, rim.grid.border
-            )
+    for k, strip in rim.strips.items():
+        box, left = layers[k].box, device.upload(_fading(strip, rim.grid, grid))
+        device.run("rim", "rim_fade", box[2:], fields[k], box, grid.border, left, rim.grid.border)
     for layer, field in zip(layers, fields, strict=True):
         device.run(
             "rim", "rim_carry", layer.box[2:], field, layer.pixels, layer.box, grid.border, grid.lonlat,
@@ -149,9 +165,7 @@ def _sources(rim: Rim, grid: Grid) -> tuple[npt.NDArray[np.int32], Distances]:
     height, width = rim.grid.shape
     around = min(math.ceil(2 * _THICK * min(height, width)) + 2, width)
     inner = slice(around, around + height), slice(around, around + width)
-    strip, covered = (
-        _padded(np.asarray(mask), rim.grid, around) for mask in (rim.strips.any(0), rim.covered)
-    )
+    strip, covered = (_padded(mask, rim.grid, around) for mask in (rim.anywhere, rim.covered))
     into = strip | ((cv2.dilate(strip.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0) & ~covered)
     free = covered & ~into
     if not free.any():

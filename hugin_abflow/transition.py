@@ -113,7 +113,7 @@ def minimise_strain(
     rim         strips that count as if layers reached over them; None: there are none.
     """
     grids = [grid.coarser(pixels) for pixels in _CELLS]
-    covers = _covers(masks.host if rim is None else masks.host | rim.strips, grids)
+    covers = _covers(masks.host if rim is None else rim.reached(masks), grids)
     price, bent = _prices(device, layers, flows, masks, grid, grids[-1], covers[-1])
     if rim is not None:
         price, bent = _over_strips((price, bent), rim, grids[-1])
@@ -190,7 +190,7 @@ def _over_strips(
     cost less than to lead a transition along a strip.
     """
     covered = on_cells(rim.covered[None], cells, np.logical_or)[0]
-    unknown = on_cells(rim.strips, cells, np.logical_or).any(0) | ~covered
+    unknown = on_cells(rim.anywhere[None], cells, np.logical_or)[0] | ~covered
     if unknown.all():
         return prices
     near = scipy.ndimage.distance_transform_edt(unknown, return_distances=False, return_indices=True)
