@@ -104,6 +104,7 @@ def test_a_file_that_is_left_is_told_once_whatever_becomes_of_others(
             ("made", "a.tif was changed, and so was a.pto", "a.tif", True),
             ("made", "a.tif was saved by GIMP", "a.tif", False),
             ("failed", "a.tif was saved by GIMP", "a.tif", False),
+            ("failed", "a.pto is cut off", "", True),
             ("skipped", "a.tif was saved by GIMP", "a.tif", False),
             ("made", "a_fused.tif was saved by GIMP", "a_fused.tif", True),
             ("made", "a.tif was saved by GIMP", "a.tif", True),

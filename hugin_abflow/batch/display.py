@@ -117,6 +117,8 @@ class Display:
         # a watched folder's project is looked at each time it is saved: no warning is news where nothing is
         # made, and where other outputs are, none of one that is left
         said, left = self._said.pop(task.project, set()), self._left.pop(task.project, set())
+        if record.result == "failed":  # perhaps before it was looked at what is left
+            left |= self._known.get(task.project, set())
         self._known[task.project] = said if record.result == "skipped" else left
         self._tell_end(task, record)
         line = f"[{self.done}/{self.total}] {name_of(task.project)}: {outcome(record)}"
