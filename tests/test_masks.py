@@ -11,6 +11,7 @@ from conftest import ProjectMaker, require_program
 from pictures import one_device
 from scipy import ndimage
 
+from hugin_abflow import rim
 from hugin_abflow.images import read_layer
 from hugin_abflow.merge import merge_project
 from hugin_abflow.settings import Settings
@@ -99,12 +100,14 @@ def test_without_the_mask_it_would_show(project: Path, kind: str) -> None:
 
 @pytest.mark.parametrize("kind", MASKS)
 def test_where_the_others_are_masked_a_photo_is_copied(project: Path, kind: str) -> None:
-    """Up to the mask's border, to the bit."""
+    """Up to the mask's border, to the bit; but for the rim, where the geometry goes on (rim.py)."""
     project.write_text(project.read_text() + line(*MASKS[kind]))
     result, layers = merged(project, exposure=False)
     alphas = [layer[..., 3] > 0 for layer in layers]
+    inside = ndimage.distance_transform_edt(np.pad(alphas[0] | alphas[1], 1))[1:-1, 1:-1]
+    inside = inside > rim._THICK * min(inside.shape) + 3
     for layer, alpha, other in zip(layers, alphas, alphas[::-1], strict=True):
-        alone = alpha & ~other
+        alone = alpha & ~other & inside
         assert alone.sum() > 5000
         np.testing.assert_array_equal(result[alone], layer[alone])
 
