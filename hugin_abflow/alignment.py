@@ -49,8 +49,8 @@ class Aligned:
     fields      where each is sampled, and its weight. reaches: how far from there, by rows (geometry.py).
     whole       where one layer was taken, on the seam grid; None: nowhere, or, without flow, everywhere.
     unlike      where they show different things, with flow there alone; None: nowhere.
-    carried     where geometry was carried into strips that one layer alone may show, as `rim.carry` gives it;
-                None: nowhere.
+    carried     on a grid, as `rim.carry` gives it: where geometry was carried into strips that one layer
+                alone may show; None: nowhere.
     """
 
     fields: list[Buffer]
@@ -58,7 +58,7 @@ class Aligned:
     correction: Correction
     whole: Cells | None
     unlike: Unlike | None
-    carried: Buffer | None = None
+    carried: tuple[Grid, Buffer] | None = None
 
 
 def align(
@@ -80,10 +80,12 @@ def align(
     aligned = _align(device, layers, pairs, flows, single, masks, strips, grid, settings)
     if strips is None:
         return aligned
-    carried = rim.carry(device, layers, aligned.fields, strips, grid)  # as they are at last, also beside cuts
-    geometry.keep_within(device, layers, aligned.fields, grid, fade=0.0)
-    reaches = [geometry.reach(device, *one, grid) for one in zip(layers, aligned.fields, strict=True)]
-    return replace(aligned, reaches=reaches, carried=carried)
+    fields, reaches = aligned.fields, list(aligned.reaches)
+    carried, changed = rim.carry(
+        device, layers, fields, strips, grid
+    )  # as they are at last, also beside cuts
+    _keep_within(device, layers, fields, changed, reaches, grid)
+    return replace(aligned, reaches=reaches, carried=(masks.grid, carried))
 
 
 def _align(
@@ -237,11 +239,22 @@ def _cut(
     moved = [*gone.values()] + ([] if single is None else [single])
     unlike = Unlike.of(cells, regions.residual.mean, whole, np.any(moved, 0) if moved else None)
     stretched = membrane.stretch(device, layers, fields, owner, whole, unlike.anywhere, masks, grid, cells)
-    # nothing else is to be seen in a region
-    geometry.keep_within(
-        device, [layers[k] for k in stretched], [fields[k] for k in stretched], grid, fade=0.0
-    )
-    for k in stretched:
-        reaches[k] = geometry.reach(device, layers[k], fields[k], grid)
+    _keep_within(device, layers, fields, stretched, reaches, grid)  # nothing else is to be seen in a region
     seam.clamp_displacements(scene, owner, whole)
     return unlike
+
+
+def _keep_within(
+    device: Device,
+    layers: Sequence[WorkingLayer],
+    fields: Sequence[Buffer],
+    changed: Sequence[int],
+    reaches: list[list[float]],
+    grid: Grid,
+) -> None:
+    """Keep layers whose displacements have changed within the canvas, as heavy as they are, and say in
+    `reaches` how far these lead now.
+    """
+    geometry.keep_within(device, [layers[k] for k in changed], [fields[k] for k in changed], grid, fade=0.0)
+    for k in changed:
+        reaches[k] = geometry.reach(device, layers[k], fields[k], grid)

@@ -11,7 +11,7 @@ import click
 from hugin_abflow.batch.config import NAME, read_config, write_config
 from hugin_abflow.errors import ConfigError
 from hugin_abflow.oneline import commented
-from hugin_abflow.options import kind_of, long_names
+from hugin_abflow.options import kind_of, long_name, long_names
 
 # Options that a file of settings cannot give.
 _UNSETTLED = frozenset({"config", "print-config", "dry-run", "watch"})
@@ -129,7 +129,7 @@ def _read(command: click.Command, file: Path) -> dict[str, Any]:
     paths = [name for name in kinds if isinstance(types[name], click.Path)]
     choices = {name: list(kind.choices) for name, kind in types.items() if isinstance(kind, click.Choice)}
     options = [param for param in command.params if isinstance(param, click.Option)]
-    others = {max(option.opts, key=len).lstrip("-") for option in options} - kinds.keys()
+    others = set(map(long_name, options)) - kinds.keys()
     short = {one.lstrip("-"): name for name, option in names.items() for one in option.opts}
     return read_config(file, kinds, paths, choices, others, short)
 

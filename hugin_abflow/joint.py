@@ -134,7 +134,6 @@ def prepare(
         aligned = alignment.align(device, blended, pairs, flows, from_one, used.masks, grid, settings)
         if _log.isEnabledFor(logging.INFO):
             figures.report(blended, pairs, used.overlaps, parallaxes, seam.seam_grid(grid), aligned.whole)
-        mask_grid = used.masks.grid
         del used  # what comes takes the most memory: its masks make room
         offsets = _offsets(device, blended, pairs, aligned, grid, settings)
         final = _blend_layers(blended, aligned, offsets) + [_unblended(device, one) for one in unused]
@@ -142,7 +141,7 @@ def prepare(
     gains = aligned.correction
     return Prepared(
         tuple(final), full, grid, gains.grid, offsets.grid, gains.shoulder, light_unit, aligned.unlike,
-        None if aligned.carried is None else (mask_grid, aligned.carried),
+        aligned.carried,
     )  # fmt: skip
 
 

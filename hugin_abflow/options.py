@@ -189,10 +189,15 @@ def spread_layers(arguments: Sequence[str]) -> list[str]:
     return spread
 
 
+def long_name(option: click.Option) -> str:
+    """Its name without dashes in front."""
+    return max(option.opts, key=len).lstrip("-")
+
+
 def long_names(command: click.Command) -> dict[str, click.Option]:
     """The options of a command that take part in settings, by their long names without dashes in front."""
     return {
-        max(option.opts, key=len).lstrip("-"): option
+        long_name(option): option
         for option in command.params
         if isinstance(option, click.Option) and option.expose_value and not option.is_eager
     }

@@ -60,8 +60,10 @@ _NEEDS = {
     Kind.HDR_STACKS: (HDRMERGE, "pano_trafo"),
 }
 # What follows the project's name in those of panoramas, before the ending.
-_PANORAMAS = {Kind.FUSED_LAYERS: "_blended_fused", Kind.FUSED_STACKS: "_fused", Kind.HDR: "_hdr"}
-# The same of those of which there are several, numbered from 0, and the ending.
+_SUFFIXES = {Kind.FUSED_LAYERS: "_blended_fused", Kind.FUSED_STACKS: "_fused", Kind.HDR: "_hdr"}
+# Outputs of one file each, whose names are known before there are layers.
+PANORAMAS = (Kind.PANORAMA, *_SUFFIXES)
+# What follows it in those of which there are several: a number, from 0, and the ending.
 _NUMBERED = {
     Kind.EXPOSURE_LAYERS: "_exposure_{:04d}.tif",
     Kind.STACKS: "_stack_ldr_{:04d}.tif",
@@ -182,7 +184,7 @@ class Branch:
 
     def panorama(self, kind: Kind) -> str:
         """The name of a panorama that is made of several files."""
-        return f"{self.plan.stem}{_PANORAMAS[kind]}{self.plan.output.ending}"
+        return f"{self.plan.stem}{_SUFFIXES[kind]}{self.plan.output.ending}"
 
     def results(self, keep_layers: bool) -> list[str]:
         """Names of what may be made, but for that of exposure-corrected layers; keep_layers: these as well.
@@ -190,7 +192,7 @@ class Branch:
         How many there are of several is not known before layers are made: one of each photo, at most.
         """
         several = sorted(self.kinds & _NUMBERED.keys())
-        names = [self.panorama(kind) for kind in sorted(self.kinds & _PANORAMAS.keys())]
+        names = [self.panorama(kind) for kind in sorted(self.kinds & _SUFFIXES.keys())]
         for number, image in enumerate(self.plan.images):
             names += [self.layer(image.index)] if keep_layers or self.keeps_layers else []
             names += [self._numbered(kind, number) for kind in several]

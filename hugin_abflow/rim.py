@@ -21,7 +21,7 @@ import numpy.typing as npt
 from hugin_abflow.cells import Mask
 from hugin_abflow.coefficient import Masks
 from hugin_abflow.opencl import Buffer, Device
-from hugin_abflow.working import Grid, WorkingLayer
+from hugin_abflow.working import Grid, WorkingLayer, any_around
 
 # How thick a strip is at most, of the panorama's smaller side. Where it is thicker, borders that cross have
 # left room for a transition.
@@ -138,22 +138,26 @@ def _padded(mask: Mask, grid: Grid, around: int) -> Mask:
 
 def carry(
     device: Device, layers: Sequence[WorkingLayer], fields: Sequence[Buffer], rim: Rim, grid: Grid
-) -> Buffer:
+) -> tuple[Buffer, list[int]]:
     """Carry fields (in place) from beside strips into them, and have each layer fade out towards its own.
 
-    Returns uint8 (height, width) on the rim's grid: 1 where fields were carried to.
+    Returns uint8 (height, width) on the rim's grid: 1 where fields were carried to; and which layers are
+    there.
     """
     source, outward = _sources(rim, grid)
+    into = source >= 0
     told = device.upload(source), device.upload(outward)
     for k, strip in rim.strips.items():
         box, left = layers[k].box, device.upload(_fading(strip, rim.grid, grid))
         device.run("rim", "rim_fade", box[2:], fields[k], box, grid.border, left, rim.grid.border)
-    for layer, field in zip(layers, fields, strict=True):
+    beside = [k for k, layer in enumerate(layers) if any_around(into, layer.box, grid, rim.grid)]
+    for k in beside:  # of many layers few
+        layer = layers[k]
         device.run(
-            "rim", "rim_carry", layer.box[2:], field, layer.pixels, layer.box, grid.border, grid.lonlat,
+            "rim", "rim_carry", layer.box[2:], fields[k], layer.pixels, layer.box, grid.border, grid.lonlat,
             *told, rim.grid.border,
         )  # fmt: skip
-    return device.upload(source >= 0, np.uint8)
+    return device.upload(into, np.uint8), beside
 
 
 def _sources(rim: Rim, grid: Grid) -> tuple[npt.NDArray[np.int32], Distances]:

@@ -30,6 +30,7 @@ from hugin_abflow.nona import open_layers, planned_layers, refuse_to_keep, remap
 from hugin_abflow.oneline import commented
 from hugin_abflow.outputs import (
     BLEND,
+    PANORAMAS,
     WORDS,
     Branch,
     Kind,
@@ -49,8 +50,6 @@ from hugin_abflow.settings import Settings
 
 # In commands of a script: what stands before files in its temporary folder. No argument can hold it.
 _TEMPORARY = "\0"
-# Outputs of one file each, whose names are known before there are layers.
-_PANORAMAS = (Kind.PANORAMA, Kind.FUSED_LAYERS, Kind.FUSED_STACKS, Kind.HDR)
 
 
 def stitch_project(
@@ -193,12 +192,17 @@ def asked_panoramas(
     if prefix or layers:
         return [default_target(plan, layers_there(plan, prefix, layers, remap))]
     found = branches(plan, checked_outputs(plan))
-    return [_panorama(branch, kind) for branch in found for kind in _PANORAMAS if kind in branch.kinds]
+    return [_panorama(branch, kind) for branch in found for kind in PANORAMAS if kind in branch.kinds]
+
+
+def names_one(options: Mapping[str, Any]) -> bool:
+    """Whether `stitch_project` makes one panorama, whatever is checked; options: its keywords."""
+    return any(options.get(name) for name in ("output", "prefix", "layers"))
 
 
 def is_more_asked(plan: Plan, options: Mapping[str, Any], leave: Collection[Path]) -> bool:
     """Whether `stitch_project` would make anything but what is to be left; options: its keywords."""
-    if any(options.get(name) for name in ("output", "prefix", "layers")):
+    if names_one(options):
         return not set(asked_panoramas(plan, **options)) <= set(leave)
     kinds = checked_outputs(plan)
     lacking = impossible(kinds)
@@ -214,7 +218,7 @@ def _panorama(branch: Branch, kind: Kind) -> Path:
 
 def _without(found: Sequence[Branch], leave: Collection[Path]) -> list[Branch]:
     """What has still to be made of branches if files are left."""
-    left = [{one for one in _PANORAMAS if one in b.kinds and _panorama(b, one) in leave} for b in found]
+    left = [{one for one in PANORAMAS if one in b.kinds and _panorama(b, one) in leave} for b in found]
     rest = [replace(branch, kinds=branch.kinds - its) for branch, its in zip(found, left, strict=True)]
     return [branch for branch in rest if branch.kinds]
 

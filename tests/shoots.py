@@ -26,6 +26,15 @@ i w120 h120 f3 v=0 a=0 b=0 c=0 d=0 e=0 g=0 t=0 Va=0 Vb=0 Vc=0 Vd=0 {LENS} y90 n"
 """
 
 
+class Deaf:
+    """A listener who does not listen."""
+
+    def phase_began(self, name: str, total: int) -> None: ...
+    def advanced(self, name: str, units: int) -> None: ...
+    def phase_ended(self, name: str, seconds: float) -> None: ...
+    def message(self, level: int, text: str, left: str = "") -> None: ...
+
+
 def textured(height: int, width: int) -> np.ndarray:
     """A smooth pattern, (height, width, 3) uint8, without a repeat."""
     y, x = np.mgrid[:height, :width]

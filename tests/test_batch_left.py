@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 import tifffile
 from conftest import ProjectMaker, names_in, require_program
-from shoots import write_project
+from shoots import Deaf, write_project
 
 from hugin_abflow import cli
 from hugin_abflow.batch import task
@@ -30,13 +30,6 @@ from hugin_abflow.tifftags import MAIN
 GIMP = "GIMP 2.10"
 PICTURE = np.full((120, 120, 3), 7, np.uint8)
 BOTH = "#hugin_outputLDRBlended true\n#hugin_outputLDRExposureLayersFused true\n"
-
-
-class Deaf:
-    def phase_began(self, name: str, total: int) -> None: ...
-    def advanced(self, name: str, units: int) -> None: ...
-    def phase_ended(self, name: str, seconds: float) -> None: ...
-    def message(self, level: int, text: str, left: str = "") -> None: ...
 
 
 @pytest.fixture

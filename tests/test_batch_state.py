@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 import tifffile
 from conftest import age, names_in
-from shoots import HEIGHT, WIDTH, write_project
+from shoots import HEIGHT, WIDTH, Deaf, write_project
 
 from hugin_abflow import cli, outputs
 from hugin_abflow.batch import state, task
@@ -26,13 +26,6 @@ from hugin_abflow.settings import Settings
 
 Make = Callable[..., Record]
 PHOTO = np.full((120, 120, 3), 7, np.uint8)
-
-
-class Deaf:
-    def phase_began(self, name: str, total: int) -> None: ...
-    def advanced(self, name: str, units: int) -> None: ...
-    def phase_ended(self, name: str, seconds: float) -> None: ...
-    def message(self, level: int, text: str, left: str = "") -> None: ...
 
 
 @pytest.fixture
@@ -229,18 +222,26 @@ def test_damage_is_seen_in_every_format(tmp_path: Path, ending: str) -> None:
         assert state._decodes(path)
 
 
+LACKING = {"enfuse": "install it"}.get
+
+
+def ask_for_fused_too(shoot: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Which lacks its program."""
+    with (shoot / "tiny.pto").open("a") as file:
+        file.write("#hugin_outputLDRBlended true\n#hugin_outputLDRExposureBlended true\n")
+    monkeypatch.setattr(outputs, "missing", LACKING)
+
+
 def test_output_that_lacked_its_program_is_made_once_that_is_there(
     make: Make, shoot: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    with (shoot / "tiny.pto").open("a") as file:
-        file.write("#hugin_outputLDRBlended true\n#hugin_outputLDRExposureBlended true\n")
-    monkeypatch.setattr(outputs, "missing", lambda program: "install it" if program == "enfuse" else None)
+    ask_for_fused_too(shoot, monkeypatch)
     make()
     record = make()
     assert record.result == "skipped" and "fused from stacks (install it)" in record.warnings[0]
     monkeypatch.setattr(outputs, "missing", lambda program: None)
     assert make().result == "made"
-    monkeypatch.setattr(outputs, "missing", lambda program: "install it" if program == "enfuse" else None)
+    monkeypatch.setattr(outputs, "missing", LACKING)
     assert make().result == "skipped"
 
 
@@ -248,9 +249,7 @@ def test_what_nobody_is_to_make_is_nobody_s_to_leave(
     make: Make, shoot: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Somebody made himself what was left out; where all holds, it would not be replaced."""
-    with (shoot / "tiny.pto").open("a") as file:
-        file.write("#hugin_outputLDRBlended true\n#hugin_outputLDRExposureBlended true\n")
-    monkeypatch.setattr(outputs, "missing", lambda program: "install it" if program == "enfuse" else None)
+    ask_for_fused_too(shoot, monkeypatch)
     make()
     tifffile.imwrite(shoot / "tiny_fused.tif", PHOTO, software="GIMP 2.10")
     record = make()

@@ -149,7 +149,7 @@ def test_geometry_goes_on_into_strips(device: Device) -> None:
     fields = [device.upload(field) for _ in host]
     found = rim.find(masks_of(device, grid, host))
     assert found is not None
-    carried = rim.carry(device, layers, fields, found, grid).get()
+    carried = rim.carry(device, layers, fields, found, grid)[0].get()
     first, second = (one.get() for one in fields)
     assert carried[-3:, 50:250].all() and not carried[3:-3].any()
     assert_close(first[-3:, 50:250], np.broadcast_to(field[100, 50:250], (3, 200, 4)), SUM)
@@ -196,7 +196,7 @@ def test_a_rim_of_strips_alone_is_left_as_it_is(device: Device) -> None:
     layer, field = on_device(device, np.ones((30, 40, 4))), np.zeros((30, 40, 4), np.float32)
     found = device.upload(field)
     assert (
-        not rim.carry(device, [layer], [found], Rim(grid, everywhere[0], {0: everywhere[0]}), grid)
+        not rim.carry(device, [layer], [found], Rim(grid, everywhere[0], {0: everywhere[0]}), grid)[0]
         .get()
         .any()
     )

@@ -90,8 +90,7 @@ class Display:
         # warnings of each project that are no news, and those so far of what is going on: their texts, but of
         # outputs that are left as they are the files, since the reason may be another each time
         self._known: dict[Path, set[str]] = {}
-        self._said: dict[Path, set[str]] = {}
-        self._left: dict[Path, set[str]] = {}  # those files alone
+        self._said: dict[Path, dict[str, bool]] = {}  # and whether it is such a file
 
     def __enter__(self) -> Display:
         return self
@@ -105,8 +104,7 @@ class Display:
 
     def began(self, task: Task) -> Voice:
         """A task begins."""
-        self._said[task.project] = set()
-        self._left[task.project] = set()
+        self._said[task.project] = {}
         return Voice(self, task)
 
     def ended(self, task: Task, record: Record) -> None:
@@ -116,10 +114,11 @@ class Display:
             self.failed += 1
         # a watched folder's project is looked at each time it is saved: no warning is news where nothing is
         # made, and where other outputs are, none of one that is left
-        said, left = self._said.pop(task.project, set()), self._left.pop(task.project, set())
+        said = self._said.pop(task.project, {})
+        left = {what for what, is_left in said.items() if is_left}
         if record.result == "failed":  # perhaps before it was looked at what is left
             left |= self._known.get(task.project, set())
-        self._known[task.project] = said if record.result == "skipped" else left
+        self._known[task.project] = set(said) if record.result == "skipped" else left
         self._tell_end(task, record)
         line = f"[{self.done}/{self.total}] {name_of(task.project)}: {outcome(record)}"
         self.write_log(logging.INFO, line)
@@ -140,9 +139,7 @@ class Display:
         """
         self.write_log(level, f"{name_of(task.project)}: {text}")
         if level == logging.WARNING:
-            self._said.setdefault(task.project, set()).add(left or text)
-            if left:
-                self._left.setdefault(task.project, set()).add(left)
+            self._said.setdefault(task.project, {})[left or text] = bool(left)
             if (left or text) in self._known.get(task.project, ()):
                 return
         if level >= logging.WARNING or (self.verbose and not self.quiet):

@@ -24,7 +24,7 @@ from hugin_abflow.jpeg import is_cut
 from hugin_abflow.metadata import saved_by, version
 from hugin_abflow.outputs import checked_outputs, impossible, possible_outputs, results
 from hugin_abflow.project import read_plan
-from hugin_abflow.stitch import asked_panoramas, is_more_asked
+from hugin_abflow.stitch import asked_panoramas, is_more_asked, names_one
 
 _log = logging.getLogger(__name__)
 
@@ -127,7 +127,7 @@ class State:
     def _asked(self) -> set[str]:
         """Names of the outputs that are asked for now, whether or not they can be made here."""
         files = asked_panoramas(self._plan, **self._options)
-        if not self._names_one():
+        if not names_one(self._options):
             files += results(self._plan, keep_layers=False)
         return {self._name(file) for file in files}
 
@@ -189,11 +189,7 @@ class State:
 
     def _left_out(self) -> list[str]:
         """Outputs that are checked in the project, but lack a program here."""
-        return [] if self._names_one() else sorted(impossible(checked_outputs(self._plan)))
-
-    def _names_one(self) -> bool:
-        """Whether the options ask for one panorama, whatever is checked in the project."""
-        return any(self._options.get(name) for name in ("output", "prefix", "layers"))
+        return [] if names_one(self._options) else sorted(impossible(checked_outputs(self._plan)))
 
     def _load(self) -> dict[str, Any]:
         """What was remembered; nothing if it is unreadable."""
