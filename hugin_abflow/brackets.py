@@ -34,7 +34,8 @@ def to_be_made(plan: Plan) -> tuple[PlannedImage, ...]:
     project = pto.load(plan.file)
     images = [project.images[image.index] for image in plan.images]
     opaque = all(image.photo.suffix.lower() in _OPAQUE for image in plan.images)
-    if plan.hdr or project.masks or not opaque or any(image.hugin is None for image in images):
+    masked = project.masks or project.doubts  # what could not be read may be a mask to nona
+    if plan.hdr or masked or not opaque or any(image.hugin is None for image in images):
         return plan.images
     shown = set().union(*map(_nearest, _views(images, project.panorama.exposure)))
     for image in plan.images:

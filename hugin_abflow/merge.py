@@ -29,7 +29,7 @@ from hugin_abflow.nona import open_layers
 from hugin_abflow.opencl import Device
 from hugin_abflow.pano_trafo import images_of, read_guides
 from hugin_abflow.progress import Progress, silent
-from hugin_abflow.project import Plan, file_key, read_plan
+from hugin_abflow.project import Plan, file_key, read_plan, warn_of_doubts
 from hugin_abflow.settings import Settings
 from hugin_abflow.spool import spooled
 
@@ -74,6 +74,7 @@ def merge_project(
     what the project, its layers, the device or the output can get wrong.
     """
     plan = read_plan(path)
+    warn_of_doubts(plan)
     settings = settings or Settings()
     if output is None:
         compression = storable(plan, compression)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import os
 from collections.abc import Hashable, Iterable
 from dataclasses import dataclass
@@ -12,6 +13,8 @@ from hugin_abflow.errors import ProjectError
 from hugin_abflow.layer import Box, Canvas
 from hugin_abflow.projection import EQUIRECTANGULAR
 from hugin_abflow.scratch import is_file
+
+_log = logging.getLogger(__name__)
 
 SINUSOIDAL = 7
 
@@ -33,6 +36,7 @@ _PROJECTIONS = (
 
 _ENDINGS = {"tif": ".tif", "tiff": ".tif", "jpg": ".jpg", "jpeg": ".jpg", "png": ".png", "exr": ".exr"}
 TIFF_COMPRESSIONS = ("none", "lzw", "packbits", "deflate")  # of Hugin, enblend and enfuse
+_DOUBTS_SHOWN = 5
 _JPEG_QUALITY = 100  # what hugin_executor takes where a project says nothing
 
 
@@ -77,6 +81,7 @@ class Plan:
     hdr             layers are scene-linear EXR (nona ``-r hdr``) instead of TIFF in the photos' depth.
     ignore_exposure layers keep their photos' exposure (nona ``--ignore-exposure``), to be fused.
     hugin_prefix    what Hugin names layers and panorama by default: "first image - last image".
+    doubts          lines of the project that are left out, in sentences.
     """
 
     file: Path
@@ -87,6 +92,7 @@ class Plan:
     output: Output
     hdr: bool
     hugin_prefix: str
+    doubts: tuple[str, ...] = ()
     ignore_exposure: bool = False
 
     @property
@@ -152,7 +158,17 @@ def read_plan(path: Path | str) -> Plan:
         output=read_output(project, hdr),
         hdr=hdr,
         hugin_prefix=f"{_stem(names[0])} - {_stem(names[-1])}",
+        doubts=tuple(project.doubts),
     )
+
+
+def warn_of_doubts(plan: Plan) -> None:
+    """Say which lines of the project are left out, of many only how many: once in a run."""
+    for doubt in plan.doubts[:_DOUBTS_SHOWN]:
+        _log.warning("%s", doubt)
+    others = len(plan.doubts) - _DOUBTS_SHOWN
+    if others > 0:
+        _log.warning("%s: %d more such lines are left out", plan.file, others)
 
 
 def locate_photo(folder: Path, name: str) -> Path:

@@ -44,7 +44,7 @@ from hugin_abflow.outputs import (
 from hugin_abflow.pano_trafo import images_of
 from hugin_abflow.programs import move_whole, run
 from hugin_abflow.progress import Progress, silent
-from hugin_abflow.project import Output, Plan, read_plan
+from hugin_abflow.project import Output, Plan, read_plan, warn_of_doubts
 from hugin_abflow.scratch import is_file, work_folder
 from hugin_abflow.settings import Settings
 
@@ -94,7 +94,11 @@ def stitch_project(
     if output or prefix or layers:
         finish(one(remap=remap, keep_layers=keep_layers))
         return made
-    for branch in _branches(read_plan(path), leave):
+    plan = read_plan(path)
+    wanted = _branches(plan, leave)
+    if not any(Kind.PANORAMA in branch.kinds for branch in wanted):  # else `merge_project` says it
+        warn_of_doubts(plan)
+    for branch in wanted:
         if Kind.LAYERS in branch.kinds:
             with open_layers(branch.plan, remap=remap, keep_layers=True, progress=progress) as opened:
                 finish(*_files(opened))
@@ -138,6 +142,7 @@ def show_project(
     Raises as `stitch_project` does for what the project can get wrong, and what must not be replaced.
     """
     plan = read_plan(path)
+    warn_of_doubts(plan)
     name = no_option(plan.file.name)
     script = partial(_script, plan, leave)
     stored = _storing(compression if output else storable(plan, compression), jpeg_quality)

@@ -162,6 +162,19 @@ def test_current_folder_that_is_gone(
     assert system_error(FileNotFoundError(2, "No such file")) == "[Errno 2] No such file"  # of a socket, say
 
 
+@pytest.mark.parametrize("outcome", [["--dry-run"], []], ids=["shown", "made"])
+def test_lines_that_nona_does_without_are_warned_of_once(
+    folder: Path, outcome: list[str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    project = folder / "tiny.pto"
+    count = project.read_text().count("\n")
+    project.write_text(project.read_text() + 'k i9 t0 p"1 2 3 4 5 6"\n' * 7 + "* the end\n")
+    assert run(folder, *outcome) == 0
+    warnings = [line for line in capsys.readouterr().err.splitlines() if "left out" in line]
+    assert len(warnings) == 6 and f"{project}, line {count + 1}: found 'i9'" in warnings[0]
+    assert warnings[-1].endswith(f"{project}: 2 more such lines are left out")
+
+
 def test_project_that_is_not_there(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     code, message = broken(folder, [str(folder / "gone.pto")], capsys)
     assert code == ExitCode.PROJECT and "gone.pto" in message

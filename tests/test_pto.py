@@ -194,12 +194,15 @@ def test_more_lines_of_one_kind_than_of_the_other(number_of_i_lines: int) -> Non
     assert sizes == {0: [(0, 5), (0, 6)], 1: [(7, 5), (0, 6)], 3: [(7, 5), (7, 6), (7, 0)]}[number_of_i_lines]
 
 
-def test_nothing_after_the_asterisk_is_read() -> None:
-    data = b'p w5\n*\np w6\ni w"\nc what\n'
+def test_lines_after_the_asterisk_are_read_as_nona_does() -> None:
+    data = b'p w5\n*\ni w7\nk i0 t0 p"1 2 3 4 5 6"\n#hugin_outputImageType jpg\n* and\ni w8\n'
     project = pto.loads(data)
-    assert (project.panorama.width, project.images) == (5, [])
+    assert [image.width for image in project.images] == [7, 8]
+    assert len(project.images[0].masks) == 1
+    assert project.option("outputImageType", "") == "jpg"
     project.options["blender"] = "enblend"
-    assert pto.dumps(project) == b'p w5\n#hugin_blender enblend\n*\np w6\ni w"\nc what\n'
+    added = data.replace(b"p w5\n", b"p w5\n#hugin_blender enblend\n")
+    assert pto.dumps(project) == added, "where panotools read it, too"
 
 
 VARIANTS = {

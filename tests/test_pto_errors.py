@@ -35,8 +35,17 @@ MALFORMED = [
     (b"i v=3", "v=3", "a link to one of the 3 images"),
     (b"i v=2", "v=2", "not in a circle"),
     (b"o v=999999999", "v=999999999", "a link to one of the 2 images"),
-    (b"p w5", "p w5", "one p-line (the first is line 1)"),
-    (b"m", "m", "one m-line (the first is line 2)"),
+    (b"p w5", "p w5", "all of f, w, h, v, or none, beside the p-line in line 1"),
+    (b"v y2", "y2", "an image's number from 0 to 1"),
+    (b'#-imgfile 5 "x"', '#-imgfile 5 "x"', 'width, height and "name"'),
+    (b'#-imgfile 5 6 "x', '"x', "a closing quote"),
+    (b'#-imgfile 5 -6 "x"', "-6", "a whole number from 0"),
+    (b'i n"caf\xe9" w\xe9', "w\\xe9", "a whole number from 0"),
+    (b"\0", "\0", "without NUL bytes"),
+]
+
+# The same of lines without which there is a panorama, as nona makes its layers.
+LEFT_OUT = [
     (b"c n0 N1 x1 y2 X3 t0", "c n0 N1 x1 y2 X3 t0", "a field 'Y'"),
     (b"c n0 N1 x1 y2 X3 Yoops t0", "Yoops", "a number after 'Y'"),
     (b"c n0 N1 x1 y2 X3 Y4 t-1", "t-1", "a whole number from 0 after 't'"),
@@ -49,15 +58,8 @@ MALFORMED = [
     (b'k i0 t0 p"1 2 3"', 'p"1 2 3"', "pairs of numbers"),
     (b'k i0 t0 p"1 2 3 x"', 'p"1 2 3 x"', "pairs of numbers"),
     (b"k i0 t0", "k i0 t0", "a field 'p'"),
-    (b"v y2", "y2", "an image's number from 0 to 1"),
     (b"v y0 what", "what", "a variable with an image's number"),
     (b'v y0 "', '"', "a closing quote"),
-    (b"#-hugin  cropFactor=big", "cropFactor=big", "a number after 'cropFactor='"),
-    (b'#-imgfile 5 "x"', '#-imgfile 5 "x"', 'width, height and "name"'),
-    (b'#-imgfile 5 6 "x', '"x', "a closing quote"),
-    (b'#-imgfile 5 -6 "x"', "-6", "a whole number from 0"),
-    (b'i n"caf\xe9" w\xe9', "w\\xe9", "a whole number from 0"),
-    (b"\0", "\0", "without NUL bytes"),
 ]
 
 
@@ -74,6 +76,53 @@ def test_the_error_names_line_token_and_expectation(
     assert expected in error.expected
     assert str(error).startswith("folder/x.pto, line 5: found ")
     assert error.exit_code is ExitCode.PROJECT
+
+
+@pytest.mark.parametrize(("line", "token", "expected"), LEFT_OUT)
+def test_a_line_without_which_there_is_a_panorama_is_left_out(line: bytes, token: str, expected: str) -> None:
+    good = [b'k i1 t0 p"1 2 3 4 5 6"', b"c n0 N1 x1 y2 X3 Y4 t0", b"v y1"]
+    data = b"\n".join([b"p w9", b"m i0", b"i w5", b"i w6", line, *good, b""])
+    project = pto.loads(data, "folder/x.pto")
+    (doubt,) = project.doubts
+    assert doubt.startswith(f"folder/x.pto, line 5: found {token!r}, expected {expected}")
+    assert doubt.endswith("it is left out, as Hugin does; correct or delete that line")
+    kept = [*project.masks, *project.control_points, *project.variables]
+    assert [one.raw.rstrip() for one in kept] == good, "and no other line is"
+    assert pto.dumps(project) == data
+
+
+def test_of_two_p_or_m_lines_the_later_counts_where_it_says_something() -> None:
+    """As nona 2022.0 has it: with the whole geometry in the second line, or none of it."""
+    data = b'p f0 w200 h100 v80 E3\nm i1 g2\np f2 w400 h200 v90 n"JPEG"\nm g1\np R1\ni w5\n'
+    project = pto.loads(data, "x.pto")
+    panorama = project.panorama
+    assert (panorama.projection, panorama.width, panorama.height, panorama.hfov) == (2, 400, 200, 90)
+    assert (panorama.exposure, panorama.output_format, panorama.hdr) == (3, "JPEG", True)
+    assert (project.modes.interpolator, project.modes.gamma) == (1, 1)
+    lines = [3, 4, 5]
+    assert [doubt.partition(":")[0] for doubt in project.doubts] == [f"x.pto, line {at}" for at in lines]
+    panorama.width = 500
+    panorama.set("E", None)
+    panorama.set("n", None)
+    panorama.set("k", 1)
+    panorama.hdr = False
+    edited = b"p f0 w200 h100 v80\nm i1 g2\np f2 w500 h200 v90\nm g1\np R0 k1\ni w5\n"
+    assert pto.dumps(project) == edited
+    assert (panorama.width, panorama.exposure, panorama.get("k")) == (500, 0, "1")
+
+
+def test_a_second_p_line_without_a_crop_is_refused_beside_one_with_a_crop() -> None:
+    """Hugin scales the crop as the width changes."""
+    with pytest.raises(PtoError, match="all of f, w, h, v, S, or none"):
+        pto.loads(b"p f0 w200 h100 v80 S0,100,0,50\np f0 w300 h150 v80\ni w5\n")
+
+
+def test_the_crop_factor_is_looked_at_where_somebody_asks() -> None:
+    project = pto.loads(b"p w9\n#-hugin  cropFactor=big disabled\ni w5\n")
+    (image,) = project.images
+    assert image.disabled and image.hugin is not None
+    with pytest.raises(PtoError, match="a number after 'cropFactor'"):
+        _ = image.hugin.crop_factor
 
 
 def test_the_error_reaches_another_process() -> None:
@@ -94,9 +143,7 @@ def test_p_lines(line: bytes, token: str) -> None:
     assert (caught.value.line, caught.value.token) == (2, token)
 
 
-@pytest.mark.parametrize(
-    "data", [b"", b"\xef\xbb\xbf", b"Dear reader,\npoints of interest\n", b"*\np w5\ni w5\n"]
-)
+@pytest.mark.parametrize("data", [b"", b"\xef\xbb\xbf", b"Dear reader,\npoints of interest\n", b"*\n"])
 def test_what_is_no_project_at_all(data: bytes) -> None:
     with pytest.raises(PtoError, match="a p-line and an i-line") as caught:
         pto.loads(data)

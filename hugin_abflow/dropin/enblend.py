@@ -20,7 +20,7 @@ from hugin_abflow.layer import Box, Canvas, Layer, bounding_box, check_layers
 from hugin_abflow.merge import guides_between, refuse_input, refuse_photo, write_panorama
 from hugin_abflow.metadata import describe, version
 from hugin_abflow.progress import Progress
-from hugin_abflow.project import read_plan
+from hugin_abflow.project import read_plan, warn_of_doubts
 from hugin_abflow.settings import Settings
 from hugin_abflow.signals import interruptible
 from hugin_abflow.terminal import (
@@ -93,6 +93,7 @@ def blend(request: Request, progress: Progress) -> None:
     guides: Callable[[], Sequence[Guide]] = tuple
     metadata = None
     if plan:
+        warn_of_doubts(plan)
         canvas = replace(plan.canvas, crop=request.crop or bounding_box(layers))
         projection, guides = plan.projection, partial(guides_between, plan, layers, settings)
         metadata = describe(replace(plan, canvas=canvas))

@@ -4,19 +4,63 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Iterator
+from typing import Self
 
 from hugin_abflow.pto import grammar
-from hugin_abflow.pto.fields import Box, FieldLine, Line, Number, Text, Whole, decode
+from hugin_abflow.pto.fields import Box, FieldLine, Line, Number, Owner, Text, Whole, decode
 
 _OPTION = re.compile(rb"#hugin_(\w+)(?!\S)[ \t]*")
 _IMAGE_FILE_FIELDS = (("w", grammar.INDEX), ("h", grammar.INDEX), ("n", grammar.TEXT))
 
 
-class Panorama(FieldLine):
+class MergedLine(FieldLine):
+    """A line that a project has once. Of fields that it lacks, those of an earlier one count."""
+
+    __slots__ = ("earlier",)
+
+    def __init__(self, owner: Owner, number: int, raw: bytes, earlier: Self | None = None) -> None:
+        self.earlier = earlier if earlier and earlier.number else None
+        super().__init__(owner, number, raw)
+
+    def read(self) -> None:
+        """Take in the fields, and those of the earlier line."""
+        super().read()
+        if self.earlier:
+            self._values = self.earlier._values | self._values
+
+    def set(self, key: str, value: str | float | None) -> None:
+        """Give a field a value in the line that it is taken from; None removes it from all."""
+        given = any(field.key == key for field in self.scan())
+        earlier = self.earlier if self.earlier and self.earlier.get(key) is not None else None
+        if given or not earlier:
+            super().set(key, value)
+        if earlier and (value is None or not given):
+            earlier.set(key, value)
+            self.read()
+
+
+class Panorama(MergedLine):
     """The p-line: the output. What it lacks has the default of Hugin's PanoramaOptions."""
 
     __slots__ = ()
     keys, head = grammar.PANORAMA, b"p"
+    # Hugin changes some of them along with others, and scales a crop with the width.
+    _GEOMETRY = ("f", "w", "h", "v")
+
+    def read(self) -> None:
+        """Take in the fields.
+
+        Raises `PtoError` for a second line by which Hugin would change what only the first one gives.
+        """
+        super().read()
+        if self.earlier is None:
+            return
+        given = {field.key for field in self.scan()}
+        needed = [*self._GEOMETRY, *(["S"] if self.earlier.get("S") else [])]
+        missing = [key for key in needed if key not in given]
+        if missing and given.intersection(needed):
+            expected = f"all of {', '.join(needed)}, or none, beside the p-line in line {self.earlier.number}"
+            raise self.error(self.raw.rstrip(), expected)
 
     projection = Whole("f", 2, "Output projection: 0 rectilinear, 1 cylindrical, 2 equirectangular ... (f).")
     width = Whole("w", 3000, "Width of the canvas in pixels (w).")
@@ -56,7 +100,7 @@ class Panorama(FieldLine):
         self.set_box("S", value)
 
 
-class Modes(FieldLine):
+class Modes(MergedLine):
     """The m-line: how nona and the optimiser work."""
 
     __slots__ = ()
@@ -227,12 +271,10 @@ class HuginLine(FieldLine):
         self.set("disabled", "" if value else None)
 
     def scan(self) -> Iterator[grammar.Field]:
-        """The fields and where they lie in `raw`. Raises `PtoError` for a malformed one."""
+        """The fields and where they lie in `raw`. Raises `PtoError` where a quote is not closed."""
         raw = self.raw
         for start, end in grammar.tokens(raw, len(self.head), self.owner.file, self.number):
-            name, equals, value = raw[start:end].partition(b"=")
-            if name == b"cropFactor" and not grammar.is_number(value):
-                raise self.error(raw[start:end], "a number after 'cropFactor='")
+            name, equals, _ = raw[start:end].partition(b"=")
             yield grammar.Field(decode(name), start, start + len(name + equals), end)
 
     def prefix(self, key: str) -> bytes:

@@ -241,7 +241,8 @@ class Project:
     options         the ``#hugin_*`` lines.
     first_number    what c- and v-lines call the first image: 0, or 1 where PTGui counts its dummy image.
     lines           the file's lines, in order: a `Line` where a line has a meaning, else its bytes.
-    end             how many of `lines` stand before the ``*`` that ends the script.
+    end             how many of `lines` stand before the ``*`` that ends the script, but not for Hugin.
+    doubts          what of the file is left out or doubtful, in sentences with file and line.
     added           lines that the file lacks, to be written at its end.
     bom, newline    the UTF-8 byte order mark, if the file has one, and its line end.
     """
@@ -250,6 +251,7 @@ class Project:
         self.file, self.bom, self.lines, self.end = file, bom, lines, len(lines)
         first = lines[0] if lines else b""
         self.newline = b"\r\n" if isinstance(first, bytes) and first.endswith(b"\r\n") else b"\n"
+        self.doubts: list[str] = []
         self.first_number = 0
         self.dummy: Image | None = None
         self.images: list[Image] = []
@@ -273,7 +275,7 @@ class Project:
 
     @property
     def comments(self) -> list[str]:
-        """All lines without a meaning to this model: comments, unknown lines, what follows the ``*``."""
+        """All lines without a meaning to this model: comments, unknown lines, those that are left out."""
         points = set(self.control_points.positions)
         plain = (line for at, line in enumerate(self.lines) if isinstance(line, bytes) and at not in points)
         return [text for text in (decode(line).strip() for line in plain) if text]

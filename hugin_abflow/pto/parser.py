@@ -1,13 +1,15 @@
 """Bytes to `Project`: Hugin's .pto and the scripts of PTGui, PTMac and the panotools.
 
 Every line is kept as its bytes; lines with a meaning are read at once, so that a malformed one is found
-here and not in the middle of the work. Only control points stay bytes until they are asked for.
+here and not in the middle of the work. Only control points stay bytes until they are asked for. Malformed
+lines that Hugin's nona does without are left out: where it makes layers, there is a panorama to be made.
 """
 
 from __future__ import annotations
 
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 from hugin_abflow.errors import ProjectError, PtoError
@@ -50,9 +52,10 @@ def load(path: str | Path) -> Project:
 def loads(data: bytes, file: str = "<bytes>") -> Project:
     """Read a project from the bytes of its file; `file` names it in messages.
 
-    Raises `PtoError` for a malformed line, a link, control point, mask or variable of an image that is not
-    there, links in a circle, and for data that is no such text at all: one with NUL bytes or without both a
-    p-line and an image.
+    Malformed control points, masks and variables are left out, which `Project.doubts` tells. Raises
+    `PtoError` for other malformed lines, a link to or a variable of an image that is not there, at which nona
+    ends, too, links in a circle, and for data that is no such text at all: one with NUL bytes or without both
+    a p-line and an image.
     """
     nul = data.find(b"\0")
     if nul >= 0 and (kind := picture_format(data)):
@@ -85,9 +88,10 @@ class _Reader:
         }
 
     def read(self) -> Project:
-        """Read all lines up to the ``*``, put the images together, check what refers to them.
+        """Read all lines, put the images together, check what refers to them.
 
-        There may be hundreds of thousands of control points: one as Hugin writes it is only matched.
+        There may be hundreds of thousands of control points: one as Hugin writes it is only matched. The
+        ``*`` at which panotools stop reading is nothing to Hugin: lines behind it count as those before.
         """
         project = self.project
         lines = project.lines
@@ -101,14 +105,17 @@ class _Reader:
                 numbers.update(match.groups())
                 positions.append(position)
             elif letter == b"c" and grammar.is_line(raw, letter):
-                point = lines[position] = ControlPoint(project, position + 1, raw)
-                numbers.update((point.value("n") or b"", point.value("N") or b""))
-                positions.append(position)
+                with self.left_out():
+                    point = lines[position] = ControlPoint(project, position + 1, raw)
+                    numbers.update((point.value("n") or b"", point.value("N") or b""))
+                    positions.append(position)
             elif letter == b"#":
                 lines[position] = self.read_comment(position + 1, raw) or raw
             elif letter == b"*":
-                project.end = position
-                break
+                project.end = min(project.end, position)
+            elif letter in (b"k", b"v") and grammar.is_line(raw, letter):
+                with self.left_out():
+                    lines[position] = self.read_line[letter](position + 1, raw)
             elif letter in self.read_line and grammar.is_line(raw, letter):
                 lines[position] = self.read_line[letter](position + 1, raw)
         project.added = [line for line in (project.panorama, project.modes) if not line.number]
@@ -118,15 +125,15 @@ class _Reader:
         return project
 
     def read_panorama(self, number: int, raw: bytes) -> Line:
-        """The p-line."""
-        self.refuse_second(self.project.panorama, number, raw)
-        self.project.panorama = Panorama(self.project, number, raw)
+        """The p-line, or another one."""
+        self.note_second(self.project.panorama, number)
+        self.project.panorama = Panorama(self.project, number, raw, self.project.panorama)
         return self.project.panorama
 
     def read_modes(self, number: int, raw: bytes) -> Line:
-        """The m-line."""
-        self.refuse_second(self.project.modes, number, raw)
-        self.project.modes = Modes(self.project, number, raw)
+        """The m-line, or another one."""
+        self.note_second(self.project.modes, number)
+        self.project.modes = Modes(self.project, number, raw, self.project.modes)
         return self.project.modes
 
     def read_input_image(self, number: int, raw: bytes) -> Line:
@@ -177,12 +184,22 @@ class _Reader:
             lines.append(line)
         return line
 
-    def refuse_second(self, earlier: Line, number: int, raw: bytes) -> None:
-        """Raise `PtoError` where the file has had such a line already."""
+    @contextmanager
+    def left_out(self) -> Iterator[None]:
+        """Leave out, and note, a line that is malformed or names an image that is not there."""
+        try:
+            yield
+        except PtoError as error:
+            self.project.doubts.append(f"{error}: it is left out, as Hugin does; correct or delete that line")
+
+    def note_second(self, earlier: Line, number: int) -> None:
+        """Note where the file has had such a line already."""
         if earlier.number:
             kind = earlier.head.decode()
-            expected = f"one {kind}-line (the first is line {earlier.number})"
-            raise PtoError(self.project.file, number, grammar.show(raw.rstrip()), expected)
+            self.project.doubts.append(
+                f"{self.project.file}, line {number}: line {earlier.number} is a {kind}-line, too; what both "
+                "give is taken from the later, as in Hugin; delete one"
+            )
 
     def join_images(self) -> None:
         """Make the images: the i-, o-, ``#-hugin`` and ``#-imgfile`` lines of the same index.
@@ -205,7 +222,7 @@ class _Reader:
         project.first_number = 1 if project.dummy is not None and counts_dummy else 0
 
     def check(self) -> None:
-        """Raise `PtoError` for what refers to nothing, and for a text that is no project."""
+        """Raise `PtoError` for what refers to nothing, but masks, and for a text that is no project."""
         project = self.project
         if not project.panorama.number and not project.images:
             expected = "a .pto text, with a p-line and an i-line for each image"
@@ -213,12 +230,21 @@ class _Reader:
             token = first.raw if isinstance(first, Line) else first
             raise PtoError(project.file, 0, grammar.show(token.rstrip()), expected)
         project.check_links()
-        for line in (*project.masks, *project.variables):
+        for line in project.variables:
             line.check()
+        masks, project.masks = project.masks, []
+        for mask in masks:
+            with self.left_out():
+                mask.check()
+                project.masks.append(mask)
 
     def check_control_points(self, numbers: set[bytes]) -> None:
-        """Raise `PtoError` for the first control point with one of `numbers` that is no image's."""
-        first = self.project.first_number
-        if not all(first <= int(number) < first + self.project.image_count for number in numbers):
-            for point in self.project.control_points:
+        """Leave out control points with one of `numbers` that is no image's."""
+        project, first = self.project, self.project.first_number
+        if all(first <= int(number) < first + project.image_count for number in numbers):
+            return
+        points, project.control_points.positions = list(project.control_points), []
+        for point in points:
+            with self.left_out():
                 point.check()
+                project.control_points.positions.append(point.number - 1)
