@@ -10,8 +10,10 @@ import click
 
 from hugin_abflow.batch.config import NAME, read_config, write_config
 from hugin_abflow.errors import ConfigError
+from hugin_abflow.imagewriter import ENDINGS
 from hugin_abflow.oneline import commented
 from hugin_abflow.options import kind_of, long_name, long_names
+from hugin_abflow.settings import Settings
 
 # Options that a file of settings cannot give.
 _UNSETTLED = frozenset({"config", "print-config", "dry-run", "watch"})
@@ -91,6 +93,34 @@ def _rivals(name: str, params: Mapping[str, Any]) -> set[str]:
     if name == "remap" and params["remap"] == "always":
         rivals |= {"prefix", "layers"}
     return rivals
+
+
+def ineffective(values: Mapping[str, Any]) -> list[str]:
+    """Warnings of options that are chosen and change nothing beside others that are. What is switched off
+    twice is none of them.
+    """
+    warnings = []
+
+    def warn(options: Sequence[str], reason: str) -> None:
+        if options:
+            warnings.append(f"of no effect: {', '.join(options)}, since {reason}")
+
+    if values["no_flow"]:
+        searched = ["--large-motion on"] if values["large_motion"] == "on" else []
+        weighed = ["--flow-magnitude"] if values["flow_magnitude"] != Settings.flow_magnitude else []
+        warn(searched + weighed, "--no-flow finds no flow; leave out one or the other")
+    if values["keep_layers"]:
+        named = next((f"--{name}" for name in ("prefix", "layers") if values[name]), None)
+        taken = named or ("--remap never" if values["remap"] == "never" else None)
+        warn(["--keep-layers"] if taken else [], f"{taken} takes layers that are there")
+    if values["jpeg_quality"] and (output := values["output"]):
+        is_jpeg = (
+            ENDINGS.get(output.suffix.lower()) == "jpeg" or (values["compression"] or "").lower() == "jpeg"
+        )
+        warn([] if is_jpeg else ["--jpeg-quality"], f"{output} is no JPEG, nor is --compression jpeg given")
+    if values["scheduler"] and values["jobs"]:
+        warn(["--jobs"], "--scheduler takes as many projects at a time as the cluster has workers")
+    return warnings
 
 
 def for_several(values: Mapping[str, Any], why: str, file: Path | None) -> None:

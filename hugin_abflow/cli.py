@@ -15,9 +15,9 @@ from hugin_abflow.batch.queue import find_projects, refuse_same_output
 from hugin_abflow.batch.run import Run, default_jobs, run, show
 from hugin_abflow.batch.task import Task
 from hugin_abflow.batch.watch import watch
-from hugin_abflow.choices import OF_THE_RUN, choose, config_texts, for_several, words
+from hugin_abflow.choices import OF_THE_RUN, choose, config_texts, for_several, ineffective, words
 from hugin_abflow.devices import list_devices
-from hugin_abflow.errors import AbflowError, ExitCode
+from hugin_abflow.errors import EXIT_CODES, AbflowError, ExitCode
 from hugin_abflow.found import Remap
 from hugin_abflow.images import COMPRESSIONS
 from hugin_abflow.metadata import PROGRAM, version
@@ -26,24 +26,6 @@ from hugin_abflow.scratch import is_folder
 from hugin_abflow.settings import FlowQuality, LargeMotion, MergeMode, Settings
 from hugin_abflow.signals import interruptible
 from hugin_abflow.terminal import complain, print_result, say, system_error
-
-EXIT_CODES = {
-    ExitCode.OK: "every panorama was written",
-    ExitCode.FAILED: "any other error",
-    ExitCode.USAGE: "the command line is wrong",
-    ExitCode.PROJECT: "the project cannot be read, makes no panorama, or is about a photo of another size",
-    ExitCode.LAYERS_MISSING: "layers or photos are missing",
-    ExitCode.LAYERS_MISMATCH: "the layers, or the photos, do not belong together (size, depth or channels)",
-    ExitCode.IMAGE_READ: "a layer or photo cannot be decoded",
-    ExitCode.OUTPUT: "the panorama cannot be written",
-    ExitCode.NONA: "nona is missing, or failed",
-    ExitCode.DEVICE: "no usable OpenCL device",
-    ExitCode.PARTIAL: "several projects: some succeeded, some failed",
-    ExitCode.ALL_FAILED: "several projects: all failed",
-    ExitCode.PROGRAM: "enfuse, hugin_hdrmerge or pano_trafo is missing, or failed",
-    ExitCode.CLUSTER: "the Dask cluster does not answer, or gave a project up",
-    ExitCode.INTERRUPTED: "interrupted (Ctrl-C, SIGTERM); nothing half-written is left",
-}
 
 EXAMPLES = (
     ("hugin-abflow harbour.pto", "remap with nona, blend, write beside the project"),
@@ -306,7 +288,8 @@ def command(projects: tuple[Path, ...], **given: Any) -> ExitCode:
     # what concerns the run as a whole is said beside what is named first
     place = places[0] if places else Path()
     first = config or find_config(place / "any" if is_folder(place) else place, places)
-    recursive, resume, force, how = _run_options(**_chosen(first))
+    values = _chosen(first)
+    recursive, resume, force, how = _run_options(**values, warnings=ineffective(values))
 
     def options(project: Path) -> tuple[Path | None, dict[str, Any]]:
         file = config or find_config(project, places)
@@ -332,7 +315,8 @@ def command(projects: tuple[Path, ...], **given: Any) -> ExitCode:
     remember = resume or force or len(found) > 1 or any(map(is_folder, projects))
     tasks = [Task(project, its, remember and not force, remember) for project, its in keywords.items()]
     if given["dry_run"]:
-        return show(tasks, {project: words(command, values) for project, (_, values) in chosen.items()})
+        ours = {project: words(command, values) for project, (_, values) in chosen.items()}
+        return show(tasks, ours, how.warnings)
     return run(tasks, how, lone=len(found) == 1)
 
 
@@ -371,11 +355,13 @@ def _run_options(
     verbose: bool,
     profile: Path | None,
     scheduler: str | None,
+    warnings: Sequence[str],
     **others: Any,
 ) -> tuple[bool, bool, bool, Run]:
     """What the options say about the run as a whole: --recursive, --resume, --force, and how it is done."""
     arguments = click.get_current_context().meta[ARGUMENTS]
-    return recursive, resume, force, Run(jobs, report, log, quiet, verbose, arguments, profile, scheduler)
+    how = Run(jobs, report, log, quiet, verbose, arguments, profile, scheduler, warnings)
+    return recursive, resume, force, how
 
 
 def _options(

@@ -29,6 +29,26 @@ class ExitCode(IntEnum):
     INTERRUPTED = 130  # Ctrl-C
 
 
+# What they mean, as README and --help have it.
+EXIT_CODES = {
+    ExitCode.OK: "every panorama was written",
+    ExitCode.FAILED: "any other error",
+    ExitCode.USAGE: "the command line is wrong",
+    ExitCode.PROJECT: "the project cannot be read, makes no panorama, or is about a photo of another size",
+    ExitCode.LAYERS_MISSING: "layers or photos are missing",
+    ExitCode.LAYERS_MISMATCH: "the layers, or the photos, do not belong together (size, depth or channels)",
+    ExitCode.IMAGE_READ: "a layer or photo cannot be decoded",
+    ExitCode.OUTPUT: "the panorama cannot be written",
+    ExitCode.NONA: "nona is missing, or failed",
+    ExitCode.DEVICE: "no usable OpenCL device",
+    ExitCode.PARTIAL: "several projects: some succeeded, some failed",
+    ExitCode.ALL_FAILED: "several projects: all failed",
+    ExitCode.PROGRAM: "enfuse, hugin_hdrmerge or pano_trafo is missing, or failed",
+    ExitCode.CLUSTER: "the Dask cluster does not answer, or gave a project up",
+    ExitCode.INTERRUPTED: "interrupted (Ctrl-C, SIGTERM); nothing half-written is left",
+}
+
+
 class AbflowError(Exception):
     """Base of all errors that hugin-abflow raises on purpose."""
 

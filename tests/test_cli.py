@@ -112,6 +112,40 @@ def test_option_changes_one_setting(calls: Calls, arguments: list[str], name: st
 
 
 @pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (
+            "--no-flow --large-motion on --flow-magnitude 5",
+            "--large-motion on, --flow-magnitude, since --no-flow",
+        ),
+        ("--no-flow --large-motion off --guides off --clones off --flow-quality fast", ""),
+        ("--large-motion on --flow-magnitude 5", ""),
+        ("--keep-layers --prefix a", "--keep-layers, since --prefix"),
+        ("--keep-layers --layers a.tif", "--keep-layers, since --layers"),
+        ("--keep-layers --remap never", "--keep-layers, since --remap never"),
+        ("--keep-layers --remap always", ""),
+        ("--jpeg-quality 80 -o a.png", "--jpeg-quality, since a.png is no JPEG"),
+        ("--jpeg-quality 80 -o a.tif --compression JPEG", ""),
+        ("--jpeg-quality 80 -o a.JPG", ""),
+        ("--jpeg-quality 80", ""),
+        ("--scheduler tcp://a:1 --jobs 2", "--jobs, since --scheduler"),
+    ],
+)
+@pytest.mark.parametrize(
+    "also", [[], ["-q"], ["b.pto"], ["--dry-run"]], ids=["one", "quiet", "several", "shown"]
+)
+def test_options_of_no_effect_are_warned_of_once(
+    calls: Calls, arguments: str, said: str, also: list[str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    if (also == ["b.pto"] and "-o" in arguments) or "--layers" in arguments:
+        also = []  # these are for one project
+    cli.main(["a.pto", *also, *arguments.split()])
+    warnings = [line for line in capsys.readouterr().err.splitlines() if "warning" in line]
+    assert len(warnings) == bool(said)
+    assert not said or f"hugin-abflow: warning: of no effect: {said}" in warnings[0]
+
+
+@pytest.mark.parametrize(
     ("given", "layers", "projects"),
     [
         ("p.pto --layers a.tif b.tif c.tif", "a.tif b.tif c.tif", "p.pto"),
@@ -298,7 +332,7 @@ def test_exit_code_of_several_projects(replace: Replace, codes: list[ExitCode], 
 
 
 def test_every_exit_code_has_a_meaning() -> None:
-    assert set(cli.EXIT_CODES) == set(ExitCode)
+    assert set(errors.EXIT_CODES) == set(ExitCode)
 
 
 # Information

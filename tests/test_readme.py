@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from hugin_abflow import cli
-from hugin_abflow.errors import OutputError
+from hugin_abflow.errors import EXIT_CODES, OutputError
 from hugin_abflow.images import write_image
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -82,7 +82,7 @@ def test_options_are_in_the_groups_of_help(capsys: pytest.CaptureFixture[str]) -
 
 
 def test_exit_codes_are_documented() -> None:
-    assert rows("Exit codes") == [[str(int(code)), text] for code, text in cli.EXIT_CODES.items()]
+    assert rows("Exit codes") == [[str(int(code)), text] for code, text in EXIT_CODES.items()]
 
 
 @pytest.mark.usefixtures("shoot")

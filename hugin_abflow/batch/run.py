@@ -20,7 +20,7 @@ from hugin_abflow.errors import AbflowError, ExitCode, OutputError, SameOutputEr
 from hugin_abflow.oneline import commented
 from hugin_abflow.scratch import is_special
 from hugin_abflow.stitch import show_project
-from hugin_abflow.terminal import complain, messages, print_path, print_result
+from hugin_abflow.terminal import complain, label, messages, print_path, print_result, say
 
 
 @dataclass(frozen=True)
@@ -33,6 +33,7 @@ class Run:
     arguments   the command line, for the report.
     profile     file for the trace, see trace.py.
     scheduler   address of a Dask scheduler, whose workers do the work; None: this machine does.
+    warnings    what is to be said of the command line itself, once.
 
     Raises `SameOutputError` where two of the files are one.
     """
@@ -45,6 +46,7 @@ class Run:
     arguments: Sequence[str] = ()
     profile: Path | None = None
     scheduler: str | None = None
+    warnings: Sequence[str] = ()
 
     def __post_init__(self) -> None:
         named: dict[str, str] = {}
@@ -80,6 +82,8 @@ def run(tasks: Iterable[Task | str | None], how: Run, lone: bool = False) -> Exi
         display = choose_display(lone, how.quiet, how.verbose, log)
         try:
             with display:
+                for text in how.warnings:
+                    display.warn(text)
                 if isinstance(tasks, Sequence):
                     display.expect(len(tasks))
                     order = {task.project.absolute(): place for place, task in enumerate(filter(None, tasks))}
@@ -165,9 +169,13 @@ def _announced(
             yield waiting.pop(project)
 
 
-def show(tasks: Iterable[Task], words: Mapping[Path, Sequence[str]]) -> ExitCode:
-    """Print on stdout what would be done for each task. words: of its project, options of our own."""
+def show(tasks: Iterable[Task], words: Mapping[Path, Sequence[str]], warnings: Sequence[str]) -> ExitCode:
+    """Print on stdout what would be done for each task. words: of its project, options of our own; warnings:
+    as `Run` has them.
+    """
     codes = []
+    for text in warnings:
+        say(label(logging.WARNING) + text)
     with messages(logging.WARNING):
         for one in tasks:
             try:
