@@ -78,12 +78,12 @@ def merge_project(
     settings = settings or Settings()
     if output is None:
         compression = storable(plan, compression)
-    _check_early(plan, settings, output, compression)
+    check_early(plan, settings, output, compression)
     with open_layers(
         plan, prefix=prefix, layers=layers, remap=remap, keep_layers=keep_layers,
         images=None if prefix or layers or keep_layers else to_be_made(plan), progress=progress,
     ) as opened:  # fmt: skip
-        target = _target(plan, opened, output)
+        target = target_of(plan, opened, output)
         shown = opened if layers else of_one_exposure(plan, opened)
         if ENDINGS.get(target.suffix.lower()) == ENDINGS[plan.output.ending]:
             compression = plan.output.compression if compression is None else compression
@@ -244,8 +244,8 @@ def _report(canvas: Canvas, projection: str, layers: Sequence[Layer], writer: Im
     _log.info("output: %s, %s, %s, %s", writer.path, writer.format, writer.compression, writer.stored)
 
 
-def _target(plan: Plan, layers: Sequence[Layer], output: Path | str | None) -> Path:
-    """The panorama's file, which must be none of the inputs."""
+def target_of(plan: Plan, layers: Sequence[Layer], output: Path | str | None) -> Path:
+    """The panorama's file, which must be none of the inputs. Raises `OutputError`."""
     inputs = [layer.file for layer in layers if layer.file is not None]
     if output is None:
         return default_target(plan, inputs)
@@ -271,8 +271,11 @@ def storable(plan: Plan, compression: str | None) -> str | None:
     return compression
 
 
-def _check_early(plan: Plan, settings: Settings, output: Path | str | None, compression: str | None) -> None:
-    """Raise what would be raised in the end, too, but after minutes in which nona makes the layers."""
+def check_early(plan: Plan, settings: Settings, output: Path | str | None, compression: str | None) -> None:
+    """Raise what would be raised in the end, too, but after minutes in which nona makes the layers.
+
+    compression     that was chosen; `storable` where nobody names the output.
+    """
     if output is None:
         target = plan.default_output()
     else:

@@ -18,11 +18,13 @@ from hugin_abflow.images import COMPRESSIONS, DEFAULTS, ENDINGS, JPEG_QUALITY, r
 from hugin_abflow.layer import Layer, check_layers
 from hugin_abflow.merge import (
     OpenDevice,
+    check_early,
     default_target,
     guides_of,
     merge_project,
     refuse_input,
     storable,
+    target_of,
     write_panorama,
 )
 from hugin_abflow.metadata import describe
@@ -139,14 +141,20 @@ def show_project(
     As the run does, the script makes what is no output in a temporary folder, so that nothing is replaced but
     outputs. It ends at the first error. Photos that miss the crop, which nona tells later, are taken for part
     of the panorama; where nona makes some layers of several, to be kept or stacked, such a one is an error.
-    Raises as `stitch_project` does for what the project can get wrong, and what must not be replaced.
+    Raises as `stitch_project` does for what project, output and named layers can get wrong.
     """
     plan = read_plan(path)
     warn_of_doubts(plan)
     name = no_option(plan.file.name)
     script = partial(_script, plan, leave)
-    stored = _storing(compression if output else storable(plan, compression), jpeg_quality)
+    chosen = compression if output else storable(plan, compression)
+    check = partial(check_early, plan, settings or Settings(), output, chosen)
+    stored = _storing(chosen, jpeg_quality)
     if output or prefix or layers:
+        check()
+        if prefix or layers:  # they are there, and fit, or the run ends with what is raised here
+            with open_layers(plan, prefix=prefix, layers=layers, remap=remap) as opened:
+                target_of(plan, opened, output)
         (final,) = asked_panoramas(plan, output=output, prefix=prefix, layers=layers, remap=remap)
         target = str(final) if output else no_option(final.name)
         merging = [BLEND, *options, *stored, "-o", target, name]
@@ -162,6 +170,7 @@ def show_project(
         keep = keep_layers or branch.keeps_layers
         remapped, found, files = _remapping(branch.plan, _remap(branch.plan, remap), keep)
         if Kind.PANORAMA in branch.kinds:
+            check()
             results.append(default_target(plan))
             target = no_option(results[-1].name)
             remapped = _merging([BLEND, *options, *stored, "-o", target, name], remapped, found)

@@ -14,7 +14,7 @@ import OpenImageIO as oiio
 import pytest
 import tifffile
 from conftest import ProjectMaker, names_in, require_program
-from layer_files import RATIONAL, X_POSITION, Y_POSITION
+from layer_files import RATIONAL, X_POSITION, Y_POSITION, write_layer
 from pictures import one_device
 from test_exif import shown
 from test_hugin import CANVAS, NAME, stacked
@@ -346,7 +346,10 @@ def test_dry_run_of_one_panorama(
     make_project: ProjectMaker, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, options: dict, expected: list
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    lines = show_project(make_project(extra=asked(*Kind)), **options)[3:]
+    project = make_project(extra=asked(*Kind))
+    for layer in (project.with_name("l0000.tif"), tmp_path / "a.tif"):
+        write_layer(layer, np.full((9, 9, 4), 255, np.uint8))
+    lines = show_project(project, **options)[3:]
     assert len(lines) == len(expected)
     for line, begin in zip(lines, expected, strict=True):
         assert line.startswith(begin.format(here=tmp_path))
@@ -385,7 +388,7 @@ def test_dry_run_finds_layers_as_the_run_does(
         with pytest.raises(LayersMissingError, match=r"no layers pano0000\.tif .* let nona make them"):
             run(project, remap="never")
     (tmp_path / "layers").mkdir()
-    (tmp_path / "layers" / "l0000.tif").touch()
+    write_layer(tmp_path / "layers" / "l0000.tif", np.full((9, 9, 4), 255, np.uint8))
     monkeypatch.chdir(tmp_path)
     line = shlex.split(show_project(project, prefix="layers/l")[-1])
     assert line[-2:] == ["--prefix", str(tmp_path / "layers" / "l")]

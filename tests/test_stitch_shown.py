@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
+import re
 import shlex
 import subprocess
 from pathlib import Path
 
+import numpy as np
 import pytest
 import tifffile
 from conftest import ProjectMaker, remap
+from layer_files import write_layer
 from pictures import one_device
 from test_hugin import CANVAS, stacked
 from test_stitch import asked, programs, run_shown
 
-from hugin_abflow.errors import OutputError
+from hugin_abflow.errors import AbflowError, ExitCode, OutputError
 from hugin_abflow.outputs import Kind
 from hugin_abflow.project import read_plan
 from hugin_abflow.settings import Settings
@@ -163,3 +166,38 @@ def test_a_script_ends_at_the_first_error(
 def compression_of(path: Path) -> str:
     with tifffile.TiffFile(path) as file:
         return file.pages[0].compression.name
+
+
+@pytest.mark.parametrize(
+    ("options", "code", "said"),
+    [
+        ({"compression": "piz"}, ExitCode.OUTPUT, "compression 'piz'; choose one of none"),
+        ({"compression": "lzw", "output": "a.jpg"}, ExitCode.OUTPUT, "compression 'lzw'; choose one of jpeg"),
+        ({"output": "a.gif"}, ExitCode.OUTPUT, "the ending must be one of"),
+        ({"output": "none/a.tif"}, ExitCode.OUTPUT, "choose another folder with -o"),
+        ({"output": "photo 0.tif"}, ExitCode.OUTPUT, "is an input of this panorama"),
+        ({"output": "a.tif", "layers": ["a.tif"]}, ExitCode.OUTPUT, "is an input of this panorama"),
+        ({"layers": ["none.tif"]}, ExitCode.LAYERS_MISSING, "no such layer"),
+        ({"layers": ["photo 0.tif"]}, ExitCode.LAYERS_MISMATCH, "has no alpha channel"),
+        ({"layers": ["pano.pto"]}, ExitCode.IMAGE_READ, "cannot be read"),
+        ({"layers": ["a.tif"], "remap": "always"}, ExitCode.USAGE, "leave out"),
+        ({"prefix": "none"}, ExitCode.LAYERS_MISSING, "check --prefix"),
+        ({"settings": Settings(device="none")}, ExitCode.DEVICE, "--device none"),
+    ],
+)
+def test_what_the_run_refuses_is_refused_alike(
+    make_project: ProjectMaker, monkeypatch: pytest.MonkeyPatch, options: dict, code: ExitCode, said: str
+) -> None:
+    """Of the options; what is found out while layers are made or merged shows in the run alone."""
+    project = make_project(panorama=CANVAS)
+    write_layer(project.with_name("a.tif"), np.full((9, 9, 4), 255, np.uint8))
+    monkeypatch.chdir(project.parent)
+    before = sorted(project.parent.iterdir())
+    messages = []
+    for run in (stitch_project, show_project):
+        with pytest.raises(AbflowError, match=re.escape(said)) as caught:
+            run(project, **options)
+        assert caught.value.exit_code == code
+        messages.append(str(caught.value))
+    assert messages[0] == messages[1]
+    assert sorted(project.parent.iterdir()) == before
