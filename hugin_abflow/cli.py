@@ -22,7 +22,7 @@ from hugin_abflow.found import Remap
 from hugin_abflow.images import COMPRESSIONS
 from hugin_abflow.metadata import PROGRAM, version
 from hugin_abflow.options import ARGUMENTS, Command, Compression, NewFile, Number, OldFile, Option, Size, Text
-from hugin_abflow.scratch import is_folder
+from hugin_abflow.scratch import is_folder, misnamed_root
 from hugin_abflow.settings import FlowQuality, LargeMotion, MergeMode, Settings
 from hugin_abflow.signals import interruptible
 from hugin_abflow.terminal import complain, print_result, say, system_error
@@ -360,7 +360,9 @@ def _run_options(
 ) -> tuple[bool, bool, bool, Run]:
     """What the options say about the run as a whole: --recursive, --resume, --force, and how it is done."""
     arguments = click.get_current_context().meta[ARGUMENTS]
-    how = Run(jobs, report, log, quiet, verbose, arguments, profile, scheduler, warnings)
+    misnamed = misnamed_root()
+    said = [*warnings, misnamed] if misnamed else warnings
+    how = Run(jobs, report, log, quiet, verbose, arguments, profile, scheduler, said)
     return recursive, resume, force, how
 
 

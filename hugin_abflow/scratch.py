@@ -153,7 +153,15 @@ def work_folder() -> Iterator[Path]:
 def root() -> Path:
     """The folder for temporary files: TMPDIR, asked each time, as Python remembers the first that it saw."""
     named = os.environ.get("TMPDIR", "")
-    return Path(named if named and Path(named).is_dir() else tempfile.gettempdir())
+    return Path(named if named and is_folder(Path(named)) else tempfile.gettempdir())
+
+
+def misnamed_root() -> str | None:
+    """What is to be said where TMPDIR names no folder, so that another one is taken; None where it does."""
+    named = os.environ.get("TMPDIR", "")
+    if not named or is_folder(Path(named)):
+        return None
+    return f"TMPDIR is {named}, and no such folder is there: {root()} is used; make it, or name another"
 
 
 def sweep(folder: Path) -> None:

@@ -145,6 +145,20 @@ def test_options_of_no_effect_are_warned_of_once(
     assert not said or f"hugin-abflow: warning: of no effect: {said}" in warnings[0]
 
 
+def test_a_folder_for_temporary_files_that_is_not_there_is_told_once(
+    calls: Calls, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for named in (tmp_path, ""):
+        monkeypatch.setenv("TMPDIR", str(named))
+        assert cli.main(["a.pto"]) == 0
+        assert "TMPDIR" not in capsys.readouterr().err
+    monkeypatch.setenv("TMPDIR", str(tmp_path / "none"))
+    for arguments in (["a.pto"], ["a.pto", "b.pto", "-q"]):
+        assert cli.main(arguments) == 0
+        (line,) = [line for line in capsys.readouterr().err.splitlines() if "TMPDIR" in line]
+        assert f"warning: TMPDIR is {tmp_path / 'none'}, and no such folder is there: " in line
+
+
 @pytest.mark.parametrize(
     ("given", "layers", "projects"),
     [

@@ -370,6 +370,14 @@ def test_warnings(layers: list[str], line: str, said: str, capsys: pytest.Captur
     assert said in warning and "hugin-abflow" not in warning
 
 
+def test_a_folder_for_temporary_files_that_is_not_there_is_told(
+    layers: list[str], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("TMPDIR", "none")
+    assert run(*layers) == 0
+    assert "abflow-enblend: warning: TMPDIR is none, and no such folder is there" in capsys.readouterr().err
+
+
 def test_verbosity(layers: list[str], capsys: pytest.CaptureFixture[str]) -> None:
     printed = []
     for option in ("-v0", "-v1", "-v2"):

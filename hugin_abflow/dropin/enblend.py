@@ -21,6 +21,7 @@ from hugin_abflow.merge import guides_between, refuse_input, refuse_photo, write
 from hugin_abflow.metadata import describe, version
 from hugin_abflow.progress import Progress
 from hugin_abflow.project import read_plan, warn_of_doubts
+from hugin_abflow.scratch import misnamed_root
 from hugin_abflow.settings import Settings
 from hugin_abflow.signals import interruptible
 from hugin_abflow.terminal import (
@@ -84,6 +85,8 @@ def blend(request: Request, progress: Progress) -> None:
     """
     if request.ignored:
         _log.warning("options of enblend that change nothing here: %s", ", ".join(request.ignored))
+    if misnamed := misnamed_root():
+        _log.warning("%s", misnamed)
     layers = _read(request)
     plan = read_plan(request.project) if request.project else None
     inputs = [*request.inputs, *([plan.file, *plan.photos] if plan else [])]
