@@ -25,10 +25,10 @@ from hugin_abflow.imagewriter import (
     JPEG_QUALITY,
     ImageWriter,
     check_target,
-    named_in_unicode,
     write_image,
 )
 from hugin_abflow.layer import Box, Layer, full_scale
+from hugin_abflow.targets import named_in_unicode
 
 __all__ = [
     "COMPRESSIONS",

@@ -1,4 +1,4 @@
-"""Write panoramas: whole files or none. Used through `hugin_abflow.images`, but for `named_in_unicode`.
+"""Write panoramas: whole files or none. Used through `hugin_abflow.images`.
 
 With `hugin_abflow.images` the only module that uses OpenImageIO.
 """
@@ -25,7 +25,8 @@ from hugin_abflow import tiffwriter, trace
 from hugin_abflow.errors import OutputError
 from hugin_abflow.exif import Metadata, embed, place_in_png
 from hugin_abflow.layer import full_scale, native
-from hugin_abflow.scratch import is_special, part_beside, put
+from hugin_abflow.scratch import part_beside, put
+from hugin_abflow.targets import explained, final_file
 
 Pixels = npt.NDArray[Any]
 
@@ -79,6 +80,7 @@ class ImageWriter:
     threads         cores that encode TIFF; default: all.
     icc             profile, carried as it is; PNG leaves a broken one out, with a warning.
     metadata        EXIF and XMP; of EXR what OpenImageIO carries, as its attributes.
+    named_with      the option that names the file, for messages.
 
     The attribute `compression` says what is really used. JPEG loses alpha: laid over black.
     Raises `OutputError` for an unknown ending, a depth or size the format cannot hold, an unwritable
@@ -101,8 +103,9 @@ class ImageWriter:
         canvas_size: tuple[int, int] | None = None,
         metadata: Metadata | None = None,
         threads: int | None = None,
+        named_with: str = "-o",
     ) -> None:
-        self.path, self.metadata = Path(path), metadata
+        self.path, self.metadata, self._named_with = Path(path), metadata, named_with
         self._threads = threads or os.cpu_count() or 1
         self.width, self.height, self.channels, self.dtype = width, height, channels, np.dtype(dtype)
         self.format = _format_of(self.path)
@@ -159,8 +162,8 @@ class ImageWriter:
         return spec
 
     def __enter__(self) -> ImageWriter:
-        self._final = _final(self.path)
-        with _explained(self.path, self._final):
+        self._final = final_file(self.path, self._named_with)
+        with explained(self.path, self._final, self._named_with):
             # made here, not by OpenImageIO: a clear reason
             self._part = self._scratch.enter_context(part_beside(self._final, self.path.suffix))
         try:
@@ -306,7 +309,7 @@ class ImageWriter:
         reason = (why.strip() or "no reason given").splitlines()[0]  # PNG's writer adds a line for each block
         return OutputError(
             f"{self.path} cannot be written: {reason.strip()}; "
-            "is there room in the folder? Choose another with -o"
+            f"is there room in the folder? Choose another with {self._named_with}"
         )
 
 
@@ -338,48 +341,19 @@ def write_image(
         writer.write_rows(pixels)
 
 
-def check_target(path: Path, compression: str | None) -> None:
-    """Raise `OutputError` for a file that cannot be written, or not so, whatever it is to hold."""
-    final, kind = _final(path), _format_of(path)
-    with _explained(path, final):
+def check_target(
+    path: Path, compression: str | None, samples: npt.DTypeLike | None = None, named_with: str = "-o"
+) -> None:
+    """Raise `OutputError` for a file that cannot be written, or not so, whatever it is to hold.
+
+    samples     that it is to hold, if that is known. named_with: as `ImageWriter` has it.
+    """
+    final, kind = final_file(path, named_with), _format_of(path)
+    with explained(path, final, named_with):
         os.stat(f"{final.parent}{os.sep}")  # noqa: PTH116 - so a file is no folder
+    if samples is not None:
+        _stored_dtype(path, kind, np.dtype(samples), None)
     _compression(path, kind, np.dtype(np.uint8), 3, compression, None)
-
-
-def _final(path: Path) -> Path:
-    """The file that is replaced: through a link what it points to, not the link."""
-    if "\0" in str(path):
-        raise OutputError(f"{str(path)!r} is no name of a file: it has a NUL; choose another with -o")
-    final = Path(os.path.realpath(path))
-    if not named_in_unicode(final.parent):
-        raise OutputError(
-            f"{path}: the path of its folder is not valid UTF-8; rename that, or choose another with -o"
-        )
-    with _explained(path, final):
-        if final.is_dir():
-            raise OutputError(f"{path} is a folder; name a file with -o")
-        # a device or a pipe, reached by a link: the rename would take its place
-        if is_special(final):
-            raise OutputError(f"{path} is no ordinary file; name one with -o")
-        if final.exists() and not final.stat().st_mode & 0o222:  # which a rename does not ask
-            raise OutputError(f"{path} is write-protected; allow writing, or name another file with -o")
-    return final
-
-
-@contextlib.contextmanager
-def _explained(path: Path, final: Path) -> Iterator[None]:
-    """Raise `OutputError` for what the system says of the folder of `final`, which `path` means."""
-    try:
-        yield
-    except OSError as error:
-        raise OutputError(
-            f"{path} cannot be written: {final.parent}: {error.strerror}; choose another folder with -o"
-        ) from None
-
-
-def named_in_unicode(path: Path) -> bool:
-    """Whether OpenImageIO can be told the path: bytes that are no UTF-8 (an old archive's) it cannot."""
-    return not any("\ud800" <= letter <= "\udfff" for letter in str(path))
 
 
 def _format_of(path: Path) -> str:
@@ -402,7 +376,7 @@ def _stored_dtype(
         return wanted if wanted == np.uint8 else np.dtype(np.uint16)
     if wanted.kind != "f":
         raise OutputError(
-            f"{path}: EXR holds half or float, the layers have {wanted}; choose .tif, .png or .jpg"
+            f"{path}: EXR holds half or float, and these are {wanted}; choose .tif, .png or .jpg"
         )
     return wanted if wanted == np.float16 else np.dtype(np.float32)
 

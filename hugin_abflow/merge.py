@@ -287,15 +287,16 @@ def check_early(plan: Plan, settings: Settings, output: Path | str | None, compr
         choose(settings.device, settings.threads)
 
 
-def refuse_input(output: Path, inputs: Iterable[Path]) -> None:
-    """Raise `OutputError` for an output that is one of the inputs."""
+def refuse_input(output: Path, inputs: Iterable[Path], named_with: str = "-o") -> None:
+    """Raise `OutputError` for an output that is one of the inputs; named_with: the option that names it."""
     if file_key(output) in map(file_key, inputs):
-        raise OutputError(f"{output} is an input of this panorama; choose another name with -o")
+        raise OutputError(f"{output} is an input of this panorama; choose another name with {named_with}")
 
 
-def refuse_photo(output: Path) -> None:
+def refuse_photo(output: Path, named_with: str = "-o") -> None:
     """Raise `OutputError` for an output that somebody named and that is a photo, whatever it belongs to."""
     if is_photo(output):
         raise OutputError(
-            f"{output} is a photo: its EXIF tells an exposure time; choose another name with -o, or remove it"
+            f"{output} is a photo: its EXIF tells an exposure time; choose another name with {named_with}, "
+            "or remove it"
         )

@@ -40,13 +40,13 @@ from hugin_abflow.found import (
     none_there,
 )
 from hugin_abflow.images import image_size, read_layers
-from hugin_abflow.imagewriter import named_in_unicode
 from hugin_abflow.jpeg import is_cut
 from hugin_abflow.layer import Layer, check_layers, other_canvas
 from hugin_abflow.programs import LAST_LINES, ending, last_lines, move_whole, started
 from hugin_abflow.progress import Progress, silent
 from hugin_abflow.project import Plan, PlannedImage, file_key
 from hugin_abflow.scratch import is_file, is_special, work_folder
+from hugin_abflow.targets import named_in_unicode
 from hugin_abflow.tifftags import is_edited
 
 log = logging.getLogger("hugin_abflow.nona")

@@ -309,7 +309,7 @@ def test_output_errors_name_the_file_and_what_to_do(tmp_path):
     pixels = noise(np.uint8)
     with pytest.raises(OutputError, match=r"a\.bmp: the ending must be one of \.tif, .*\.exr"):
         write_image(tmp_path / "a.bmp", pixels)
-    with pytest.raises(OutputError, match="EXR holds half or float, the layers have uint8"):
+    with pytest.raises(OutputError, match="EXR holds half or float, and these are uint8"):
         write_image(tmp_path / "a.exr", pixels)
     with pytest.raises(OutputError, match="int32"):
         write_image(tmp_path / "a.tif", pixels.astype(np.int32))

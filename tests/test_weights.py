@@ -176,7 +176,11 @@ def test_masks_that_cannot_be_written_are_told_before_the_work(
     message = refused(capsys, "--save-masks=none/m%n.tif", *layers)
     assert "none/m1.tif cannot be written" in message
     assert "No such file or directory" in message
+    assert "choose another folder with --save-masks" in message
     assert "m1.text: the ending must be one of" in refused(capsys, "--save-masks=m%n.text", *layers)
+    message = refused(capsys, "--save-masks=m%n.exr", *layers)
+    assert "m1.exr: EXR holds half or float, and these are uint16; choose .tif" in message
+    assert "choose another name with --save-masks" in refused(capsys, "--save-masks=%p", *layers)
 
 
 @pytest.mark.parametrize(

@@ -23,6 +23,7 @@ from hugin_abflow.opencl import Device
 from hugin_abflow.progress import Progress, silent
 from hugin_abflow.settings import Settings
 
+_OPTION = "--save-masks"
 _WHITE = np.uint16(65535)
 # What is left of a weight that a mask takes away, far below a step of 16 bits: a pixel that no other layer
 # can fill stays opaque, and one that another's sample just reaches, from outside, is this layer's, as it was.
@@ -95,9 +96,9 @@ class MaskedMerge:
         if len(set(targets)) < len(targets):
             raise CommandLineError(f"--save-masks={self.save} names one mask twice; %n gives each a number")
         for target in targets:
-            refuse_input(target, [self.output, *self.inputs])
-            refuse_photo(target)
-            check_target(target, None)  # now, not when all else is done
+            refuse_input(target, [self.output, *self.inputs], _OPTION)
+            refuse_photo(target, _OPTION)
+            check_target(target, None, np.uint16, _OPTION)  # now, not when all else is done
         return targets
 
 
@@ -141,7 +142,9 @@ def _write(
     """One layer's weight: the panorama of layers that are black, but for that one, which is white."""
     painted = replace(prepared, layers=tuple(_painted(device, one, layer) for one in prepared.layers))
     crop = canvas.crop
-    with ImageWriter(path, crop.width, crop.height, 1, np.uint16, offset=(crop.left, crop.top)) as writer:
+    with ImageWriter(
+        path, crop.width, crop.height, 1, np.uint16, offset=(crop.left, crop.top), named_with=_OPTION
+    ) as writer:
         for rows in joint.bands(device, painted, canvas, settings, silent):
             writer.write_rows(rows)
 

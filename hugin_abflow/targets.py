@@ -1,0 +1,58 @@
+"""Files that are to be written: which file a name means, and what forbids to write it, with what to do."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from hugin_abflow.errors import OutputError
+from hugin_abflow.scratch import is_special
+
+
+def final_file(path: Path, named_with: str) -> Path:
+    """The file that is replaced: through a link what it points to, not the link.
+
+    named_with      the option that names it, for messages.
+
+    Raises `OutputError` for a name that no file can have, and for what must not be replaced.
+    """
+    if "\0" in str(path):
+        raise OutputError(
+            f"{str(path)!r} is no name of a file: it has a NUL; choose another with {named_with}"
+        )
+    final = Path(os.path.realpath(path))
+    if not named_in_unicode(final.parent):
+        raise OutputError(
+            f"{path}: the path of its folder is not valid UTF-8; rename that, or choose another with "
+            f"{named_with}"
+        )
+    with explained(path, final, named_with):
+        if final.is_dir():
+            raise OutputError(f"{path} is a folder; name a file with {named_with}")
+        # a device or a pipe, reached by a link: the rename would take its place
+        if is_special(final):
+            raise OutputError(f"{path} is no ordinary file; name one with {named_with}")
+        if final.exists() and not final.stat().st_mode & 0o222:  # which a rename does not ask
+            raise OutputError(
+                f"{path} is write-protected; allow writing, or name another file with {named_with}"
+            )
+    return final
+
+
+@contextmanager
+def explained(path: Path, final: Path, named_with: str) -> Iterator[None]:
+    """Raise `OutputError` for what the system says of the folder of `final`, which `path` means."""
+    try:
+        yield
+    except OSError as error:
+        raise OutputError(
+            f"{path} cannot be written: {final.parent}: {error.strerror}; choose another folder with "
+            f"{named_with}"
+        ) from None
+
+
+def named_in_unicode(path: Path) -> bool:
+    """Whether OpenImageIO can be told the path: bytes that are no UTF-8 (an old archive's) it cannot."""
+    return not any("\ud800" <= letter <= "\udfff" for letter in str(path))

@@ -1,0 +1,38 @@
+"""Files that cannot be written are told with the option that names them."""
+
+from __future__ import annotations
+
+import os
+import sys
+from pathlib import Path
+
+import pytest
+
+from hugin_abflow.errors import OutputError
+from hugin_abflow.targets import explained, final_file
+
+
+@pytest.mark.parametrize(
+    ("name", "said"),
+    [
+        ("folder", "folder is a folder; name a file with --x"),
+        ("link", "link is no ordinary file; name one with --x"),
+        ("closed", "closed is write-protected; allow writing, or name another file with --x"),
+        ("a\0b", "it has a NUL; choose another with --x"),
+        ("\udce9/a", "is not valid UTF-8; rename that, or choose another with --x"),
+    ],
+)
+@pytest.mark.skipif(sys.platform == "win32", reason="has no such files")
+def test_the_option_is_named(tmp_path: Path, name: str, said: str) -> None:
+    (tmp_path / "folder").mkdir()
+    (tmp_path / "link").symlink_to(os.devnull)
+    (tmp_path / "closed").touch(0o444)
+    with pytest.raises(OutputError, match=said):
+        final_file(tmp_path / name, "--x")
+
+
+def test_what_the_system_says_of_the_folder(tmp_path: Path) -> None:
+    file = tmp_path / "none" / "a"
+    said = f"^a cannot be written: {tmp_path / 'none'}: No such file .*; choose another folder with --x$"
+    with pytest.raises(OutputError, match=said), explained(Path("a"), file, "--x"):
+        file.touch()
