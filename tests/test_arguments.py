@@ -95,6 +95,41 @@ def test_response_files_nest_and_are_relative_to_themselves(tmp_path: Path) -> N
     ]
 
 
+@pytest.mark.parametrize(
+    ("lines", "expected"),
+    [
+        ("l*.tif", "l*.tif"),
+        ("#glob: wildcard\nl*.tif", "l0.tif l1.tif"),
+        ("#  Globbing : WILDCARD \nl[1-9].tif\n#filename-globbing:literal\nl*.tif", "l1.tif l*.tif"),
+        ("l?.tif\n#glob: wildcard", "l?.tif"),
+        ("#glob: none\nl0.tif", "l0.tif"),
+        ("#glob: shell\n{l1,b/[a-d],l0}.tif", "l1.tif b/c.tif l0.tif"),
+        ("#glob: sh\n~/l{0,{1,0}}.tif", "{here}/l0.tif {here}/l1.tif"),
+        ("#glob: wildcard\n@b/list", "b/c.tif b/ä.tif"),
+        ("# x glob: wildcard\n##glob: wildcard\n#glob wildcard\n#glob:\nl*.tif", "l*.tif"),
+        ("#glob: wildcard\n{here}/l1*", "{here}/l1.tif"),
+    ],
+)
+def test_response_files_may_hold_patterns_as_enblends_do(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, lines: str, expected: str
+) -> None:
+    monkeypatch.setenv("HOME", str(tmp_path))
+    (tmp_path / "b").mkdir()
+    for name in ("l1.tif", "l0.tif", ".l2.tif", "b/c.tif", "b/ä.tif"):
+        (tmp_path / name).touch()
+    (tmp_path / "b" / "list").write_text("*.tif\n")
+    (tmp_path / "list").write_text(lines.replace("{here}", str(tmp_path)))
+    files = [tmp_path / name.replace("{here}", str(tmp_path)) for name in expected.split()]
+    assert expand([f"@{tmp_path / 'list'}"]) == files
+
+
+def test_patterns_of_response_files_that_cannot_be(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    (tmp_path / "a").write_text("#glob: wild cards\nl*.tif\n#glob: wildcard\n\nl*.tif\n")
+    with pytest.raises(LayersMissingError, match=r"a, line 5: no file fits l\*\.tif; correct the list"):
+        expand([f"@{tmp_path / 'a'}"])
+    assert "a, line 1: 'wild cards' is none of literal, none, wildcard, shell, sh" in caplog.text
+
+
 def test_response_file_that_names_itself_is_passed_over(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:

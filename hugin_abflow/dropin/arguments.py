@@ -6,9 +6,11 @@ missing must be attached (``-w both`` is an option without a value, and a file),
 
 from __future__ import annotations
 
+import glob
 import logging
 import os
-from collections.abc import Iterable, Sequence
+import re
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -16,6 +18,8 @@ from typing import Literal
 from hugin_abflow.errors import CommandLineError, LayersMissingError
 
 _log = logging.getLogger(__name__)
+
+_GLOBBING = re.compile(r"#\s*(?:glob|globbing|filename-globbing)\s*:\s*(\S.*)", re.IGNORECASE)
 
 
 @dataclass(frozen=True)
@@ -102,33 +106,67 @@ def expand(names: Iterable[str]) -> list[Path]:
     """Files, where ``@list`` stands for the names in a response file.
 
     A list holds one name a line, relative to its folder; ``#`` begins a comment line; lists may name lists.
-    One that names itself is warned of and passed over. Raises `LayersMissingError` for a list that cannot be
-    read.
+    ``#glob: wildcard`` makes patterns of the names that follow, with ``* ? [ ]``, ``#glob: shell`` with
+    braces and ``~``, too, and ``#glob: literal`` ends that. A list that names itself is warned of and passed
+    over. Raises `LayersMissingError` for a list that cannot be read, and for a pattern that no file fits.
     """
-    return _expand(names, Path(), ())
+    return [file for name in names for file in (_listed(Path(name[1:])) if name[:1] == "@" else [Path(name)])]
 
 
-def _expand(names: Iterable[str], folder: Path, outer: tuple[Path, ...]) -> list[Path]:
+def _listed(response: Path, globbing: str = "literal", outer: tuple[Path, ...] = ()) -> list[Path]:
+    """The files of a response file, which the lists `outer` name; globbing: how they take names."""
+    if response.resolve() in outer:
+        _log.warning("%s names itself; passed over", response)
+        return []
     files: list[Path] = []
-    for name in names:
-        if not name.startswith("@"):
-            files.append(folder / name)
-            continue
-        response = folder / name[1:]
-        if response.resolve() in outer:
-            _log.warning("%s names itself; passed over", response)
-            continue
-        files += _expand(_lines(response), response.parent, (*outer, response.resolve()))
+    for number, line in enumerate(_lines(response), 1):
+        if chosen := _GLOBBING.fullmatch(line):
+            if chosen[1].lower() in _PATTERNS:
+                globbing = chosen[1].lower()
+            else:
+                known = ", ".join(_PATTERNS)
+                _log.warning("%s, line %d: '%s' is none of %s", response, number, chosen[1], known)
+        elif line.startswith("@"):
+            files += _listed(response.parent / line[1:], globbing, (*outer, response.resolve()))
+        elif line and not line.startswith("#"):
+            found = _PATTERNS[globbing](line, response.parent)
+            if not found:
+                raise LayersMissingError(f"{response}, line {number}: no file fits {line}; correct the list")
+            files += [response.parent / name for name in found]
     return files
 
 
+def _fitting(pattern: str, folder: Path) -> list[str]:
+    """Names of the files that fit a pattern."""
+    return sorted(glob.glob(pattern, root_dir=folder))  # noqa: PTH207 - Path's has no absolute patterns
+
+
+def _fitting_shells(pattern: str, folder: Path) -> list[str]:
+    """The same, of one that may begin with ``~``, and name several in braces, which tell the order."""
+    braces = re.search(r"\{([^{}]*)\}", pattern)
+    if not braces:
+        return _fitting(os.path.expanduser(pattern), folder)  # noqa: PTH111 - as `glob` has it, a text
+    before, after = pattern[: braces.start()], pattern[braces.end() :]
+    found = [_fitting_shells(before + part + after, folder) for part in braces[1].split(",")]
+    return list(dict.fromkeys(name for names in found for name in names))
+
+
+# How names in a list are taken, by the names that enblend has for that.
+_PATTERNS: dict[str, Callable[[str, Path], list[str]]] = {
+    "literal": lambda name, folder: [name],
+    "none": lambda name, folder: [name],
+    "wildcard": _fitting,
+    "shell": _fitting_shells,
+    "sh": _fitting_shells,
+}
+
+
 def _lines(response: Path) -> list[str]:
-    """The names in a response file."""
+    """The lines of a response file, without blanks around them."""
     try:
-        lines = [os.fsdecode(line.strip()) for line in response.read_bytes().splitlines()]
+        return [os.fsdecode(line.strip()) for line in response.read_bytes().splitlines()]
     except OSError as error:
         raise LayersMissingError(
             f"the list {response} cannot be read: {error.strerror}; a name after @ is that of a text file "
             "with a layer's name on each line"
         ) from None
-    return [line for line in lines if line and not line.startswith("#")]

@@ -209,7 +209,8 @@ HELP = """\
 Usage: abflow-enblend [options] [--output=IMAGE] INPUT...
 Blend INPUT images into a single IMAGE, by optical flow; called as enblend 4.2 is.
 
-INPUT... are the layers that nona makes, or @LIST: a file with a name on each line.
+INPUT... are the layers that nona makes, or @LIST: a file with a name on each line, or a pattern
+behind a line "#glob: wildcard".
 
   -o, --output=FILE      write output to FILE; default: "a.tif"
   -f WIDTHxHEIGHT[+X+Y]  size and position of the output; default: all that the layers cover
