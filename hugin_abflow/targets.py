@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import errno
 import os
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -51,6 +53,21 @@ def explained(path: Path, final: Path, named_with: str) -> Iterator[None]:
             f"{path} cannot be written: {final.parent}: {error.strerror}; choose another folder with "
             f"{named_with}"
         ) from None
+
+
+def refuse_too_large(path: Path, more: int) -> None:
+    """Raise OSError if a file could not grow by so many bytes; where the system cannot tell, nothing."""
+    if sys.platform in ("win32", "darwin"):
+        return
+    with path.open("r+b") as file:
+        size = os.fstat(file.fileno()).st_size
+        try:
+            os.posix_fallocate(file.fileno(), size, more)
+        except OSError as error:
+            if error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
+                raise
+        finally:
+            os.ftruncate(file.fileno(), size)
 
 
 def named_in_unicode(path: Path) -> bool:
