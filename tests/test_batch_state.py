@@ -17,7 +17,7 @@ import tifffile
 from conftest import age, names_in
 from shoots import HEIGHT, WIDTH, Deaf, write_project
 
-from hugin_abflow import cli, outputs
+from hugin_abflow import cli, outputs, scratch
 from hugin_abflow.batch import state, task
 from hugin_abflow.batch.record import Record
 from hugin_abflow.batch.task import Task, perform
@@ -96,6 +96,20 @@ def test_what_holds_is_skipped_and_recorded_as_it_was(make: Make, shoot: Path) -
     ]  # fmt: skip
     assert (shoot / "tiny.tif").stat().st_mtime_ns == written.st_mtime_ns
     assert make(resume=False).result == "made"
+
+
+def test_what_a_killed_run_left_goes_where_all_holds_too(
+    make: Make, shoot: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("TMPDIR", str(tmp_path))
+    make()
+    left = f"abflow-{scratch._HOST}-0123456789ab"
+    parts = [shoot / f".{left}.tif", shoot / ".abflow" / f".{left}.part"]
+    for part in parts:
+        part.touch()
+    (tmp_path / f"hugin-{left}").mkdir()
+    assert make().result == "skipped"
+    assert not any(part.exists() for part in parts) and names_in(tmp_path) == ["shoot"]
 
 
 def test_state_is_readable_and_lies_beside_the_panorama(make: Make, shoot: Path, tmp_path: Path) -> None:

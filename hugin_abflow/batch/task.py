@@ -14,7 +14,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any, Protocol
 
-from hugin_abflow import memory, nona, trace
+from hugin_abflow import memory, nona, scratch, trace
 from hugin_abflow.batch.record import Record
 from hugin_abflow.batch.state import State
 from hugin_abflow.errors import AbflowError
@@ -95,7 +95,11 @@ def perform(task: Task, listener: Listener, level: int = logging.WARNING, turn: 
     with messages(level, show=show):
         try:
             state = _state(task, record)
-            if not (state and task.resume and state.restore(record)):
+            if state and task.resume and state.restore(record):
+                # what makes something does so by itself
+                for folder in {scratch.root(), state.file.parent, *(file.parent for file in record.files)}:
+                    scratch.sweep(folder)
+            else:
                 _stitch(task, record, listener, turn, state)
                 if state and task.remember:
                     state.save(record)
