@@ -6,7 +6,7 @@
     project.panorama.crop = (0, 10, 4000, 1990)
     pto.dump(project, "cropped.pto")
 
-A malformed file raises `PtoError` with its line.
+A malformed file raises `PtoError` with its line. What nona does without is left out: see `Project.doubts`.
 """
 
 from hugin_abflow.errors import PtoError
