@@ -16,11 +16,14 @@ from pathlib import Path
 from typing import BinaryIO
 
 from hugin_abflow import jpeg, tifftags
+from hugin_abflow.scratch import is_file
 from hugin_abflow.tifftags import ASCII, EXIF, GPS, MAIN, SHORT, UNDEFINED, Directories, Value
 
 _log = logging.getLogger(__name__)
 
+SOFTWARE = 305
 XMP_TAG = 700  # of TIFF
+_EXPOSURE_TIME = 33434
 _PNG = b"\x89PNG\r\n\x1a\n"
 _EXIF_MARK, _XMP_MARK = b"Exif\0\0", b"http://ns.adobe.com/xap/1.0/\0"  # of JPEG's APP1
 _LONGEST = 65533  # bytes of a JPEG segment
@@ -121,6 +124,19 @@ def read_exif(path: Path) -> dict[int, dict[int, Value]]:
         return tifftags.read_directories(BytesIO(block)) if block else {}
     except (OSError, struct.error, OverflowError, ValueError):
         return {}
+
+
+def software(found: Directories) -> str:
+    """The program that has saved a file, as its tags say; empty where they do not."""
+    return text_of(found.get(MAIN, {}).get(SOFTWARE, text("")))
+
+
+def is_photo(path: Path) -> bool:
+    """Whether EXIF tells how a single photo was taken: that of panoramas does not, be they ours or Hugin's,
+    or else it names Hugin.
+    """
+    found = read_exif(path) if is_file(path) else {}
+    return _EXPOSURE_TIME in found.get(EXIF, {}) and "hugin" not in software(found).lower()
 
 
 def _find_in_jpeg(file: BinaryIO) -> bytes:

@@ -17,14 +17,14 @@ from hugin_abflow import joint, sequential
 from hugin_abflow.brackets import of_one_exposure, to_be_made
 from hugin_abflow.devices import choose
 from hugin_abflow.errors import LayersMissingError, OutputError
-from hugin_abflow.exif import Metadata
+from hugin_abflow.exif import Metadata, is_photo
 from hugin_abflow.found import Remap, candidates
 from hugin_abflow.guides import Guide, check_guides
 from hugin_abflow.holes import Coverage
 from hugin_abflow.images import ENDINGS, ImageWriter, check_target, use_threads
 from hugin_abflow.kept import in_use, kept_device
 from hugin_abflow.layer import Canvas, Layer, check_canvas, check_layers
-from hugin_abflow.metadata import describe, is_photo
+from hugin_abflow.metadata import describe
 from hugin_abflow.nona import open_layers
 from hugin_abflow.opencl import Device
 from hugin_abflow.pano_trafo import images_of, read_guides

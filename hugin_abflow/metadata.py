@@ -9,19 +9,18 @@ from importlib import metadata as packages
 from pathlib import Path
 
 from hugin_abflow import pto
-from hugin_abflow.exif import Metadata, comment, comment_of, read_exif, text, text_of
+from hugin_abflow.exif import SOFTWARE, Metadata, comment, comment_of, read_exif, software, text
 from hugin_abflow.layer import Canvas
 from hugin_abflow.oneline import one_line
 from hugin_abflow.project import Plan
 from hugin_abflow.scratch import is_file
-from hugin_abflow.tifftags import EXIF, GPS, LONG, MAIN, RATIONAL, SHORT, UNDEFINED, Directories, Value
+from hugin_abflow.tifftags import EXIF, GPS, LONG, MAIN, RATIONAL, SHORT, UNDEFINED, Value
 
 PROGRAM = "hugin-abflow"
 
 _log = logging.getLogger(__name__)
 
-_SOFTWARE, _USER_COMMENT = 305, 37510
-_EXPOSURE_TIME = 33434
+_USER_COMMENT = 37510
 # What EXIF must have: versions of Exif and Flashpix, width and height, 150 dpi as enblend writes it.
 _VERSIONS = {36864: Value(UNDEFINED, b"0232"), 40960: Value(UNDEFINED, b"0100")}
 _SIZE = (40962, 40963)
@@ -94,7 +93,7 @@ def describe(plan: Plan) -> Metadata:
         directory: {tag: found[directory][tag] for tag in tags if tag in found.get(directory, {})}
         for directory, tags in _COPIED.items()
     }
-    chosen[MAIN][_SOFTWARE] = text(f"{PROGRAM} {version()}")
+    chosen[MAIN][SOFTWARE] = text(f"{PROGRAM} {version()}")
     said = comment_of(found.get(EXIF, {}).get(_USER_COMMENT))
     chosen[EXIF][_USER_COMMENT] = comment("\n".join([said] * bool(said) + summary(plan)))
     chosen[MAIN] |= _RESOLUTION
@@ -106,24 +105,12 @@ def describe(plan: Plan) -> Metadata:
     return Metadata(chosen, gpano(plan.canvas, len(plan.images)))
 
 
-def is_photo(path: Path) -> bool:
-    """Whether EXIF tells how a single photo was taken: that of panoramas does not, be they ours or Hugin's,
-    or else it names Hugin.
-    """
-    found = read_exif(path) if is_file(path) else {}
-    return _EXPOSURE_TIME in found.get(EXIF, {}) and "hugin" not in _software(found).lower()
-
-
 def saved_by(path: Path) -> str:
     """The program that EXIF says has saved an image, if that is neither ours nor Hugin's; else nothing. Those
     that Hugin calls, such as enblend, name none.
     """
-    software = _software(read_exif(path) if is_file(path) else {})
-    return "" if "hugin" in software.lower() else one_line(software)
-
-
-def _software(found: Directories) -> str:
-    return text_of(found.get(MAIN, {}).get(_SOFTWARE, text("")))
+    program = software(read_exif(path) if is_file(path) else {})
+    return "" if "hugin" in program.lower() else one_line(program)
 
 
 def summary(plan: Plan) -> list[str]:

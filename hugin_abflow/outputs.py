@@ -13,7 +13,10 @@ from enum import StrEnum
 from pathlib import Path
 
 from hugin_abflow import pto
+from hugin_abflow.errors import OutputError
+from hugin_abflow.exif import is_photo
 from hugin_abflow.found import layer_name
+from hugin_abflow.merge import refuse_input
 from hugin_abflow.metadata import PROGRAM
 from hugin_abflow.programs import missing
 from hugin_abflow.project import TIFF_COMPRESSIONS, Plan, read_output
@@ -184,7 +187,7 @@ class Branch:
 
     def panorama(self, kind: Kind) -> str:
         """The name of a panorama that is made of several files."""
-        return f"{self.plan.stem}{_SUFFIXES[kind]}{self.plan.output.ending}"
+        return self.plan.default_output(suffix=_SUFFIXES[kind]).name
 
     def results(self, keep_layers: bool) -> list[str]:
         """Names of what may be made, but for that of exposure-corrected layers; keep_layers: these as well.
@@ -279,6 +282,18 @@ def results(plan: Plan, keep_layers: bool) -> list[Path]:
             found.append(plan.default_output())
         found += [plan.folder / name for name in branch.results(keep_layers)]
     return found
+
+
+def refuse_result(result: Path, plan: Plan, inputs: Sequence[Path] = ()) -> None:
+    """Raise `OutputError` for a file that would be made, but is there: an input, the project's or one of
+    `inputs`, or a photo.
+    """
+    refuse_input(result, [plan.file, *plan.photos, *inputs])
+    if is_photo(result):
+        raise OutputError(
+            f"{result} is a photo: its EXIF tells an exposure time; rename it, or the project, after which "
+            "outputs are named"
+        )
 
 
 def _words(text: str) -> list[str]:

@@ -10,6 +10,7 @@ from pathlib import Path, PureWindowsPath
 
 from hugin_abflow import pto
 from hugin_abflow.errors import ProjectError
+from hugin_abflow.exif import is_photo
 from hugin_abflow.layer import Box, Canvas
 from hugin_abflow.projection import EQUIRECTANGULAR
 from hugin_abflow.scratch import is_file
@@ -116,18 +117,20 @@ class Plan:
         """Of nona's layers."""
         return ".exr" if self.hdr else ".tif"
 
-    def default_output(self, taken: Iterable[Path] = ()) -> Path:
+    def default_output(self, taken: Iterable[Path] = (), suffix: str = "") -> Path:
         """Beside the project, named after it: ``pano.pto`` -> ``pano.tif``.
 
-        If that is a photo of the project or one of `taken` (the layers' files), ``pano_abflow.tif``,
-        then ``pano_abflow2.tif`` and so on: inputs are never replaced.
+        If that is a photo, of the project or as its EXIF tells, or one of `taken` (the layers' files),
+        ``pano_abflow.tif``, then ``pano_abflow2.tif`` and so on: neither inputs nor photos are ever replaced.
+        suffix: what follows the project's name, as of fused panoramas.
         """
         inputs = {file_key(path) for path in [*self.photos, *taken]}
-        path, attempt = self.folder / f"{self.stem}{self.output.ending}", 0
-        while file_key(path) in inputs:
+        name = f"{self.stem}{suffix}"
+        path, attempt = self.folder / f"{name}{self.output.ending}", 0
+        while file_key(path) in inputs or is_photo(path):
             attempt += 1
-            suffix = "_abflow" if attempt == 1 else f"_abflow{attempt}"
-            path = self.folder / f"{self.stem}{suffix}{self.output.ending}"
+            another = "_abflow" if attempt == 1 else f"_abflow{attempt}"
+            path = self.folder / f"{name}{another}{self.output.ending}"
         return path
 
 

@@ -22,7 +22,6 @@ from hugin_abflow.merge import (
     default_target,
     guides_of,
     merge_project,
-    refuse_input,
     storable,
     target_of,
     write_panorama,
@@ -42,6 +41,7 @@ from hugin_abflow.outputs import (
     impossible,
     no_option,
     possible_outputs,
+    refuse_result,
 )
 from hugin_abflow.pano_trafo import images_of
 from hugin_abflow.programs import move_whole, run
@@ -181,7 +181,7 @@ def show_project(
         for step in _steps(replace(branch, plan=asked), [image.index for image in plan.images], leave):
             if step.wanted:
                 results.append(plan.folder / step.result)
-                refuse_input(results[-1], [plan.file, *plan.photos])
+                refuse_result(results[-1], plan)
             names[step.result] = step.result if step.wanted else _TEMPORARY + step.result
             inputs = tuple(names.get(file, file) for file in step.inputs)
             placed = replace(step, result=names[step.result], inputs=inputs)
@@ -416,7 +416,7 @@ class _Maker:
     def _target(self, step: Step, files: dict[str, Path], scratch: Path) -> Path:
         """Where the result goes, which must be none of the inputs."""
         target = (self.plan.folder if step.wanted else scratch) / step.result
-        refuse_input(target, [self.plan.file, *self.plan.photos, *(files[name] for name in step.inputs)])
+        refuse_result(target, self.plan, [files[name] for name in step.inputs])
         return target
 
     def _run(self, step: Step, files: dict[str, Path], scratch: Path) -> Path:
