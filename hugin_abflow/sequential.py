@@ -31,6 +31,7 @@ def merge(
     guides: Sequence[Guide] = (),
 ) -> Generator[npt.NDArray[Any], None, None]:
     """The panorama's crop, in bands as `joint.merge` gives them."""
+    layers = [replace(layer) for layer in layers]  # one may be given twice, and each is told by what it is
     order = _order(device, layers, canvas, settings)
     if len(order) > 2:  # a mosaic was seen from several places: what stands still moves in several ways
         settings = replace(settings, movers=False, foreground=False)

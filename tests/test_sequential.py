@@ -261,3 +261,10 @@ def test_crop_and_one_layer():
     whole = np.zeros((83, 101, 4), np.uint8)
     whole[17:58, 9:66] = picture
     np.testing.assert_array_equal(result, whole[10:70, 20:60])
+
+
+def test_a_layer_that_is_given_twice_changes_nothing():
+    """As the same object, which is another layer each time."""
+    layers = layers_of(PLANE, three_masks()[:2])
+    once = merged(layers, PLANE, merge="sequential")
+    np.testing.assert_array_equal(merged([layers[0], *layers], PLANE, merge="sequential"), once)
