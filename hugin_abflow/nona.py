@@ -15,7 +15,6 @@ from typing import get_args
 
 from hugin_abflow import pto
 from hugin_abflow.errors import (
-    AbflowError,
     ImageReadError,
     LayersMismatchError,
     LayersMissingError,
@@ -25,10 +24,9 @@ from hugin_abflow.errors import (
     PhotoMissingError,
     ProgramFailedError,
     ProgramMissingError,
-    ProjectError,
     SettingsError,
 )
-from hugin_abflow.formats import foreign_format
+from hugin_abflow.failures import check_made, failure
 from hugin_abflow.found import (
     Found,
     Remap,
@@ -39,10 +37,10 @@ from hugin_abflow.found import (
     named_files,
     none_there,
 )
-from hugin_abflow.images import image_size, read_layers
+from hugin_abflow.images import read_layers
 from hugin_abflow.jpeg import is_cut
-from hugin_abflow.layer import Layer, check_layers, other_canvas
-from hugin_abflow.programs import LAST_LINES, ending, last_lines, move_whole, started
+from hugin_abflow.layer import Layer, check_layers
+from hugin_abflow.programs import LAST_LINES, move_whole, started
 from hugin_abflow.progress import Progress, silent
 from hugin_abflow.project import Plan, PlannedImage, file_key
 from hugin_abflow.scratch import is_file, is_special, work_folder
@@ -61,8 +59,6 @@ _LOADING = "loading "  # and at its beginning
 # be missing: some cameras leave out no more than the mark of the end.
 _LOSS, _CUT = ": Read error on ", "Premature end of JPEG file"
 _DOUBTS = (_CUT, "Corrupt JPEG data")
-# What it says of photos of two depths, or of grey ones beside coloured ones.
-_DIFFERENT = re.compile("uses [A-Z0-9]+ valued pixel, while|has [0-9] channels?, while")
 
 
 @contextmanager
@@ -201,14 +197,14 @@ def _make_all(plan: Plan, folder: Path, keep: bool, progress: Progress) -> Found
         code, lines = _run(plan, _project_for_nona(plan, folder), plan.images, folder, [], advance)
     made = _made(plan, folder)
     if code:
-        raise _failure(plan, plan.images, folder, code, lines)
+        raise failure(plan, plan.images, folder, code, lines)
     if not made:
         raise LayersMissingError(
             f"{plan.file}: nona made no layer: it sees no active image that shows anything in the crop; "
             "look at crop and masks in Hugin (of a crop far smaller than the photos it sees none), and "
             "whether the photos are RGB or grey"
         )
-    _check_made(plan, made)
+    check_made(plan, made)
     return Found(prefix, _keep(prefix, made) if keep else made)
 
 
@@ -241,21 +237,10 @@ def _make_missing(
                 log.info("image %d (%s) misses the crop: it has no layer", image.index, image.name)
             elif code:
                 _require_photo(plan, image)
-                raise _failure(plan, [image], folder, code, lines)
+                raise failure(plan, [image], folder, code, lines)
     made = _made(plan, folder)
-    _check_made(plan, made)
+    check_made(plan, made)
     return _keep(prefix, made) if keep else made
-
-
-def _check_made(plan: Plan, made: dict[int, Path]) -> None:
-    """Raise `LayersMismatchError` if nona made layers for another canvas than the project's."""
-    for path in list(made.values())[:1]:  # all are made for one
-        if made_for := other_canvas(read_layers(path)[0], plan.canvas):
-            raise LayersMismatchError(
-                f"{plan.file}: the canvas is {plan.canvas.width}x{plan.canvas.height}, of which Hugin makes "
-                f"{made_for}, since this projection shows no more; open the project in Hugin, which corrects "
-                "that, and save it"
-            )
 
 
 def _require_photo(plan: Plan, image: PlannedImage) -> None:
@@ -353,47 +338,6 @@ def _made(plan: Plan, folder: Path) -> dict[int, Path]:
     prefix = _prefix(plan, folder)
     paths = {image.index: layer_path(prefix, image.index, plan.layer_ending) for image in plan.images}
     return {index: path for index, path in paths.items() if path.is_file()}
-
-
-def _failure(
-    plan: Plan, images: Sequence[PlannedImage], folder: Path, code: int, lines: list[str]
-) -> AbflowError:
-    """What to raise for a run of nona over `images` that failed; it does not always say which is to blame."""
-    said = last_lines(lines)
-    for image in images:
-        if any(f"Unable to open file '{name}'" in said for name in (image.name, image.photo)):
-            return ImageReadError(f"{image.photo} cannot be opened; check its permissions")
-    images = [image for image in images if named_in_unicode(image.photo)]  # else they cannot be opened here
-    if "did not find a matching file type" in said:
-        for image in images:
-            if foreign := foreign_format(image.photo):
-                return ImageReadError(
-                    f"{image.photo} is {foreign}, which Hugin does not read; convert it to JPEG or TIFF, and "
-                    "align the project with that"
-                )
-            if image_size(image.photo) is None:
-                return ImageReadError(
-                    f"{image.photo} is no image that can be read; copy it from the camera again"
-                )
-    if "unexpectedly changed dimensions" in said:
-        project = pto.load(plan.file)
-        for image in images:
-            size, aligned = image_size(image.photo), project.images[image.index]
-            wanted = aligned.width, aligned.height
-            if size and all(wanted) and size != wanted:  # nona looks for itself where it is 0
-                return ProjectError(
-                    f"{image.photo} has {size[0]}x{size[1]} pixels, in {plan.file} it has "
-                    f"{wanted[0]}x{wanted[1]}; put that photo back, or align this one in Hugin"
-                )
-    if _DIFFERENT.search(said):
-        return LayersMismatchError(
-            f"{plan.file}: photos differ in depth or in colour channels; give all the same, such as "
-            f"8 bit RGB, under the same names. nona's last lines:\n  {said}"
-        )
-    advice = f"it wrote into {folder.parent}, TMPDIR chooses another folder"
-    if "bad_alloc" in said:
-        advice = "it had not enough memory: close other programs, or make the panorama smaller in Hugin"
-    return NonaFailedError(f"nona {ending(code)} on {plan.file}; {advice}. Its last lines:\n  {said}")
 
 
 def refuse_to_keep(plan: Plan, images: Sequence[PlannedImage], prefix: str) -> None:

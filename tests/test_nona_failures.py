@@ -7,7 +7,7 @@ import os
 import numpy as np
 import pytest
 import tifffile
-from conftest import ICC, photo_pixels, remap
+from conftest import ICC, names_in, photo_pixels, remap
 
 from hugin_abflow.errors import ImageReadError, LayersMismatchError, NonaFailedError, ProjectError
 from hugin_abflow.nona import open_layers
@@ -46,6 +46,20 @@ def test_photo_of_a_format_that_hugin_does_not_read(make_project, nona, begins, 
     photo.write_bytes(begins + bytes(300))
     with pytest.raises(ImageReadError, match=rf"{photo} is {kind}, .*convert it to JPEG"), open_layers(plan):
         pass
+
+
+@pytest.mark.parametrize("dtype", [np.float64, np.uint32, np.int16])
+@pytest.mark.parametrize("keep", [False, True])
+def test_photos_of_samples_that_no_layer_has(make_project, nona, dtype, keep):
+    """Nona keeps them; the layer that cannot be read is gone when somebody looks for it."""
+    plan = read_plan(make_project(yaws=(0, 60)))
+    for number, photo in enumerate(plan.photos):
+        tifffile.imwrite(photo, (photo_pixels(number) * 99.0).astype(dtype), photometric="rgb")
+    before = names_in(plan.folder)
+    said = f"^{plan.photos[0]} is of sample type .* convert the photos"
+    with pytest.raises(ImageReadError, match=said), open_layers(plan, keep_layers=keep):
+        pass
+    assert names_in(plan.folder) == before
 
 
 def test_a_project_with_a_name_as_long_as_file_systems_take(make_project, nona):
