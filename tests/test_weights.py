@@ -11,8 +11,8 @@ import tifffile
 from layer_files import write_layer
 from pictures import one_device, texture
 
-from hugin_abflow import joint
-from hugin_abflow.dropin import enblend
+from hugin_abflow import joint, working
+from hugin_abflow.dropin import enblend, weights
 from hugin_abflow.dropin.weights import name
 from hugin_abflow.errors import CommandLineError
 from hugin_abflow.layer import Layer
@@ -71,15 +71,15 @@ def test_a_layer_that_takes_no_part_gets_no_weight(
     write_layer(Path("c.tif"), texture(y, x)[20:60, 10:70], 10, 20, (WIDTH, HEIGHT))
     for number in (1, 2, 3):
         tifffile.imwrite(f"mask-{number}.tif", np.full((HEIGHT, WIDTH), 255, np.uint8))
-    weights, bands = [], joint.bands
+    used, bands = [], joint.bands
 
     def watched(device, prepared, *others):
-        weights.extend(layer.field.get()[..., 3] for layer in prepared.layers)
+        used.extend(layer.field.get()[..., 3] for layer in prepared.layers)
         return bands(device, prepared, *others)
 
     monkeypatch.setattr(joint, "bands", watched)
     assert run("--load-masks", *layers, "c.tif") == 0
-    assert [bool((weight < 0).any()) for weight in weights] == [False, False, True]
+    assert [bool((weight < 0).any()) for weight in used] == [False, False, True]
 
 
 def test_what_masks_take_out_leaves_no_shadow(layers: list[str]) -> None:
@@ -132,6 +132,39 @@ def test_masks_of_a_smaller_working_canvas(layers: list[str], monkeypatch: pytes
     assert run("-f177x81+9+11", "--load-masks", "--save-masks=s%n.tif", *layers) == 0
     first = tifffile.imread("s1.tif")[..., 0]
     assert (first[:, : 115 - 9] == 65535).all()
+
+
+def test_masks_are_read_by_rows(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, layers: list[str]) -> None:
+    """Of the layer's own place alone: memory does not grow with the canvas."""
+    width, height, own = 400, 700, slice(500, 700)
+    y, x = np.mgrid[:height, :width]
+    write_layer(Path("a.tif"), texture(y, x)[:560], 0, 0, (width, height))
+    write_layer(Path("b.tif"), texture(x, y)[own, 300:], 300, own.start, (width, height))
+    for number in (1, 2):
+        tifffile.imwrite(f"mask-{number}.tif", np.full((height, width), 255, np.uint8), rowsperstrip=1)
+    asked: dict[str, list[tuple[int, int]]] = {}
+    spread: list[tuple[int, int]] = []
+    original, reduce_layer = weights.read_layer, working.reduce_layer
+
+    def watched(path: Path) -> Layer:
+        mask = original(path)
+
+        def read(top: int, bottom: int) -> np.ndarray:
+            asked.setdefault(mask.name, []).append((top, bottom))
+            return mask.read(top, bottom)
+
+        return replace(mask, read=read)
+
+    def reduced(device, layer, *others, **options):
+        spread.append((layer.box.width, layer.box.height))
+        return reduce_layer(device, layer, *others, **options)
+
+    monkeypatch.setattr(weights, "read_layer", watched)
+    monkeypatch.setattr(working, "reduce_layer", reduced)
+    assert run("--load-masks", "a.tif", "b.tif") == 0
+    assert max(bottom - top for rows in asked.values() for top, bottom in rows) < 300
+    assert min(asked["mask-2.tif"])[0] == own.start and max(asked["mask-2.tif"])[1] == own.stop
+    assert (100, 200) in spread
 
 
 def refused(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:

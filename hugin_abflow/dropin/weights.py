@@ -22,6 +22,7 @@ from hugin_abflow.merge import refuse_input, refuse_photo
 from hugin_abflow.opencl import Device
 from hugin_abflow.progress import Progress, silent
 from hugin_abflow.settings import Settings
+from hugin_abflow.working import Grid, Place
 
 _OPTION = "--save-masks"
 _WHITE = np.uint16(65535)
@@ -169,18 +170,35 @@ def _weighted(device: Device, layer: BlendLayer, mask: Layer, prepared: Prepared
     field = layer.field.get()
     if (field[..., 3] < 0).all():
         return layer
-    region, crop = prepared.grid.region, mask.box
-    rows = np.clip(np.arange(region.top, region.bottom) - crop.top, 0, crop.height - 1)
-    columns = np.clip(np.arange(region.left, region.right) - crop.left, 0, crop.width - 1)
-    # repeated outside the crop: a working pixel that is not wholly covered would weigh nothing
-    grey = mask.rows(0, crop.height)[..., :1][rows][:, columns]
-    opaque = np.full_like(grey, full_scale(mask.dtype))
-    whole = Layer.from_array(mask.name, np.concatenate([grey, opaque], 2), region.left, region.top)
-    reduced = working.reduce_layer(device, whole, prepared.grid, lambda units: None)
-    left, top, width, height = layer.box
-    weights = reduced.pixels.get()[top : top + height, left : left + width, 0]
+    spread = _spread(mask, prepared.grid, layer.box)
+    reduced = working.reduce_layer(device, spread, prepared.grid, lambda units: None, checked=False)
+    weights = reduced.pixels.get()[..., 0]
     field[..., 3] = np.maximum(weights, _LEAST_WEIGHT)
     return replace(layer, field=device.upload(field))
+
+
+def _spread(mask: Layer, grid: Grid, place: Place) -> Layer:
+    """The mask as an opaque grey layer, over all that lies under a place of the grid; read by rows, as it may
+    be large. Outside the crop its border is repeated: a working pixel that is not wholly covered would weigh
+    nothing.
+    """
+    region, crop = grid.region, mask.box
+    left, top, width, height = place
+    box = Box(
+        region.left + left * region.width // grid.width,
+        region.top + top * region.height // grid.height,
+        region.left - (-(left + width) * region.width // grid.width),
+        region.top - (-(top + height) * region.height // grid.height),
+    )
+    columns = np.clip(np.arange(box.left, box.right) - crop.left, 0, crop.width - 1)
+
+    def read(first: int, end: int) -> npt.NDArray[Any]:
+        rows = np.clip(np.arange(first, end) + (box.top - crop.top), 0, crop.height - 1)
+        above = int(rows[0])
+        grey = mask.rows(above, int(rows[-1]) + 1)[rows - above][:, columns, :1]
+        return np.concatenate([grey, np.full_like(grey, full_scale(mask.dtype))], 2)
+
+    return Layer(mask.name, box, mask.dtype, 1, read)
 
 
 def _offset(device: Device, prepared: Prepared) -> Prepared:
