@@ -79,6 +79,20 @@ def test_layers_that_no_band_needs_together_share_memory() -> None:
         assert all(shelves.rings[k].rows >= band[k][1] - band[k][0] for k in used)
 
 
+@pytest.mark.parametrize("share", [1.0, 0.9])
+def test_bands_hold_the_rows_around_those_that_are_sampled(device: Device, share: float) -> None:
+    """All moves sideways, so that displacements reach no other row, but what lies between pixels does."""
+    full = plane(77, 53)
+    grid = full.resized(39, 27)
+    field = np.zeros((27, 39, 4), np.float32)
+    field[..., 0], field[..., 3] = 1.3, 1
+    layer = blend_layer(device, stored_pixels(31, 77, 53, np.uint8, 3, share), 0, 0, full, grid, field)
+    assert not any(layer.reach)
+    whole = merged(device, [layer, layer], full, grid)
+    for rows in (1, 2, 7):
+        assert np.array_equal(merged(device, [layer, layer], full, grid, rows=rows), whole), rows
+
+
 @pytest.mark.parametrize(("far", "strip"), [(0.0, 1), (9.0, 1), (9.0, 16)])
 def test_a_band_reads_only_rows_that_it_needs(device: Device, far: float, strip: int) -> None:
     """Memory grows with the band, not with the picture; and no row is read twice, where one band reaches far
