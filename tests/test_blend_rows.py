@@ -93,6 +93,34 @@ def test_bands_hold_the_rows_around_those_that_are_sampled(device: Device, share
         assert np.array_equal(merged(device, [layer, layer], full, grid, rows=rows), whole), rows
 
 
+@pytest.mark.parametrize(
+    ("dtype", "alphas"),
+    [
+        (np.uint8, ([0, 80, 127], [128, 150, 255])),
+        (np.uint16, ([0, 20_000, 32_767], [32_768, 40_000, 65_535])),
+        (np.float32, ([0, 0.3, 0.499], [0.5, 0.6, 1])),
+    ],
+)
+@pytest.mark.parametrize("moved", [0.0, 0.4, 1.0])
+@pytest.mark.parametrize("count", [1, 2])
+def test_pixels_count_from_half_of_full_alpha_on(
+    device: Device, dtype: type, alphas: tuple[list[float], list[float]], moved: float, count: int
+) -> None:
+    """As if it were binary, whether rows are copied or sampled, and whether another layer is there."""
+    full = plane(77, 53)
+    field = np.zeros((53, 77, 4), np.float32)
+    field[..., 0], field[..., 3] = moved, 1
+    pixels = [stored_pixels(40 + k, 77, 53, dtype, 3, 0.9) for k in range(count)]
+    expected = merged(
+        device, [blend_layer(device, own, 0, 0, full, full, field) for own in pixels], full, full
+    )
+    for own in pixels:
+        outside, inside = (np.random.default_rng(50).choice(some, (53, 77)) for some in alphas)
+        own[..., 3] = np.where(own[..., 3] > 0, inside, outside)
+    soft = [blend_layer(device, own, 0, 0, full, full, field) for own in pixels]
+    assert np.array_equal(merged(device, soft, full, full), expected)
+
+
 @pytest.mark.parametrize(("far", "strip"), [(0.0, 1), (9.0, 1), (9.0, 16)])
 def test_a_band_reads_only_rows_that_it_needs(device: Device, far: float, strip: int) -> None:
     """Memory grows with the band, not with the picture; and no row is read twice, where one band reaches far
