@@ -127,6 +127,32 @@ def test_what_leads_beyond_the_canvas_goes_half_of_the_way_to_its_border(device:
     assert np.allclose(found[..., 3], np.exp(-0.5 * shortened), rtol=1e-4)
 
 
+def test_a_canvas_that_wraps_ends_above_and_below(device: Device) -> None:
+    """And nowhere where there are poles."""
+    for grid, ends in ((plane(60, 40, wraps=True), True), (sphere(80, 40), False)):
+        field = np.zeros((*grid.shape, 4), np.float32)
+        field[:] = -8.5 * (grid.lonlat[1] or 1), 0, 0, 1
+        field[:4] = 0, -6 if ends else 0, 0.2 * (not ends), 1
+        out = device.upload(field)
+        geometry.keep_within(device, [SimpleNamespace(box=(0, 0, *grid.shape[::-1]))], [out], grid)
+        assert np.allclose(out.get()[4:], field[4:], atol=1e-5)
+        changed = np.abs(out.get()[:4] - field[:4]).max(-1) > 0.1
+        assert changed.all() if ends else not changed.any()
+
+
+def test_what_is_shortened_by_a_pixel_is_not_seen_under_another_layer(device: Device) -> None:
+    """A quarter of a level of 8 bits: both lie on each other no longer, and it would be there twice."""
+    grid = plane(60, 40)
+    field = np.zeros((40, 60, 4), np.float32)
+    field[:] = -8.5, 0, 0, 1
+    out = device.upload(field)
+    geometry.keep_within(device, [SimpleNamespace(box=(0, 0, 60, 40))], [out], grid)
+    shortened = out.get()[..., 0] + 8.5
+    its = shortened > 0.99  # up to rounding
+    assert 0.2 < its.mean() < 0.4
+    assert (out.get()[its, 3] < 0.25 / 255).all()
+
+
 @pytest.mark.usefixtures(one_device.__name__)
 def test_no_other_layer_shows_at_once_along_the_border_of_the_canvas() -> None:
     """Where the brighter of two layers that lie some rows apart is displaced beyond the canvas."""
@@ -169,6 +195,20 @@ def test_activation_and_softmax_equal_their_twins(device: Device, name: str) -> 
     assert_close(out.get(), weights, TRIGONOMETRY)
     assert weights[..., 3].max() > 0.5
     assert np.array_equal(out.get()[..., 3] == 0, weights[..., 3] < 1e-45)
+
+
+def test_layers_that_hardly_count_keep_their_ratio(device: Device) -> None:
+    """They are all that is seen where the one that counts shows nothing. None is nothing, however faint."""
+    below = np.linspace(0, 80, 21, dtype=np.float32)
+    field = np.zeros((1, 22, 4), np.float32)
+    field[0, :21, 3], field[0, 21, 3] = 900 - below, -5000
+    blend, out = np.full((1, 22), 0.5, np.float32), device.upload(field)
+    top = device.upload(np.full((1, 22), 900, np.float32))
+    box = (0, 0, 22, 1)
+    device.run("geometry", "geometry_softmax", box[2:], out, device.upload(blend), box, (22, 1, 0, 0), top)
+    weights = out.get()[0, :, 3].astype(float)
+    assert np.allclose(weights[1:21] / weights[:20], math.exp(-4), rtol=1e-3)
+    assert 0 < weights[21] <= weights[20]
 
 
 def test_twins_of_the_softmax_are_the_formulas() -> None:
