@@ -64,7 +64,7 @@ def of_one_exposure(plan: Plan, layers: Sequence[Layer]) -> list[Layer]:
         kept |= {*nearest, *(k for k in others if not _covered(layers[k], [layers[j] for j in nearest]))}
     for k, layer in enumerate(layers):
         if k not in kept:
-            _log.info("%s shows a view in another exposure; it is left out", layer.name)
+            _log.info("%s shows a view in another exposure; it is left out", layer.called)
     return [layers[k] for k in sorted(kept)]
 
 

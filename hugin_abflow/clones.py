@@ -136,7 +136,7 @@ def owners(
             owner, energy, gone, choice = best
             _log.info(
                 "%s and %s show the same at two places; it is shown once",
-                scene.layers[clone.a].layer.name, scene.layers[clone.b].layer.name,
+                scene.layers[clone.a].layer.called, scene.layers[clone.b].layer.called,
             )  # fmt: skip
     return owner, gone
 

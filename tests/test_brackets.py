@@ -121,6 +121,17 @@ def test_only_what_is_covered_is_left_out(
     assert len(brackets.of_one_exposure(plan, layers)) == (1 if covers else 2)
 
 
+def test_photos_are_named_whose_layers_are_left_out(
+    make_project: ProjectMaker, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Not layers that nona made for this run alone, which nobody finds."""
+    plan = read_plan(bracketed(make_project, (0, -2)))
+    layers = [replace(layer_of(), name=name, photo=f"IMG_{name}") for name in names(0, 1)]
+    with caplog.at_level("INFO"):
+        assert brackets.of_one_exposure(plan, layers) == layers[:1]
+    assert caplog.messages == [f"IMG_{names(1)[0]} shows a view in another exposure; it is left out"]
+
+
 def test_layers_of_which_nobody_knows_the_photo_are_shown(make_project: ProjectMaker) -> None:
     project = bracketed(make_project, (0, 2))
     assert shown(project, "pages", "pages", "pages") == ["pages"] * 3

@@ -182,7 +182,7 @@ def chosen(
     )
     asked: list[int] = []
     monkeypatch.setattr(clones, "_look", lambda *given: asked.append(given[-1]) or (a, b)[given[-1]])
-    layers = [SimpleNamespace(layer=SimpleNamespace(name=name)) for name in ("left.tif", "right.tif")]
+    layers = [SimpleNamespace(layer=SimpleNamespace(called=name)) for name in ("left.tif", "right.tif")]
     found, gone = clones.owners(
         Scene(None, layers, [Pair(0, 1)], [], None, None), None, grid_of("plane"), choice
     )
