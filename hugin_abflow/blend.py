@@ -44,6 +44,9 @@ _WHOLE_STRIP = 2 << 20
 _QUARTER_LEVEL = {np.dtype(np.uint8): 0.25 / 255}
 _QUARTER_FINE_LEVEL = 0.25 / 65535
 
+# A weight that nothing brings above 0.
+NEVER = -1e30
+
 # Pixels of a row for which it is found out first which layers they show.
 _BLOCK = 64
 
@@ -67,6 +70,10 @@ class BlendLayer:
     gain    on the exposure scale and the colour grid, float32 (height, width, 4); None: no correction.
     offset  what is added after that (multiband.py), its place on its grid and float32 (height, width, 4);
             None: nothing.
+
+    Of weights those above 0 count. Within a band what nobody would see is made 0 or less (hidden.py), and not
+    sampled, unless most of what counts leads outside its layer: then all are raised by a share of their sum,
+    and what was hidden stands in. `NEVER` stays below 0 even so: such a layer shows only where no other is.
     """
 
     layer: Layer

@@ -33,7 +33,7 @@ from hugin_abflow import (
     unit,
     working,
 )
-from hugin_abflow.blend import BlendLayer, Prepared
+from hugin_abflow.blend import NEVER, BlendLayer, Prepared
 from hugin_abflow.coefficient import Masks
 from hugin_abflow.geometry import Pair
 from hugin_abflow.guides import Guide, by_pair
@@ -51,8 +51,6 @@ _unused_log = logging.getLogger("hugin_abflow.unused")
 _LEAST_OVERLAP = 64
 # Every so many rows and columns of a mask are looked at first.
 _SAMPLED = 16
-# A weight that nothing brings above 0 (blend.cl lets hidden layers weigh something after all).
-_NEVER = -1e30
 # Below this a working canvas is too small to be worth another attempt.
 _LEAST_WORKING_PIXELS = 20_000
 
@@ -292,7 +290,7 @@ def _redundant(index: int, layers: Sequence[WorkingLayer], masks: Masks) -> bool
 
 def _unblended(device: Device, layer: WorkingLayer) -> BlendLayer:
     """A layer that weighs less than nothing: it shows only where no other layer is."""
-    field = device.upload(np.array([[[0, 0, 0, _NEVER]]], np.float32))
+    field = device.upload(np.array([[[0, 0, 0, NEVER]]], np.float32))
     return BlendLayer(layer.layer, (*layer.box[:2], 1, 1), field, [0.0], None, None)
 
 
