@@ -24,6 +24,7 @@ from hugin_abflow import (
     rim,
     seam,
     shadows,
+    tears,
     transition,
 )
 from hugin_abflow.coefficient import Masks
@@ -232,8 +233,9 @@ def _cut(
     cells = seam.seam_grid(grid)
     price = seam.clipping_prices(scene, regions.correction, clipped.excess, whole)
     highlights.restore_weights(device, layers, fields, extra, whole, grid, cells)
+    torn = tears.find(device, layers, fields, whole, grid, cells)
     owner, gone = seam.cut(
-        scene, regions.residual, whole, single, price,
+        scene, regions.residual, whole, single, price, torn,
         choose=partial(clones.owners, scene, regions.correction, cells) if settings.clones else None,
     )  # fmt: skip
     moved = [*gone.values()] + ([] if single is None else [single])

@@ -63,12 +63,7 @@ def _stretch(
     device: Device, layer: WorkingLayer, field: Buffer, inner: Cells, grid: Grid, cells: Grid
 ) -> bool:
     """The same of one layer, in the cells `inner`; whether it shows anything there."""
-    found = device.empty((*cells.shape, 4))
-    device.run(
-        "membrane", "membrane_mean", cells.border[:2],
-        layer.pixels, field, layer.box, grid.border, cells.border, found,
-    )  # fmt: skip
-    means = found.get().astype(np.float64)
+    means = mean_displacements(device, layer, field, grid, cells)
     known = means[..., 3] > 0
     free = inner & known
     if not free.any():
@@ -85,6 +80,18 @@ def _stretch(
         device.upload(np.ascontiguousarray(smooth, np.float32)), cells.border,
     )  # fmt: skip
     return True
+
+
+def mean_displacements(device: Device, layer: WorkingLayer, field: Buffer, grid: Grid, cells: Grid) -> Values:
+    """The mean displacement of a layer's pixels in each cell, and 1; zeros where it has none: (height, width,
+    4).
+    """
+    found = device.empty((*cells.shape, 4))
+    device.run(
+        "membrane", "membrane_mean", cells.border[:2],
+        layer.pixels, field, layer.box, grid.border, cells.border, found,
+    )  # fmt: skip
+    return found.get().astype(np.float64)
 
 
 def _held(k: int, owner: npt.NDArray[np.intp], whole: Cells, both: Cells, wraps: bool) -> Cells:

@@ -4,12 +4,12 @@ In each connected region of cells where aligned layers differ every cell is give
 the softmax favours, with cuts between layers, and at the layers' own borders, where they show least. This is
 a labelling of least energy,
 
-    sum_cells (r (1 - s_k) + h e_k)  +  sum_neighbours c (t + t') / 2 [k != k']  +  sum_borders c t
+    sum_cells (r (1 - s_k) + h e_k + q_k)  +  sum_neighbours c (t + t') / 2 [k != k']  +  sum_borders c t
 
 with r the residual of low frequencies, averaged over the cells around, t how far that of all, not averaged,
-is seen, s_k the share of the softmax, c the price of a cut (labelling.py), and h that of what layer k clips
-of what another one, as bright, still shows, e_k. A cut through somebody who is as bright as what is behind
-shows in t alone.
+is seen, s_k the share of the softmax, c the price of a cut (labelling.py), h that of what layer k clips of
+what another one, as bright, still shows, e_k, and q_k that of a layer that is torn there. A cut through
+somebody who is as bright as what is behind shows in t alone.
 """
 
 from __future__ import annotations
@@ -61,6 +61,9 @@ _MOSTLY = 0.5
 # favour of the softmax, which grows with the area, is no reason to cut. A car across the middle of an overlap
 # was cut in two.
 _CLEAN = 1 / 3
+# Price of a cell of a layer that its displacements tear there (tears.py), as of a residual that nothing
+# favours.
+_TORN = 0.3
 # How bare a cut may be, in cells times full scale, before another one is looked for: by how much the residual
 # of low frequencies is more than _STRONG along it. No texture hides where white stone ends before dark glass.
 _BARE = 1.0
@@ -109,6 +112,7 @@ class Choice:
     whole_factor    (height, width): how many times as much as a cut it may cost to take a region from one
                     layer, the largest of its cells; None: it is cut wherever that is cheapest.
     clipping    h e_k: what each layer costs in a cell besides, for what it clips; None: nothing.
+    torn        (layers, height, width): where each layer's displacements tear it (tears.py); None: nowhere.
     otherwise   a second choice, with longer cuts: a region whose cut by this one would be bare is cut by that
                 one, if that is much less bare. None: there is none.
     """
@@ -122,6 +126,7 @@ class Choice:
     whole_factor: npt.NDArray[np.float64] | None = None
     clipping: Prices | None = None
     cut_share: float = 0.0
+    torn: npt.NDArray[np.bool_] | None = None
     otherwise: Choice | None = None
 
     def owners(self, unwanted: Prices | None = None) -> tuple[npt.NDArray[np.intp], float]:
@@ -205,6 +210,8 @@ class Choice:
             its[there] = self._disfavour(k, rows, columns)[there]
         if self.clipping is not None:
             price += self.clipping[candidates][:, rows, columns]
+        if self.torn is not None:
+            np.add(price, _TORN, out=price, where=self.torn[candidates[:, None], rows, columns])
         number = np.full(self.residual.mean.shape, -1)
         number[rows, columns] = np.arange(rows.size)
         links = []

@@ -66,9 +66,9 @@ _CERTAINLY_DARKER = 0.1
 _NEVER = 1e6
 # What is left of a layer's weight where it yields: a pixel that no other layer can fill stays opaque.
 _TRACE = 1e-12
-# Bytes that `cut` takes for each cell of each layer: share and cover; and more where several layers are, for
-# a graph of prices with what finds the least of them.
-_CELL_BYTES = 8 + 2
+# Bytes that `cut` takes for each cell of each layer: share, cover, and where it is torn; and more where
+# several layers are, for a graph of prices with what finds the least of them.
+_CELL_BYTES = 8 + 3
 _SHARED_BYTES = 16
 # The same of prices for another cut, and of where layers are.
 _OTHER_BYTES = 8 + 1
@@ -163,6 +163,7 @@ def cut(
     whole: Cells,
     single: Cells | None = None,
     clipping_price: Prices | None = None,
+    torn: npt.NDArray[np.bool_] | None = None,
     choose: Callable[[Choice], tuple[npt.NDArray[np.intp], Gone]] | None = None,
 ) -> tuple[npt.NDArray[np.intp], Gone]:
     """Give each cell of the regions `whole` to one layer: the others lose their colour weight there
@@ -171,6 +172,7 @@ def cut(
     single      what single.py and shadows.py found: a region that has cells of it is cut in two only if that
                 is much better, others if it is clearly better.
     clipping_price    what each layer costs in a cell besides (`clipping_prices`).
+    torn        where each layer is torn (`tears.find`).
     choose      the layers of a choice, and who is gone then; default: the least energy, and nobody.
 
     Returns the layer of each cell, (height, width) on the seam grid, elsewhere that which weighs most, -1
@@ -181,7 +183,7 @@ def cut(
     if single is not None:
         factor = np.where(single, _SINGLE_FACTOR, _WHOLE_FACTOR)
     plain = _choice(scene, residual, whole, cells, _shown(scene, cells), _CUT)
-    plain = replace(plain, cut_share=_CUT_SHARE, whole_factor=factor, clipping=clipping_price)
+    plain = replace(plain, cut_share=_CUT_SHARE, whole_factor=factor, clipping=clipping_price, torn=torn)
     long = replace(plain, cut_price=_LONG * _CUT, cut_share=_LONG * _CUT_SHARE)
     choice = replace(plain, residual=seen(plain.residual), otherwise=long)
     owner, gone = choose(choice) if choose else (choice.owners()[0], Gone())
