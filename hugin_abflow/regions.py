@@ -57,9 +57,9 @@ _AS_IT_IS = 0.15
 _FORBIDDEN = 1e4
 # The share of a region's cells that a layer has for it to be taken from there, whole.
 _MOSTLY = 0.5
-# The share of what a cut shows up to which next to nothing is seen where a region is shown whole: then
+# The share of what a cut shows up to which next to nothing is seen of another, or of a whole region: then
 # favour of the softmax, which grows with the area, is no reason to cut. A car across the middle of an overlap
-# was cut in two.
+# was cut in two. Nor is it to cut where two places of one thing overlap: a flower box lost its middle.
 _CLEAN = 1 / 3
 # Price of a cell of a layer that its displacements tear there (tears.py), as of a residual that nothing
 # favours.
@@ -114,7 +114,7 @@ class Choice:
     clipping    h e_k: what each layer costs in a cell besides, for what it clips; None: nothing.
     torn        (layers, height, width): where each layer's displacements tear it (tears.py); None: nowhere.
     otherwise   a second choice, with longer cuts: a region whose cut by this one would be bare is cut by that
-                one, if that is much less bare. None: there is none.
+                one, if that is much less bare, and any other if that is seen much less. None: there is none.
     """
 
     whole: Cells
@@ -165,7 +165,7 @@ class Choice:
         him. So it is, whatever the softmax favours, if a cut is seen much better.
 
         A cut is short, and where the softmax favours neither layer. Where it would be bare, that of
-        `otherwise` is taken if it is much less so.
+        `otherwise` is taken if it is much less so, and wherever it is seen much less.
         """
         candidates = np.flatnonzero(self.cover[:, rows, columns].any(1))
         if candidates.size < 2:
@@ -175,16 +175,18 @@ class Choice:
         wanted = _dearer(plain, more)
         labels = least(wanted)
         bare = partial(_bareness, plain, self.residual.mean[rows, columns])
-        if self.otherwise is not None and bare(labels) > _BARE:
+        other = labels
+        if self.otherwise is not None and np.ptp(labels):
             other = least(_dearer(self.otherwise._graph(rows, columns, candidates), more))
-            labels = other if bare(other) <= _LESS_BARE * bare(labels) else labels
+            if bare(labels) > _BARE and bare(other) <= _LESS_BARE * bare(labels):
+                labels = other
         if self.whole_factor is not None:
 
             def unseen(labels: Labels) -> float:
                 return float(self._disfavour(candidates[labels], rows, columns).sum())
 
             factor, faint = self.whole_factor[rows, columns].max(), _WEAK * self._cut_price(rows.size)
-            labels = _alone(wanted, labels, factor, unseen, faint)
+            labels = _seen_less(wanted, labels, other, factor, unseen, faint)
         return candidates[labels], _energy(plain, labels)
 
     def _cut_price(self, cells: int) -> float:
@@ -240,12 +242,17 @@ def _bareness(graph: Graph, mean: npt.NDArray[np.float64], labels: Labels) -> fl
     return float(np.maximum(along - _STRONG, 0).sum())
 
 
-def _alone(
-    graph: Graph, labels: Labels, factor: float, unseen: Callable[[Labels], float], faint: float
+def _seen_less(
+    graph: Graph,
+    labels: Labels,
+    other: Labels,
+    factor: float,
+    unseen: Callable[[Labels], float],
+    faint: float,
 ) -> Labels:
-    """The labels that take all cells from one layer, as far as it goes, which has most of them, if they show
-    next to nothing of what `labels` show, or else if they cost no more than `factor` times as much; else
-    `labels`.
+    """Of the labels that take all cells from one layer, as far as it goes, which has most of them, and of
+    `other`, those that show next to nothing of what `labels` show; or else of the former those that cost no
+    more than `factor` times as much; else `labels`.
 
     unseen      the part of what labels cost that nobody sees. faint: the price of a cut up to which it is not
                 seen, either.
@@ -260,7 +267,7 @@ def _alone(
     cuts = graph.cut[labels[graph.first] != labels[graph.second]]
     alone = [np.where(one, k, labels) for k, one in enumerate(graph.possible) if one.mean() > _MOSTLY]
     is_cut = cuts.sum() > faint * cuts.size
-    clean = [one for one in alone if is_cut and shown(one) <= _CLEAN * shown(labels)]
+    clean = [one for one in [*alone, other] if is_cut and shown(one) <= _CLEAN * shown(labels)]
     cheap = [one for one in alone if price(one) <= factor * price(labels)]
     return min(clean or cheap, key=price, default=labels)
 

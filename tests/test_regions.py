@@ -143,6 +143,29 @@ def test_a_bare_cut_gives_way_to_a_long_one(differ: float, at_edge: float, gives
     assert np.array_equal(found, along if gives_way else straight)
 
 
+@pytest.mark.parametrize("at_edge", [0.005, 0.05])
+def test_a_cut_through_a_thing_gives_way_to_one_beside_it(at_edge: float) -> None:
+    """A thing that layers show at two places that overlap, alike there: far from where the softmax favours
+    neither layer a cut is seen much less, or not.
+    """
+    rows, columns = (v.ravel() for v in np.mgrid[0:12, 0:40])
+    rms = np.full((12, 40), 0.3)
+    rms[:, 18:22], rms[:, 2:5] = 0.08, at_edge
+    residual = Residuals(np.where(rms < 0.1, rms / 2, rms), rms)
+    share = np.clip(np.linspace(1.1, -0.1, 40), 0, 1) * np.ones((12, 1))
+    cover = np.ones((2, 12, 40), bool)
+    cover[1, :, 0] = cover[0, :, 39] = False
+    whole = np.ones((12, 40), bool)
+    short = Choice(whole, residual, np.stack([share, 1 - share]), cover, False, CUT, 1.0 * whole)
+    long = replace(short, cut_price=8 * CUT)
+    through, beside = (one.label(rows, columns)[0].reshape(12, 40) for one in (short, long))
+    assert (through[:, 17] == 0).all()
+    assert (through[:, 22] == 1).all()
+    found = replace(short, otherwise=long).label(rows, columns)[0].reshape(12, 40)
+    assert np.array_equal(found, beside if at_edge < 0.01 else through)
+    assert (beside[:, 5] == 1).all() or at_edge > 0.01
+
+
 def test_how_bare_a_cut_is() -> None:
     """By what it is more than strong along it."""
     graph = regions.Graph(
