@@ -26,7 +26,7 @@ from hugin_abflow.errors import OutputError
 from hugin_abflow.exif import Metadata, embed, place_in_png
 from hugin_abflow.layer import full_scale, native
 from hugin_abflow.scratch import part_beside, put
-from hugin_abflow.targets import explained, final_file, refuse_too_large
+from hugin_abflow.targets import explained, final_file, may_grow
 
 Pixels = npt.NDArray[Any]
 
@@ -251,18 +251,19 @@ class ImageWriter:
         return self.format == "png" and bool(output.has_error)
 
     def _refuse_full_disk(self, samples: int) -> None:
-        """Raise `OutputError` before libjpeg meets a full disk, or the end of a quota or of what one file may
-        take (``ulimit -f``): it would end the process, untidily.
+        """Raise `OutputError` before libjpeg meets a full disk, or the end of what one file may take: it
+        would end the process, untidily.
 
         samples     that are written next. OpenImageIO completes with blanks what is closed before its end.
         """
         blank = _JPEG_BLANK * self.width * (self.height - self._done) * self.channels
-        needed = tiffwriter.worst_case("jpeg", 100) * samples + blank + _JPEG_LEAST
+        quality = int(self.compression.partition(":")[2] or 100)
+        needed = tiffwriter.worst_case("jpeg", quality) * samples + blank + _JPEG_LEAST
         disk = shutil.disk_usage(self._part.parent)
         if disk.total and disk.free < needed:  # some network folders say 0 of 0
             raise self._failure(os.strerror(errno.ENOSPC))
-        with self._told():
-            refuse_too_large(self._part, math.ceil(needed))
+        if not may_grow(self._part, math.ceil(needed)):
+            raise self._failure(f"{os.strerror(errno.EFBIG)}, by the limit for one file (ulimit -f)")
 
     def _convert(self, rows: Pixels) -> Pixels:
         """To the stored depth and the format's kind of alpha."""

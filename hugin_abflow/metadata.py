@@ -105,6 +105,11 @@ def describe(plan: Plan) -> Metadata:
     return Metadata(chosen, gpano(plan.canvas, len(plan.images)))
 
 
+def is_ours(path: Path) -> bool:
+    """Whether EXIF says that we, or Hugin, have saved an image."""
+    return "hugin" in software(read_exif(path)).lower()
+
+
 def saved_by(path: Path) -> str:
     """The program that EXIF says has saved an image, if that is neither ours nor Hugin's; else nothing. Those
     that Hugin calls, such as enblend, name none.

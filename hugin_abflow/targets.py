@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import errno
 import os
 import sys
 from collections.abc import Iterator
@@ -55,19 +54,14 @@ def explained(path: Path, final: Path, named_with: str) -> Iterator[None]:
         ) from None
 
 
-def refuse_too_large(path: Path, more: int) -> None:
-    """Raise OSError if a file could not grow by so many bytes; where the system cannot tell, nothing."""
-    if sys.platform in ("win32", "darwin"):
-        return
-    with path.open("r+b") as file:
-        size = os.fstat(file.fileno()).st_size
-        try:
-            os.posix_fallocate(file.fileno(), size, more)
-        except OSError as error:
-            if error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
-                raise
-        finally:
-            os.ftruncate(file.fileno(), size)
+def may_grow(path: Path, more: int) -> bool:
+    """Whether a file may grow by so many bytes, by what the system allows for one (``ulimit -f``)."""
+    if sys.platform == "win32":
+        return True
+    import resource  # Unix alone has it
+
+    most = resource.getrlimit(resource.RLIMIT_FSIZE)[0]
+    return most == resource.RLIM_INFINITY or path.stat().st_size + more <= most
 
 
 def named_in_unicode(path: Path) -> bool:

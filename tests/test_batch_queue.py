@@ -6,12 +6,14 @@ import os
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
+import tifffile
 from shoots import write_project
 
 from hugin_abflow import cli
 from hugin_abflow.batch.queue import find_projects, refuse_same_output
-from hugin_abflow.errors import ExitCode, ProjectError, SameOutputError
+from hugin_abflow.errors import ExitCode, OutputError, ProjectError, SameOutputError
 
 
 @pytest.fixture
@@ -85,6 +87,22 @@ def chosen(prefix: str | None = None, keep_layers: bool = False) -> dict[str, An
 
 def refuse(*projects: Path) -> None:
     refuse_same_output({project: chosen() for project in projects})
+
+
+def test_a_photo_of_another_project_is_not_replaced(shoot: Path) -> None:
+    """Though no EXIF tells that it is one; but a panorama that is joined to others is."""
+    rows, whole = write_project(shoot / "row.pto"), write_project(shoot / "whole.pto")
+    whole.write_text(whole.read_text().replace("left.png", "row.tif"))
+    refuse(rows, whole)  # it is not there yet
+    photo = shoot / "row.tif"
+    tifffile.imwrite(photo, np.zeros((4, 5, 3), np.uint8), photometric="rgb", software="")
+    with pytest.raises(
+        OutputError, match=r"row\.pto would replace .*row\.tif, a photo of .*whole\.pto; .* -o"
+    ):
+        refuse(rows, whole)
+    refuse(rows)
+    tifffile.imwrite(photo, np.zeros((4, 5, 3), np.uint8), photometric="rgb", software="Hugin 2022.0")
+    refuse(rows, whole)
 
 
 def test_two_projects_with_one_panorama_are_refused(shoot: Path) -> None:

@@ -44,7 +44,7 @@ def test_jpeg_stops_before_the_disk_is_full(tmp_path, monkeypatch):
     pixels = noise(np.uint8, width=401, height=301)
     with ImageWriter(tmp_path / "a.jpg", 401, 602, 3, np.uint8) as writer:
         writer.write_rows(pixels)
-        disk.free = 1 << 19
+        disk.free = 1 << 18
         with pytest.raises(OutputError, match=r"a\.jpg cannot be written: No space left on device"):
             writer.write_rows(pixels)
         disk.free = 1 << 20

@@ -35,7 +35,7 @@ MALFORMED = [
     (b"i v=3", "v=3", "a link to one of the 3 images"),
     (b"i v=2", "v=2", "not in a circle"),
     (b"o v=999999999", "v=999999999", "a link to one of the 2 images"),
-    (b"p w5", "p w5", "all of f, w, h, v, or none, beside the p-line in line 1"),
+    (b"p w5", "p w5", "all of f, w, h, v, or none but S, beside the p-line in line 1; delete one of the two"),
     (b"v y2", "y2", "an image's number from 0 to 1"),
     (b'#-imgfile 5 "x"', '#-imgfile 5 "x"', 'width, height and "name"'),
     (b'#-imgfile 5 6 "x', '"x', "a closing quote"),
@@ -85,7 +85,7 @@ def test_a_line_without_which_there_is_a_panorama_is_left_out(line: bytes, token
     project = pto.loads(data, "folder/x.pto")
     (doubt,) = project.doubts
     assert doubt.startswith(f"folder/x.pto, line 5: found {token!r}, expected {expected}")
-    assert doubt.endswith("it is left out, as Hugin does; correct or delete that line")
+    assert doubt.endswith("it is left out, though nona may obey it; correct or delete that line")
     kept = [*project.masks, *project.control_points, *project.variables]
     assert [one.raw.rstrip() for one in kept] == good, "and no other line is"
     assert pto.dumps(project) == data
@@ -113,8 +113,25 @@ def test_of_two_p_or_m_lines_the_later_counts_where_it_says_something() -> None:
 
 def test_a_second_p_line_without_a_crop_is_refused_beside_one_with_a_crop() -> None:
     """Hugin scales the crop as the width changes."""
-    with pytest.raises(PtoError, match="all of f, w, h, v, S, or none"):
+    with pytest.raises(PtoError, match=r"all of f, w, h, v, S, or none but S, .* line 1; delete one"):
         pto.loads(b"p f0 w200 h100 v80 S0,100,0,50\np f0 w300 h150 v80\ni w5\n")
+
+
+def test_a_second_p_line_with_a_crop_alone_scales_nothing() -> None:
+    project = pto.loads(b"p f0 w200 h100 v80 S0,100,0,50\np S1,90,2,40\ni w5\n")
+    assert project.panorama.crop == (1, 2, 90, 40)
+
+
+@pytest.mark.parametrize(("key", "left"), [("S", b"f0 w200 h100 v80"), ("v", b"f0 w200 h100 S0,100,0,50")])
+def test_what_is_removed_is_removed_from_both_p_lines(key: str, left: bytes) -> None:
+    """And one of the geometry can be given a value."""
+    line = b"p f0 w200 h100 v80 S0,100,0,50\n"
+    project = pto.loads(line + line + b"i w5\n")
+    project.panorama.set(key, None)
+    assert project.panorama.get(key) is None
+    assert pto.dumps(project) == b"p " + left + b"\np " + left + b"\ni w5\n"
+    project.panorama.height = 50
+    assert project.panorama.height == 50
 
 
 def test_the_crop_factor_is_looked_at_where_somebody_asks() -> None:

@@ -10,7 +10,8 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-from hugin_abflow.errors import ProjectError, SameOutputError
+from hugin_abflow.errors import OutputError, ProjectError, SameOutputError
+from hugin_abflow.metadata import is_ours
 from hugin_abflow.outputs import results
 from hugin_abflow.project import read_plan
 from hugin_abflow.scratch import is_file, is_folder, is_special
@@ -44,21 +45,28 @@ def _key(file: Path) -> str:
 
 def refuse_same_output(projects: Mapping[Path, Mapping[str, Any]]) -> None:
     """Raise `SameOutputError` for projects that would write the same file, by the names that files have where
-    no layers are there yet.
+    no layers are there yet; `OutputError` for one that would replace a photo of another, unless that is a
+    panorama of ours or of Hugin's.
 
     projects    with the keywords of `stitch.stitch_project`; where a prefix is named, the ordinary panorama
                 alone is made.
     """
-    writers: dict[str, Path] = {}
+    remedy = "rename one, or stitch it alone with -o"
+    writers: dict[str, tuple[Path, Path]] = {}
+    photos: dict[str, Path] = {}
     for project, its in projects.items():
         with suppress(ProjectError, OSError):  # it will fail by itself
             plan = read_plan(project)
+            photos.update((_key(photo), project) for photo in plan.photos)
             alone = [plan.default_output()] if its["prefix"] else None
             for output in alone or results(plan, its["keep_layers"]):
-                other = writers.setdefault(_key(output), project)
+                other, _ = writers.setdefault(_key(output), (project, output))
                 if other != project:
-                    remedy = "rename one, or stitch it alone with -o"
                     raise SameOutputError(f"{other} and {project} would both write {output}; {remedy}")
+    for key in writers.keys() & photos.keys():
+        project, output = writers[key]
+        if is_file(output) and not is_ours(output):
+            raise OutputError(f"{project} would replace {output}, a photo of {photos[key]}; {remedy}")
 
 
 def _projects(place: Path, recursive: bool) -> list[Path]:

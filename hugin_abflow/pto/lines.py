@@ -31,12 +31,12 @@ class MergedLine(FieldLine):
     def set(self, key: str, value: str | float | None) -> None:
         """Give a field a value in the line that it is taken from; None removes it from all."""
         given = any(field.key == key for field in self.scan())
-        earlier = self.earlier if self.earlier and self.earlier.get(key) is not None else None
-        if given or not earlier:
-            super().set(key, value)
-        if earlier and (value is None or not given):
-            earlier.set(key, value)
+        if self.earlier and self.earlier.get(key) is not None and (value is None or not given):
+            self.earlier.set(key, value)
             self.read()
+            if not given:
+                return
+        super().set(key, value)
 
 
 class Panorama(MergedLine):
@@ -47,20 +47,15 @@ class Panorama(MergedLine):
     # Hugin changes some of them along with others, and scales a crop with the width.
     _GEOMETRY = ("f", "w", "h", "v")
 
-    def read(self) -> None:
-        """Take in the fields.
-
-        Raises `PtoError` for a second line by which Hugin would change what only the first one gives.
-        """
-        super().read()
+    def check_beside_earlier(self) -> None:
+        """Raise `PtoError` for a second line by which Hugin would change what only the first one gives."""
         if self.earlier is None:
             return
         given = {field.key for field in self.scan()}
         needed = [*self._GEOMETRY, *(["S"] if self.earlier.get("S") else [])]
-        missing = [key for key in needed if key not in given]
-        if missing and given.intersection(needed):
-            expected = f"all of {', '.join(needed)}, or none, beside the p-line in line {self.earlier.number}"
-            raise self.error(self.raw.rstrip(), expected)
+        if given.intersection(self._GEOMETRY) and not given.issuperset(needed):
+            beside = f"or none but S, beside the p-line in line {self.earlier.number}; delete one of the two"
+            raise self.error(self.raw.rstrip(), f"all of {', '.join(needed)}, {beside}")
 
     projection = Whole("f", 2, "Output projection: 0 rectilinear, 1 cylindrical, 2 equirectangular ... (f).")
     width = Whole("w", 3000, "Width of the canvas in pixels (w).")

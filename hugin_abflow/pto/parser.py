@@ -128,6 +128,7 @@ class _Reader:
         """The p-line, or another one."""
         self.note_second(self.project.panorama, number)
         self.project.panorama = Panorama(self.project, number, raw, self.project.panorama)
+        self.project.panorama.check_beside_earlier()
         return self.project.panorama
 
     def read_modes(self, number: int, raw: bytes) -> Line:
@@ -190,7 +191,9 @@ class _Reader:
         try:
             yield
         except PtoError as error:
-            self.project.doubts.append(f"{error}: it is left out, as Hugin does; correct or delete that line")
+            self.project.doubts.append(
+                f"{error}: it is left out, though nona may obey it; correct or delete that line"
+            )
 
     def note_second(self, earlier: Line, number: int) -> None:
         """Note where the file has had such a line already."""
