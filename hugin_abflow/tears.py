@@ -37,13 +37,13 @@ def find(
     fields      where each layer is sampled (`geometry.fields`). cells: the grid of the regions.
     """
     torn = np.zeros((len(layers), *whole.shape), bool)
+    along, down = _steps(grid, cells)
     for layer, field, one in zip(layers, fields, torn, strict=True):
         means = membrane.mean_displacements(device, layer, field, grid, cells)
         known = whole & (means[..., 3] > 0)
         if known.any():  # of many layers few
-            one |= _across(means[..., :3], known, cells.wraps, _steps(grid, cells)[0])
-            down = _across(means[..., :3].swapaxes(0, 1), known.T, False, _steps(grid, cells)[1])
-            one |= down.T
+            one |= _beside(means[..., :3], known, cells.wraps, along)
+            one |= _beside(means[..., :3].swapaxes(0, 1), known.T, False, down).T
     return torn
 
 
@@ -59,7 +59,7 @@ def _steps(grid: Grid, cells: Grid) -> tuple[npt.NDArray[np.float64], npt.NDArra
     )
 
 
-def _across(
+def _beside(
     means: npt.NDArray[np.float64], known: Cells, wraps: bool, step: npt.NDArray[np.float64]
 ) -> Cells:
     """The known cells between which, along rows, displacements differ by too much, on both sides.
