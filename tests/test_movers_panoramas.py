@@ -142,7 +142,7 @@ def test_his_place_is_known_wherever_it_matters(device: Device, monkeypatch: pyt
         original = getattr(module, name)
 
         def remember(*given, **named):
-            last = given[-2] if name == "cut" else named.get("single", given[-1])
+            last = given[3] if name == "cut" else named.get("single", given[-1])
             seen[name] = last.moved > 0 if isinstance(last, Unlike) else last
             return original(*given, **named)
 
