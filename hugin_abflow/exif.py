@@ -131,12 +131,17 @@ def software(found: Directories) -> str:
     return text_of(found.get(MAIN, {}).get(SOFTWARE, text("")))
 
 
+def is_ours(found: Directories) -> bool:
+    """Whether the program that has saved a file is ours, or Hugin's."""
+    return "hugin" in software(found).lower()
+
+
 def is_photo(path: Path) -> bool:
     """Whether EXIF tells how a single photo was taken: that of panoramas does not, be they ours or Hugin's,
     or else it names Hugin.
     """
     found = read_exif(path) if is_file(path) else {}
-    return _EXPOSURE_TIME in found.get(EXIF, {}) and "hugin" not in software(found).lower()
+    return _EXPOSURE_TIME in found.get(EXIF, {}) and not is_ours(found)
 
 
 def _find_in_jpeg(file: BinaryIO) -> bytes:

@@ -293,10 +293,7 @@ def refuse_input(output: Path, inputs: Iterable[Path], named_with: str = "-o") -
         raise OutputError(f"{output} is an input of this panorama; choose another name with {named_with}")
 
 
-def refuse_photo(output: Path, named_with: str = "-o") -> None:
-    """Raise `OutputError` for an output that somebody named and that is a photo, whatever it belongs to."""
+def refuse_photo(output: Path, remedy: str = "choose another name with -o, or remove it") -> None:
+    """Raise `OutputError` for an output that is a photo, whatever it belongs to; remedy: what to do."""
     if is_photo(output):
-        raise OutputError(
-            f"{output} is a photo: its EXIF tells an exposure time; choose another name with {named_with}, "
-            "or remove it"
-        )
+        raise OutputError(f"{output} is a photo: its EXIF tells an exposure time; {remedy}")

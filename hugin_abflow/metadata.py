@@ -9,7 +9,7 @@ from importlib import metadata as packages
 from pathlib import Path
 
 from hugin_abflow import pto
-from hugin_abflow.exif import SOFTWARE, Metadata, comment, comment_of, read_exif, software, text
+from hugin_abflow.exif import SOFTWARE, Metadata, comment, comment_of, is_ours, read_exif, software, text
 from hugin_abflow.layer import Canvas
 from hugin_abflow.oneline import one_line
 from hugin_abflow.project import Plan
@@ -105,17 +105,12 @@ def describe(plan: Plan) -> Metadata:
     return Metadata(chosen, gpano(plan.canvas, len(plan.images)))
 
 
-def is_ours(path: Path) -> bool:
-    """Whether EXIF says that we, or Hugin, have saved an image."""
-    return "hugin" in software(read_exif(path)).lower()
-
-
 def saved_by(path: Path) -> str:
     """The program that EXIF says has saved an image, if that is neither ours nor Hugin's; else nothing. Those
     that Hugin calls, such as enblend, name none.
     """
-    program = software(read_exif(path) if is_file(path) else {})
-    return "" if "hugin" in program.lower() else one_line(program)
+    found = read_exif(path) if is_file(path) else {}
+    return "" if is_ours(found) else one_line(software(found))
 
 
 def summary(plan: Plan) -> list[str]:

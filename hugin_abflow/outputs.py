@@ -13,10 +13,8 @@ from enum import StrEnum
 from pathlib import Path
 
 from hugin_abflow import pto
-from hugin_abflow.errors import OutputError
-from hugin_abflow.exif import is_photo
 from hugin_abflow.found import layer_name
-from hugin_abflow.merge import refuse_input
+from hugin_abflow.merge import refuse_input, refuse_photo
 from hugin_abflow.metadata import PROGRAM
 from hugin_abflow.programs import missing
 from hugin_abflow.project import TIFF_COMPRESSIONS, Plan, read_output
@@ -289,11 +287,7 @@ def refuse_result(result: Path, plan: Plan, inputs: Sequence[Path] = ()) -> None
     `inputs`, or a photo.
     """
     refuse_input(result, [plan.file, *plan.photos, *inputs])
-    if is_photo(result):
-        raise OutputError(
-            f"{result} is a photo: its EXIF tells an exposure time; rename it, or the project, after which "
-            "outputs are named"
-        )
+    refuse_photo(result, "rename it, or the project, after which outputs are named")
 
 
 def _words(text: str) -> list[str]:

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from hugin_abflow.errors import OutputError, ProjectError, SameOutputError
-from hugin_abflow.metadata import is_ours
+from hugin_abflow.exif import is_ours, read_exif
 from hugin_abflow.outputs import results
 from hugin_abflow.project import read_plan
 from hugin_abflow.scratch import is_file, is_folder, is_special
@@ -65,7 +65,7 @@ def refuse_same_output(projects: Mapping[Path, Mapping[str, Any]]) -> None:
                     raise SameOutputError(f"{other} and {project} would both write {output}; {remedy}")
     for key in writers.keys() & photos.keys():
         project, output = writers[key]
-        if is_file(output) and not is_ours(output):
+        if is_file(output) and not is_ours(read_exif(output)):
             raise OutputError(f"{project} would replace {output}, a photo of {photos[key]}; {remedy}")
 
 

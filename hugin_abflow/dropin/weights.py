@@ -98,7 +98,7 @@ class MaskedMerge:
             raise CommandLineError(f"--save-masks={self.save} names one mask twice; %n gives each a number")
         for target in targets:
             refuse_input(target, [self.output, *self.inputs], _OPTION)
-            refuse_photo(target, _OPTION)
+            refuse_photo(target, f"choose another name with {_OPTION}, or remove it")
             check_target(target, None, np.uint16, _OPTION)  # now, not when all else is done
         return targets
 
