@@ -304,7 +304,8 @@ def test_interruption_ends_nona_and_leaves_nothing(make_project, tmp_path):
         "import sys\n"
         "from hugin_abflow.nona import open_layers\n"
         "from hugin_abflow.project import read_plan\n"
-        "with open_layers(read_plan(sys.argv[1])):\n"
+        "from hugin_abflow.signals import interruptible\n"
+        "with interruptible(), open_layers(read_plan(sys.argv[1])):\n"
         "    pass\n"
     )
     environment = {
