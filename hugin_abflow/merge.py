@@ -16,8 +16,8 @@ import numpy.typing as npt
 from hugin_abflow import joint, sequential
 from hugin_abflow.brackets import of_one_exposure, to_be_made
 from hugin_abflow.devices import choose
-from hugin_abflow.errors import LayersMissingError, OutputError
-from hugin_abflow.exif import Metadata, is_photo
+from hugin_abflow.errors import LayersMissingError
+from hugin_abflow.exif import Metadata
 from hugin_abflow.found import Remap, candidates
 from hugin_abflow.guides import Guide, check_guides
 from hugin_abflow.holes import Coverage
@@ -29,9 +29,10 @@ from hugin_abflow.nona import open_layers
 from hugin_abflow.opencl import Device
 from hugin_abflow.pano_trafo import images_of, read_guides
 from hugin_abflow.progress import Progress, silent
-from hugin_abflow.project import Plan, file_key, read_plan, warn_of_doubts
+from hugin_abflow.project import Plan, read_plan, warn_of_doubts
 from hugin_abflow.settings import Settings
 from hugin_abflow.spool import spooled
+from hugin_abflow.targets import refuse_input, refuse_photo
 
 _log = logging.getLogger(__name__)
 
@@ -285,15 +286,3 @@ def check_early(plan: Plan, settings: Settings, output: Path | str | None, compr
     check_target(target, compression)
     if settings.device is not None:
         choose(settings.device, settings.threads)
-
-
-def refuse_input(output: Path, inputs: Iterable[Path], named_with: str = "-o") -> None:
-    """Raise `OutputError` for an output that is one of the inputs; named_with: the option that names it."""
-    if file_key(output) in map(file_key, inputs):
-        raise OutputError(f"{output} is an input of this panorama; choose another name with {named_with}")
-
-
-def refuse_photo(output: Path, remedy: str = "choose another name with -o, or remove it") -> None:
-    """Raise `OutputError` for an output that is a photo, whatever it belongs to; remedy: what to do."""
-    if is_photo(output):
-        raise OutputError(f"{output} is a photo: its EXIF tells an exposure time; {remedy}")

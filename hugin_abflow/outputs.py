@@ -14,11 +14,11 @@ from pathlib import Path
 
 from hugin_abflow import pto
 from hugin_abflow.found import layer_name
-from hugin_abflow.merge import refuse_input, refuse_photo
 from hugin_abflow.metadata import PROGRAM
 from hugin_abflow.programs import missing
 from hugin_abflow.project import TIFF_COMPRESSIONS, Plan, read_output
 from hugin_abflow.stacks import exposure_layers, stacks
+from hugin_abflow.targets import refuse_input, refuse_photo
 
 _log = logging.getLogger(__name__)
 

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import os
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
 from hugin_abflow.errors import OutputError
+from hugin_abflow.exif import is_photo
+from hugin_abflow.project import file_key
 from hugin_abflow.scratch import is_special
 
 
@@ -40,6 +42,18 @@ def final_file(path: Path, named_with: str) -> Path:
                 f"{path} is write-protected; allow writing, or name another file with {named_with}"
             )
     return final
+
+
+def refuse_input(output: Path, inputs: Iterable[Path], named_with: str = "-o") -> None:
+    """Raise `OutputError` for an output that is one of the inputs; named_with: the option that names it."""
+    if file_key(output) in map(file_key, inputs):
+        raise OutputError(f"{output} is an input of this panorama; choose another name with {named_with}")
+
+
+def refuse_photo(output: Path, remedy: str = "choose another name with -o, or remove it") -> None:
+    """Raise `OutputError` for an output that is a photo, whatever it belongs to; remedy: what to do."""
+    if is_photo(output):
+        raise OutputError(f"{output} is a photo: its EXIF tells an exposure time; {remedy}")
 
 
 @contextmanager

@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import shutil
 import struct
-from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -17,9 +16,9 @@ from layer_files import write_layer
 from hugin_abflow.errors import LayersMismatchError, LayersMissingError, OutputError
 from hugin_abflow.found import candidates, layers_by_prefix
 from hugin_abflow.images import write_image
-from hugin_abflow.merge import default_target, refuse_input
+from hugin_abflow.merge import default_target
 from hugin_abflow.nona import open_layers
-from hugin_abflow.project import Plan, file_key, read_plan
+from hugin_abflow.project import Plan, read_plan
 from hugin_abflow.tifftags import ASCII, EXIF, MAIN, RATIONAL, UNDEFINED, Value, add_directories, is_edited
 
 pytestmark = pytest.mark.usefixtures("temporary")
@@ -100,18 +99,6 @@ def test_a_photo_of_pages_is_no_file_of_layers(developed):
     (developed.parent / "pano0001.tif").unlink()
     developed.write_text(developed.read_text().replace("pano0001", "pano"))
     assert candidates(read_plan(developed)) == []
-
-
-@pytest.mark.skipif(os.name == "nt", reason="names ignore case there")
-def test_names_that_differ_by_case_are_one_where_the_file_is(tmp_path):
-    """A disk that ignores case finds one file by both names, as here a second link makes it."""
-    (tmp_path / "photo.jpg").write_bytes(b"photo")
-    with_capitals = tmp_path / "PHOTO.JPG"
-    assert file_key(tmp_path / "none.jpg") == file_key(tmp_path / "NONE.JPG")
-    with suppress(FileExistsError):  # on such a disk
-        os.link(tmp_path / "photo.jpg", with_capitals)
-    with pytest.raises(OutputError, match=r"PHOTO\.JPG is an input"):
-        refuse_input(with_capitals, [tmp_path / "photo.jpg"])
 
 
 def test_a_layer_is_not_kept_in_the_place_of_a_photo(developed, nona, tmp_path):

@@ -17,13 +17,14 @@ from hugin_abflow.errors import CommandLineError, ExitCode, LayersMismatchError,
 from hugin_abflow.guides import Guide
 from hugin_abflow.images import read_layers
 from hugin_abflow.layer import Box, Canvas, Layer, bounding_box, check_layers
-from hugin_abflow.merge import guides_between, refuse_input, refuse_photo, write_panorama
+from hugin_abflow.merge import guides_between, write_panorama
 from hugin_abflow.metadata import describe, version
 from hugin_abflow.progress import Progress
 from hugin_abflow.project import read_plan, warn_of_doubts
 from hugin_abflow.scratch import misnamed_root
 from hugin_abflow.settings import Settings
 from hugin_abflow.signals import interruptible
+from hugin_abflow.targets import refuse_input, refuse_photo
 from hugin_abflow.terminal import (
     catching,
     complain,

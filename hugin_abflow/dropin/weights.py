@@ -18,10 +18,10 @@ from hugin_abflow.errors import CommandLineError, LayersMismatchError, LayersMis
 from hugin_abflow.guides import Guide
 from hugin_abflow.images import ImageWriter, check_target, read_layer
 from hugin_abflow.layer import Box, Canvas, Layer, full_scale
-from hugin_abflow.merge import refuse_input, refuse_photo
 from hugin_abflow.opencl import Device
 from hugin_abflow.progress import Progress, silent
 from hugin_abflow.settings import Settings
+from hugin_abflow.targets import refuse_input, refuse_photo
 from hugin_abflow.working import Grid, Place
 
 _OPTION = "--save-masks"
