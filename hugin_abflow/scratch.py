@@ -158,10 +158,10 @@ def root() -> Path:
 
 def misnamed_root() -> str | None:
     """What is to be said where TMPDIR names no folder, so that another one is taken; None where it does."""
-    named = os.environ.get("TMPDIR", "")
-    if not named or is_folder(Path(named)):
+    named, used = os.environ.get("TMPDIR", ""), root()
+    if not named or used == Path(named):
         return None
-    return f"TMPDIR is {named}, and no such folder is there: {root()} is used; make it, or name another"
+    return f"TMPDIR is {named}, and no such folder is there: {used} is used; make it, or name another"
 
 
 def sweep(folder: Path) -> None:
