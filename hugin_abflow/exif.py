@@ -10,13 +10,15 @@ from __future__ import annotations
 import logging
 import struct
 import zlib
+from contextlib import suppress
 from dataclasses import dataclass
+from functools import lru_cache
 from io import SEEK_CUR, SEEK_END, BytesIO
 from pathlib import Path
+from stat import S_ISREG
 from typing import BinaryIO
 
 from hugin_abflow import jpeg, tifftags
-from hugin_abflow.scratch import is_file
 from hugin_abflow.tifftags import ASCII, EXIF, GPS, MAIN, SHORT, UNDEFINED, Directories, Value
 
 _log = logging.getLogger(__name__)
@@ -138,9 +140,19 @@ def is_ours(found: Directories) -> bool:
 
 def is_photo(path: Path) -> bool:
     """Whether EXIF tells how a single photo was taken: that of panoramas does not, be they ours or Hugin's,
-    or else it names Hugin.
+    or else it names Hugin. Several steps of a run ask it of one file, which is read again if it has changed.
     """
-    found = read_exif(path) if is_file(path) else {}
+    with suppress(OSError, ValueError):  # it is not there, or no file can have its name
+        status = path.stat()
+        if S_ISREG(status.st_mode):  # who opens a pipe waits until somebody writes
+            return _is_photo(path.absolute(), status.st_mtime_ns, status.st_ctime_ns, status.st_size)
+    return False
+
+
+@lru_cache
+def _is_photo(path: Path, *state: int) -> bool:
+    """The same of a file as long as its state, its times and size, is this one."""
+    found = read_exif(path)
     return _EXPOSURE_TIME in found.get(EXIF, {}) and not is_ours(found)
 
 

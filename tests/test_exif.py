@@ -17,7 +17,17 @@ from conftest import ICC, noise
 from hugin_abflow import exif as exif_module
 from hugin_abflow import tifftags
 from hugin_abflow.errors import OutputError
-from hugin_abflow.exif import Metadata, comment, comment_of, embed, place_in_png, read_exif, text, text_of
+from hugin_abflow.exif import (
+    Metadata,
+    comment,
+    comment_of,
+    embed,
+    is_photo,
+    place_in_png,
+    read_exif,
+    text,
+    text_of,
+)
 from hugin_abflow.images import ImageWriter, read_layer
 from hugin_abflow.tifftags import ASCII, EXIF, GPS, MAIN, Value
 
@@ -298,3 +308,16 @@ def test_texts_of_cameras() -> None:
         assert comment_of(Value(7, b"UNICODE\0" + "Höhe Δ".encode(encoding))) == "Höhe Δ"
     for content in ("plain", "Höhe"):
         assert comment_of(comment(content)) == content
+
+
+def test_a_photo_is_told_at_once_until_it_changes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A run asks several times, of the file that its output would replace."""
+    path, read = tmp_path / "a.tif", list[Path]()
+    monkeypatch.setattr(exif_module, "read_exif", lambda path: [read.append(path), read_exif(path)][1])
+    assert not is_photo(path) and not is_photo(tmp_path) and not is_photo(Path("a\0b")) and not read
+    picture(path)
+    assert not is_photo(path) and not is_photo(path) and len(read) == 1
+    embed(path, "tiff", Metadata({EXIF: {33434: Value(5, struct.pack("<2I", 1, 250))}}))
+    assert is_photo(path) and is_photo(path) and len(read) == 2
+    path.unlink()
+    assert not is_photo(path) and len(read) == 2
