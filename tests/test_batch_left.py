@@ -14,8 +14,8 @@ import tifffile
 from conftest import ProjectMaker, names_in, require_program
 from shoots import Deaf, write_project
 
-from hugin_abflow import cli
-from hugin_abflow.batch import task
+from hugin_abflow import cli, scratch
+from hugin_abflow.batch import pool, run, task
 from hugin_abflow.batch.record import Record
 from hugin_abflow.batch.task import Task, perform
 from hugin_abflow.exif import Metadata, embed, text
@@ -251,6 +251,24 @@ def test_the_program_is_told_by_software(tmp_path: Path, ending: str) -> None:
     assert saved_by(file) == GIMP
     embed(file, ENDINGS[file.suffix], Metadata({MAIN: {305: text("GIMP\nerror: \x1b[2J")}}, b""))
     assert saved_by(file) == "GIMP?error: ?[2J"
+
+
+def test_temporary_files_of_killed_runs_are_looked_for_once(
+    tmp_path: Path, made: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Where all projects hold as well: the folder may hold much of others'."""
+    temporary, swept = tmp_path / "temporary files", list[Path]()
+    (temporary / f"hugin-abflow-{scratch._HOST}-0123456789ab").mkdir(parents=True)
+    for name in ("a", "b"):
+        write_project(tmp_path / "shoot" / f"{name}.pto")
+    monkeypatch.setattr(run, "Pool", lambda jobs, *rest: pool.Alone(*rest))
+    assert cli.main([str(tmp_path / "shoot")]) == 0
+    made.clear()
+    monkeypatch.setenv("TMPDIR", str(temporary))
+    sweep = scratch.sweep
+    monkeypatch.setattr(scratch, "sweep", lambda folder: [swept.append(folder), sweep(folder)])
+    assert cli.main([str(tmp_path / "shoot")]) == 0
+    assert made == names_in(temporary) == [] and swept.count(temporary) == 1
 
 
 def test_dry_run_tells_what_becomes_of_what_is_there(

@@ -19,6 +19,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
+from hugin_abflow import scratch
 from hugin_abflow.batch.pool import PAUSE, Watcher
 from hugin_abflow.batch.record import Record
 from hugin_abflow.batch.task import Listener, Task, perform, settings_of
@@ -79,6 +80,7 @@ def _perform(task: Task, key: str, topic: str, level: int, its_version: str) -> 
                 "the same on all machines"
             )
             return record
+        scratch.sweep(scratch.root())  # this machine's, which is not where the run began
         return perform(task, voice, level)
 
 

@@ -9,7 +9,7 @@ from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 
-from hugin_abflow import trace
+from hugin_abflow import scratch, trace
 from hugin_abflow.batch.cluster import Cluster
 from hugin_abflow.batch.display import Display, choose_display, name_of, open_log
 from hugin_abflow.batch.pool import Alone, Pool
@@ -18,7 +18,6 @@ from hugin_abflow.batch.report import print_table, write_report
 from hugin_abflow.batch.task import Task, left_alone
 from hugin_abflow.errors import AbflowError, ExitCode, OutputError, SameOutputError
 from hugin_abflow.oneline import commented
-from hugin_abflow.scratch import is_special
 from hugin_abflow.stitch import show_project
 from hugin_abflow.terminal import complain, label, messages, print_path, print_result, say
 
@@ -51,7 +50,7 @@ class Run:
     def __post_init__(self) -> None:
         named: dict[str, str] = {}
         for option, file in (("--report", self.report), ("--log", self.log), ("--profile", self.profile)):
-            if file and not is_special(file):  # a terminal or /dev/null takes all of them
+            if file and not scratch.is_special(file):  # a terminal or /dev/null takes all of them
                 other = named.setdefault(os.path.realpath(file), option)
                 if other != option:
                     raise SameOutputError(f"{other} and {option} both name {file}; give each its own file")
@@ -77,8 +76,9 @@ def run(tasks: Iterable[Task | str | None], how: Run, lone: bool = False) -> Exi
     with ExitStack() as stack:
         log = stack.enter_context(open_log(how.log))
         stack.enter_context(trace.recording(how.profile))
-        if how.report and not is_special(how.report):  # who reads a pipe expects one report
+        if how.report and not scratch.is_special(how.report):  # who reads a pipe expects one report
             write_report(how.report, [], how.arguments)  # now: a run may be long
+        scratch.sweep(scratch.root())  # of killed runs: where all projects hold nobody else does
         display = choose_display(lone, how.quiet, how.verbose, log)
         try:
             with display:

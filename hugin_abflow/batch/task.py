@@ -97,7 +97,7 @@ def perform(task: Task, listener: Listener, level: int = logging.WARNING, turn: 
             state = _state(task, record)
             if state and task.resume and state.restore(record):
                 # what makes something does so by itself
-                for folder in {scratch.root(), state.file.parent, *(file.parent for file in record.files)}:
+                for folder in {state.file.parent, *(file.parent for file in record.files)}:
                     scratch.sweep(folder)
             else:
                 _stitch(task, record, listener, turn, state)
