@@ -15,7 +15,7 @@ import numpy.typing as npt
 
 from hugin_abflow import membrane
 from hugin_abflow.opencl import Buffer, Device
-from hugin_abflow.working import Grid, WorkingLayer
+from hugin_abflow.working import Grid, WorkingLayer, any_around
 
 # By how much displacements differ from a cell to the next, beside their distance, from which on a layer is
 # torn between them: surfaces seen from aside are compressed, or stretched, by up to a third or so.
@@ -39,9 +39,9 @@ def find(
     torn = np.zeros((len(layers), *whole.shape), bool)
     along, down = _steps(grid, cells)
     for layer, field, one in zip(layers, fields, torn, strict=True):
-        means = membrane.mean_displacements(device, layer, field, grid, cells)
-        known = whole & (means[..., 3] > 0)
-        if known.any():  # of many layers few
+        if any_around(whole, layer.box, grid, cells):  # of many layers few
+            means = membrane.mean_displacements(device, layer, field, grid, cells)
+            known = whole & (means[..., 3] > 0)
             one |= _beside(means[..., :3], known, cells.wraps, along)
             one |= _beside(means[..., :3].swapaxes(0, 1), known.T, False, down).T
     return torn
