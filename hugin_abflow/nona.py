@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import os
 import re
 import shutil
 import subprocess
@@ -13,7 +14,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import get_args
 
-from hugin_abflow import pto
+from hugin_abflow import programs, pto
 from hugin_abflow.errors import (
     ImageReadError,
     LayersMismatchError,
@@ -23,7 +24,6 @@ from hugin_abflow.errors import (
     OutputError,
     PhotoMissingError,
     ProgramFailedError,
-    ProgramMissingError,
     SettingsError,
 )
 from hugin_abflow.failures import check_made, failure
@@ -189,10 +189,7 @@ def _can_make(plan: Plan) -> bool:
 def _make_all(plan: Plan, folder: Path, keep: bool, progress: Progress) -> Found:
     """Have nona make every layer."""
     prefix = str(plan.folder / plan.layer_prefix(plan.stem))
-    if keep:
-        refuse_to_keep(plan, plan.images, prefix)
-    for image in plan.images:
-        _require_photo(plan, image)
+    refuse_to_make(plan, plan.images, prefix if keep else None, anew=True)
     with progress("remap", len(_STEPS) * len(plan.images)) as advance:
         code, lines = _run(plan, _project_for_nona(plan, folder), plan.images, folder, [], advance)
     made = _made(plan, folder)
@@ -226,8 +223,7 @@ def _make_missing(
     plan: Plan, missing: Sequence[PlannedImage], folder: Path, prefix: str, keep: bool, progress: Progress
 ) -> dict[int, Path]:
     """Have nona make the layers that are not there; images that miss the crop have none."""
-    if keep:
-        refuse_to_keep(plan, missing, prefix)
+    refuse_to_make(plan, missing, prefix if keep else None, anew=False)
     project = _project_for_nona(plan, folder)
     with progress("remap", len(_STEPS) * len(missing)) as advance:
         for image in missing:
@@ -288,8 +284,6 @@ def _run(
                     )
                 elif any(mark in line for mark in _DOUBTS):
                     doubts.add(line.strip())
-    except ProgramMissingError as error:
-        raise NonaMissingError(f"{error}; or name layers that exist with --prefix or --layers") from None
     except ProgramFailedError as error:
         raise NonaFailedError(str(error)) from None
     for doubt in sorted(doubts):
@@ -340,7 +334,26 @@ def _made(plan: Plan, folder: Path) -> dict[int, Path]:
     return {index: path for index, path in paths.items() if path.is_file()}
 
 
-def refuse_to_keep(plan: Plan, images: Sequence[PlannedImage], prefix: str) -> None:
+def refuse_to_make(plan: Plan, images: Sequence[PlannedImage], kept_as: str | None, anew: bool) -> None:
+    """Raise what is known to keep nona from making layers of `images` before it begins.
+
+    kept_as     the prefix of layers that are kept. anew: no other layers are there.
+
+    Raises `NonaMissingError`, `PhotoMissingError`, of layers that are kept `OutputError`.
+    """
+    if not images:
+        return
+    if kept_as is not None:
+        _refuse_to_keep(plan, images, kept_as)
+    for image in images if anew else ():  # beside other layers it may miss the crop, and need no photo
+        _require_photo(plan, image)
+    if shutil.which("nona", os.F_OK) is None:  # why one that is there cannot be run is told when it is
+        raise NonaMissingError(
+            f"{programs.missing('nona')}; or name layers that exist with --prefix or --layers"
+        )
+
+
+def _refuse_to_keep(plan: Plan, images: Sequence[PlannedImage], prefix: str) -> None:
     """Raise `OutputError` if layers of `images` could not be read by these names, or would take the place of
     something else: before nona makes them, which may take minutes.
     """

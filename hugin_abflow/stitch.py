@@ -11,6 +11,7 @@ from itertools import groupby
 from pathlib import Path
 from typing import Any
 
+from hugin_abflow.brackets import to_be_made
 from hugin_abflow.errors import LayersMismatchError, ProgramMissingError
 from hugin_abflow.exif import embed
 from hugin_abflow.found import Remap, layer_name, layers_there
@@ -27,7 +28,7 @@ from hugin_abflow.merge import (
     write_panorama,
 )
 from hugin_abflow.metadata import describe
-from hugin_abflow.nona import open_layers, planned_layers, refuse_to_keep, remapping
+from hugin_abflow.nona import open_layers, planned_layers, refuse_to_make, remapping
 from hugin_abflow.oneline import commented
 from hugin_abflow.outputs import (
     BLEND,
@@ -141,7 +142,8 @@ def show_project(
     As the run does, the script makes what is no output in a temporary folder, so that nothing is replaced but
     outputs. It ends at the first error. Photos that miss the crop, which nona tells later, are taken for part
     of the panorama; where nona makes some layers of several, to be kept or stacked, such a one is an error.
-    Raises as `stitch_project` does for what project, output and named layers can get wrong.
+    Raises as `stitch_project` does for what project, output, photos and named layers can get wrong; whether
+    `settings.max_memory` suffices shows in the run alone, once layers are decoded.
     """
     plan = read_plan(path)
     warn_of_doubts(plan)
@@ -327,14 +329,12 @@ def _remap(plan: Plan, remap: Remap) -> Remap:
 
 def _remapping(plan: Plan, remap: Remap, keep: bool) -> tuple[list[list[str]], str, dict[int, str]]:
     """nona's commands, if layers have to be made; what comes before the numbers of all layers, "" where these
-    lie in two folders; and the layers' files by image.
-
-    Raises `OutputError` for layers that cannot be kept.
+    lie in two folders; and the layers' files by image. Raises as `nona.refuse_to_make` does.
     """
     found, missing = planned_layers(plan, remap)
     prefix = found.prefix if found else str(plan.folder / plan.layer_prefix(plan.stem))
-    if keep and missing:
-        refuse_to_keep(plan, missing, prefix)
+    needed = plan.images if keep or plan.ignore_exposure else to_be_made(plan)
+    refuse_to_make(plan, [one for one in missing if one in needed], prefix if keep else None, not found)
     here = Path(prefix).name
     there = no_option(here) if keep or not missing else _TEMPORARY + here
     which = [["-i", str(image.index)] for image in missing] if found else [[]]

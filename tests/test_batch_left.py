@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 import tifffile
-from conftest import ProjectMaker, names_in, require_program
+from conftest import ProjectMaker, age, names_in, require_program
 from shoots import Deaf, write_project
 
 from hugin_abflow import cli, scratch
@@ -272,10 +272,13 @@ def test_temporary_files_of_killed_runs_are_looked_for_once(
 
 
 def test_dry_run_tells_what_becomes_of_what_is_there(
-    project: Path, made: list[str], capsys: pytest.CaptureFixture[str]
+    project: Path, made: list[str], nona: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     save(project.with_name("tiny_blended_fused.tif"), GIMP)
     save(project.with_name("tiny.tif"), False)
+    for photo in ("left.png", "right.png"):  # of which layers would be made to be fused
+        project.with_name(photo).touch()
+        age(project.with_name(photo), 60)
     for arguments, lines in (
         (
             [str(project.parent)],

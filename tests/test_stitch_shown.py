@@ -16,7 +16,7 @@ from pictures import one_device
 from test_hugin import CANVAS, stacked
 from test_stitch import asked, programs, run_shown
 
-from hugin_abflow.errors import AbflowError, ExitCode, OutputError
+from hugin_abflow.errors import AbflowError, ExitCode, NonaMissingError, OutputError
 from hugin_abflow.outputs import Kind
 from hugin_abflow.project import read_plan
 from hugin_abflow.settings import Settings
@@ -183,6 +183,8 @@ def compression_of(path: Path) -> str:
         ({"layers": ["a.tif"], "remap": "always"}, ExitCode.USAGE, "leave out"),
         ({"prefix": "none"}, ExitCode.LAYERS_MISSING, "check --prefix"),
         ({"settings": Settings(device="none")}, ExitCode.DEVICE, "--device none"),
+        ({"output": "missing.tif"}, ExitCode.LAYERS_MISSING, "photo 1.tif (image 1) is not there"),
+        ({"remap": "always"}, ExitCode.LAYERS_MISSING, "photo 1.tif (image 1) is not there"),
     ],
 )
 def test_what_the_run_refuses_is_refused_alike(
@@ -191,6 +193,8 @@ def test_what_the_run_refuses_is_refused_alike(
     """Of the options; what is found out while layers are made or merged shows in the run alone."""
     project = make_project(panorama=CANVAS)
     write_layer(project.with_name("a.tif"), np.full((9, 9, 4), 255, np.uint8))
+    if "photo 1" in said:
+        project.with_name("photo 1.tif").unlink()
     monkeypatch.chdir(project.parent)
     before = sorted(project.parent.iterdir())
     messages = []
@@ -201,3 +205,23 @@ def test_what_the_run_refuses_is_refused_alike(
         messages.append(str(caught.value))
     assert messages[0] == messages[1]
     assert sorted(project.parent.iterdir()) == before
+
+
+def test_nona_is_missed_where_layers_have_to_be_made(
+    make_project: ProjectMaker, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Or some of them; whether photos of these miss the crop, and need not be there, nona alone can tell."""
+    project = make_project(panorama=CANVAS, yaws=(0, 60))
+    remap(read_plan(project), "pano")
+    project.with_name("pano0001.tif").unlink()
+    project.with_name("photo 1.tif").rename(project.with_name("photo 2.tif"))
+    assert show_project(project)
+    monkeypatch.setenv("PATH", "")
+    assert show_project(project, remap="never")
+    for run in (stitch_project, show_project):
+        with pytest.raises(NonaMissingError, match=r"nona is not in PATH; .* or name layers"):
+            run(project)
+    project.with_name("photo 2.tif").rename(project.with_name("photo 1.tif"))
+    for run in (stitch_project, show_project):
+        with pytest.raises(NonaMissingError, match=r"nona is not in PATH; .* or name layers"):
+            run(project, remap="always")
