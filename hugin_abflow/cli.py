@@ -316,7 +316,7 @@ def command(projects: tuple[Path, ...], **given: Any) -> ExitCode:
     tasks = [Task(project, its, remember and not force, remember) for project, its in keywords.items()]
     if given["dry_run"]:
         ours = {project: words(command, values) for project, (_, values) in chosen.items()}
-        return show(tasks, ours, how.warnings)
+        return show(tasks, ours, how)
     return run(tasks, how, lone=len(found) == 1)
 
 

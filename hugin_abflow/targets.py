@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import sys
 from collections.abc import Iterable, Iterator
@@ -66,6 +67,25 @@ def explained(path: Path, final: Path, named_with: str) -> Iterator[None]:
             f"{path} cannot be written: {final.parent}: {error.strerror}; choose another folder with "
             f"{named_with}"
         ) from None
+
+
+def unwritable(path: Path, replaced: bool) -> str | None:
+    """Why the system would not let a file be written, in its words; None if it would, as far as that is told
+    without writing anything.
+
+    replaced    by a new file of its name; else it is opened, and made if it is not there.
+    """
+    final = Path(os.path.realpath(path))
+    if is_special(final):  # who opens a pipe waits until somebody reads
+        return None
+    try:
+        os.stat(f"{final.parent}{os.sep}")  # noqa: PTH116 - so a file is no folder
+        if final.is_dir():
+            return os.strerror(errno.EISDIR)
+        written = final if final.exists() and not replaced else final.parent
+    except OSError as error:
+        return error.strerror
+    return None if os.access(written, os.W_OK) else os.strerror(errno.EACCES)
 
 
 def may_grow(path: Path, more: int) -> bool:

@@ -120,7 +120,7 @@ def recording(path: Path | None) -> Iterator[None]:
 
 
 def _unwritable(path: Path, error: OSError) -> OutputError:
-    return OutputError(f"the profile {path} cannot be written: {error.strerror}; name another")
+    return OutputError(f"{path} cannot be written: {error.strerror}; name another file with --profile")
 
 
 def is_recording() -> bool:

@@ -4,14 +4,17 @@ from __future__ import annotations
 
 import os
 import sys
+from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
 
 import pytest
+from shoots import write_project
 
-from hugin_abflow.errors import OutputError
+from hugin_abflow import cli
+from hugin_abflow.errors import ExitCode, OutputError
 from hugin_abflow.project import file_key
-from hugin_abflow.targets import explained, final_file, refuse_input
+from hugin_abflow.targets import explained, final_file, refuse_input, unwritable
 
 
 @pytest.mark.parametrize(
@@ -50,3 +53,44 @@ def test_names_that_differ_by_case_are_one_where_the_file_is(tmp_path: Path) -> 
         os.link(tmp_path / "photo.jpg", with_capitals)
     with pytest.raises(OutputError, match=r"PHOTO\.JPG is an input"):
         refuse_input(with_capitals, [tmp_path / "photo.jpg"])
+
+
+@pytest.mark.parametrize("option", ["--log", "--report", "--profile"])
+@pytest.mark.parametrize(
+    ("name", "why"), [("none/a", "No such file"), ("file/a", "Not a dir"), ("folder", "")]
+)
+@pytest.mark.skipif(sys.platform == "win32", reason="says it in other words")
+def test_what_the_run_could_not_write_is_refused_where_it_is_only_shown(
+    replace: Callable[..., None], tmp_path: Path, capsys: pytest.CaptureFixture[str],
+    option: str, name: str, why: str,
+) -> None:  # fmt: skip
+    replace(lambda path, **keywords: pytest.fail("it begins"))
+    project = write_project(tmp_path / "a.pto")
+    (tmp_path / "file").touch()
+    (tmp_path / "folder").mkdir()
+    said = []
+    for also in ([], ["--dry-run"]):
+        assert cli.main([str(project), option, str(tmp_path / name), *also]) == ExitCode.OUTPUT
+        output = capsys.readouterr()
+        assert output.out == ""
+        said.append(output.err)
+    assert said[0] == said[1] and why in said[0] and f"; name another file with {option}" in said[0]
+
+
+@pytest.mark.parametrize("option", ["--log", "--report", "--profile"])
+def test_what_is_only_shown_writes_nothing(tmp_path: Path, option: str) -> None:
+    project = write_project(tmp_path / "a.pto")
+    (tmp_path / "there").write_text("before")
+    for name in ("new", "there", os.devnull):
+        assert cli.main(["--dry-run", str(project), option, str(tmp_path / name)]) == 0
+    assert (tmp_path / "there").read_text() == "before" and not (tmp_path / "new").exists()
+
+
+@pytest.mark.skipif(sys.platform == "win32" or os.geteuid() == 0, reason="nothing is closed to this user")
+def test_what_is_closed_is_told_without_writing(tmp_path: Path) -> None:
+    file = tmp_path / "file"
+    file.touch(0o444)
+    assert unwritable(file, replaced=False) and not unwritable(file, replaced=True)
+    tmp_path.chmod(0o555)
+    assert unwritable(file, replaced=True) and unwritable(tmp_path / "new", replaced=False)
+    tmp_path.chmod(0o755)

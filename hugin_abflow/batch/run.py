@@ -19,6 +19,7 @@ from hugin_abflow.batch.task import Task, left_alone
 from hugin_abflow.errors import AbflowError, ExitCode, OutputError, SameOutputError
 from hugin_abflow.oneline import commented
 from hugin_abflow.stitch import show_project
+from hugin_abflow.targets import unwritable
 from hugin_abflow.terminal import complain, label, messages, print_path, print_result, say
 
 
@@ -169,12 +170,16 @@ def _announced(
             yield waiting.pop(project)
 
 
-def show(tasks: Iterable[Task], words: Mapping[Path, Sequence[str]], warnings: Sequence[str]) -> ExitCode:
-    """Print on stdout what would be done for each task. words: of its project, options of our own; warnings:
-    as `Run` has them.
+def show(tasks: Iterable[Task], words: Mapping[Path, Sequence[str]], how: Run) -> ExitCode:
+    """Print on stdout what would be done for each task. words: of its project, options of our own.
+
+    Raises `OutputError` for a log, a report or a profile that cannot be written, as `run` does.
     """
+    for option, file in (("--log", how.log), ("--profile", how.profile), ("--report", how.report)):
+        if file and (why := unwritable(file, replaced=option == "--report")):
+            raise OutputError(f"{file} cannot be written: {why}; name another file with {option}")
     codes = []
-    for text in warnings:
+    for text in how.warnings:
         say(label(logging.WARNING) + text)
     with messages(logging.WARNING):
         for one in tasks:
