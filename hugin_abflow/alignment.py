@@ -54,7 +54,7 @@ class Aligned:
                 alone may show; None: nowhere.
     """
 
-    fields: list[Buffer]
+    fields: Sequence[Buffer]
     reaches: list[list[float]]
     correction: Correction
     whole: Cells | None
@@ -82,9 +82,8 @@ def align(
     if strips is None:
         return aligned
     fields, reaches = aligned.fields, list(aligned.reaches)
-    carried, changed = rim.carry(
-        device, layers, fields, strips, grid
-    )  # as they are at last, also beside cuts
+    # as they are at last, also beside cuts
+    carried, changed = rim.carry(device, layers, fields, strips, grid)
     _keep_within(device, layers, fields, changed, reaches, grid)
     return replace(aligned, reaches=reaches, carried=(masks.grid, carried))
 
@@ -113,21 +112,11 @@ def _align(
     scene = Scene(device, layers, pairs, fields, masks, grid)
     with ThreadPoolExecutor(2, "gains") as threads:  # each on one core: the device goes on meanwhile
         gains = _Gains(threads, device, measured, settings)
-        strict = gains.strict(None) if settings.seam else None
-        # before it is known whether there are regions, which is rare
-        early = gains.final(None) if settings.flow and single is None and settings.cores > 1 else None
-        reaches = [geometry.reach(device, *one, grid) for one in zip(layers, fields, strict=True)]
-        regions = _find_regions(scene, gains, strict, single, settings) if strict else None
-        if regions and not settings.flow:
-            unlike = seam.unlike(scene, regions.correction)
-            seam.cut_unaligned(scene, regions.correction)
-            # what is not aligned tells little of exposures: that is left to bands of frequencies
-            return Aligned(fields, reaches, gains.none().result(), None, unlike)
-        if regions is None or regions.whole is None:
-            return Aligned(fields, reaches, (early or gains.final(None)).result(), None, None)
-        final = gains.final(regions.whole)
-        unlike = _cut(scene, regions, regions.whole, single, clipped, extra, reaches, settings)
-        return Aligned(fields, reaches, final.result(), regions.whole, unlike)
+        if not settings.seam:
+            return _uncut(scene, gains)
+        if not settings.flow:
+            return _cut_overlaps(scene, gains, single, settings)
+        return _cut_regions(scene, gains, single, clipped, extra, settings)
 
 
 def _fields(
@@ -191,6 +180,45 @@ class _Regions:
     whole: Cells | None
     residual: Residuals
     correction: Correction
+
+
+def _uncut(scene: Scene, gains: _Gains) -> Aligned:
+    """Layers that are blended wherever they overlap."""
+    final = gains.final(None)
+    return Aligned(scene.fields, _reaches(scene), final.result(), None, None)
+
+
+def _cut_overlaps(scene: Scene, gains: _Gains, single: Cells | None, settings: Settings) -> Aligned:
+    """Layers that nothing has aligned, cut in all of their overlaps."""
+    strict = gains.strict(None)
+    reaches = _reaches(scene)
+    correction = _find_regions(scene, gains, strict, single, settings).correction
+    unlike = seam.unlike(scene, correction)
+    seam.cut_unaligned(scene, correction)
+    # what is not aligned tells little of exposures: that is left to bands of frequencies
+    return Aligned(scene.fields, reaches, gains.none().result(), None, unlike)
+
+
+def _cut_regions(
+    scene: Scene, gains: _Gains, single: Cells | None, clipped: Clipped, extra: PerLayer, settings: Settings
+) -> Aligned:
+    """Layers that flow has aligned, cut where they differ all the same."""
+    strict = gains.strict(None)
+    # before it is known whether there are regions, which is rare
+    early = gains.final(None) if single is None and settings.cores > 1 else None
+    reaches = _reaches(scene)
+    regions = _find_regions(scene, gains, strict, single, settings)
+    if regions.whole is None:
+        return Aligned(scene.fields, reaches, (early or gains.final(None)).result(), None, None)
+    final = gains.final(regions.whole)
+    unlike = _cut(scene, regions, regions.whole, single, clipped, extra, reaches, settings)
+    return Aligned(scene.fields, reaches, final.result(), regions.whole, unlike)
+
+
+def _reaches(scene: Scene) -> list[list[float]]:
+    """How far fields lead from where their layers are sampled, by rows (`Aligned.reaches`)."""
+    layers = zip(scene.layers, scene.fields, strict=True)
+    return [geometry.reach(scene.device, layer, field, scene.grid) for layer, field in layers]
 
 
 def _find_regions(
