@@ -13,6 +13,7 @@ import logging
 import os
 from collections.abc import Collection, Iterable, Mapping
 from contextlib import suppress
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
@@ -36,6 +37,21 @@ _ROWS = 256  # that are decoded at a time
 
 Entry = dict[str, Any]
 _Look = Literal["made", "changed", "gone"]
+
+
+@dataclass(frozen=True)
+class _Verdict:
+    """What is to be thought of the outputs that are there.
+
+    same    project, inputs, settings and version are as they were when they were made.
+    holds   so are all outputs, but for what somebody changed: there is nothing to make.
+    shown   those that are there. left: of these, such as somebody changed, or another program saved.
+    """
+
+    same: bool
+    holds: bool
+    shown: list[Entry]
+    left: list[Entry]
 
 
 class State:
@@ -85,29 +101,36 @@ class State:
         somebody changed since, or another program saved, is left, with a warning, whatever else changed.
         Nobody's work is lost unasked. Else return False; `left` is known then, too. `begin` comes first.
         """
-        asked = self._asked()
-        # what somebody changed and nobody asks for any more is not ours: no run would make it anew
-        found = [(entry, how) for entry, how in self._found() if how != "changed" or entry["file"] in asked]
-        there = [entry for entry, how in found if how != "gone"]
-        same = bool(found) and self._known["hash"] == self._hash()
-        # what was left out is to be made once its program is installed
-        holds = same and len(there) == len(found) and set(self._known["left_out"]) <= set(self._left_out())
-        # layers are inputs as well; such as somebody changed are used, and replaced by none
-        inputs = set() if holds else {entry["file"] for entry in self._inputs}
-        changed = [entry for entry, how in found if how == "changed" and entry["file"] not in inputs]
-        foreign = [] if holds else self._foreign({entry["file"] for entry, _ in found} | inputs)
-        for entry in changed + foreign:
-            self._warn(entry, same)
+        verdict = self._judge()
+        for entry in verdict.left:
+            self._warn(entry, verdict.same)
         # where the others are made anew, even what it was before somebody changed it is out of date
-        self._left = [entry if same else {**entry, "blake2b": ""} for entry in changed] + foreign
-        if not holds and (not self._left or is_more_asked(self._plan, self._options, self.left)):
+        self._left = [entry if verdict.same else {**entry, "blake2b": ""} for entry in verdict.left]
+        if not verdict.holds and (not self._left or is_more_asked(self._plan, self._options, self.left)):
             return False
-        record.outputs = self._plain(there + foreign)
+        record.outputs = self._plain(verdict.shown)
         record.device, record.overlaps = self._known.get("device", ""), self._known.get("overlaps", [])
         if self._left_out():
             possible_outputs(self._plan)  # warns of them
         record.result = "skipped"
         return True
+
+    def _judge(self) -> _Verdict:
+        """What is to be thought of the outputs that are there; nobody is told."""
+        asked = self._asked()
+        # what somebody changed and nobody asks for any more is not ours: no run would make it anew
+        found = [(entry, how) for entry, how in self._found() if how != "changed" or entry["file"] in asked]
+        there = [entry for entry, how in found if how != "gone"]
+        changed = [entry for entry, how in found if how == "changed"]
+        same = bool(found) and self._known["hash"] == self._hash()
+        # what was left out is to be made once its program is installed
+        if same and len(there) == len(found) and set(self._known["left_out"]) <= set(self._left_out()):
+            return _Verdict(same, True, there, changed)
+        # layers are inputs as well; such as somebody changed are used, and replaced by none
+        inputs = {entry["file"] for entry in self._inputs}
+        foreign = self._foreign({entry["file"] for entry, _ in found} | inputs)
+        changed = [entry for entry in changed if entry["file"] not in inputs]
+        return _Verdict(same, False, there + foreign, changed + foreign)
 
     def _found(self) -> list[tuple[Entry, _Look]]:
         """The outputs that were made, and what became of them; nothing, and nothing is known any more, where
