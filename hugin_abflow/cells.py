@@ -13,7 +13,7 @@ import scipy
 
 from hugin_abflow.chart import Chart
 from hugin_abflow.pyramid import Level
-from hugin_abflow.working import Grid
+from hugin_abflow.working import Border, Grid
 
 Mask = npt.NDArray[np.bool_]
 Flows = tuple[npt.NDArray[np.float32], npt.NDArray[np.float32]]
@@ -227,7 +227,7 @@ def cells_at(
 
 
 def pixels_at(
-    places: Places, border: tuple[int, int, int, int]
+    places: Places, border: Border
 ) -> tuple[Mask, tuple[npt.NDArray[np.intp], npt.NDArray[np.intp]]]:
     """Which places (..., 2) px lie on a grid (width, height, wraps, 0), and the rows and columns of all."""
     width, height, wraps, _ = border

@@ -16,7 +16,7 @@ import numpy.typing as npt
 from hugin_abflow.opencl import Device
 from hugin_abflow.projection import EQUIRECTANGULAR, Projection, directions
 from hugin_abflow.pyramid import Level
-from hugin_abflow.working import Grid, WorkingLayer, on_cells
+from hugin_abflow.working import Border, Grid, WorkingLayer, on_cells
 
 # Chart pixels around the overlap, so that flow is smooth across its border.
 _MARGIN = 16
@@ -66,9 +66,9 @@ class Chart:
         return grid.circumference * float(self.transform[9])
 
     @property
-    def border(self) -> tuple[int, int, int, int]:
-        """Grid as the kernels take it: (width, height, wraps, 0)."""
-        return self.width, self.height, int(self.wraps), 0
+    def border(self) -> Border:
+        """Grid as the kernels take it."""
+        return Border(self.width, self.height, int(self.wraps))
 
     @property
     def spherical(self) -> bool:

@@ -67,7 +67,7 @@ def masks(device: Device, layers: Sequence[WorkingLayer], grid: Grid) -> Masks:
     for layer in layers:
         mask = device.empty(mask_grid.shape, np.uint8)
         device.run(
-            "coefficient", "coefficient_mask", mask_grid.border[:2], layer.pixels, layer.box, grid.border,
+            "coefficient", "coefficient_mask", mask_grid.border.size, layer.pixels, layer.box, grid.border,
             mask_grid.border, mask,
         )  # fmt: skip
         buffers.append(mask)
@@ -87,7 +87,7 @@ def _table(grid: Grid) -> npt.NDArray[np.float32]:
 def distance(device: Device, masks_: Masks, index: int, cover: Buffer, working: Grid) -> Buffer:
     """D_k of layer `index` in working pixels, float32 on the mask grid; `cover` is the union's mask."""
     grid = masks_.grid
-    size = grid.border[:2]
+    size = grid.border.size
     table = device.upload(_table(grid))
     seed, flooded = (device.empty(grid.shape, np.int32) for _ in range(2))
     mask = masks_.buffers[index]

@@ -23,6 +23,7 @@ from hugin_abflow.flow import FlowParameters, adopt
 from hugin_abflow.geometry import Pair, PairFlow
 from hugin_abflow.opencl import Buffer, Device
 from hugin_abflow.pyramid import Level
+from hugin_abflow.working import Border
 
 # Brightness of pixels that do not count: EXCLUDED of kernels/common.cl.
 EXCLUDED = 1e3
@@ -152,7 +153,7 @@ def trust(
     mask = device.upload(np.zeros((1, 1), np.uint8) if excluded is None else excluded.astype(np.uint8))
     cells = (*mask.shape[::-1], CELL, 0)
     device.run(
-        "consistency", "consistency_trust", grid[:2], flow, back, grid, _TOLERANCE, _SQUEEZED,
+        "consistency", "consistency_trust", grid.size, flow, back, grid, _TOLERANCE, _SQUEEZED,
         mask, cells, image, trusted,
     )  # fmt: skip
     return trusted
@@ -164,7 +165,7 @@ def _supported(device: Device, trusted: Buffer, wraps: bool) -> Buffer:
     for _ in range(_AROUND):
         around = _coarser(device, around, wraps)
     device.run(
-        "consistency", "consistency_support", grid[:2], around, _grid(around, wraps), 2.0**_AROUND, _ENOUGH,
+        "consistency", "consistency_support", grid.size, around, _grid(around, wraps), 2.0**_AROUND, _ENOUGH,
         trusted, grid,
     )  # fmt: skip
     return trusted
@@ -176,14 +177,14 @@ def _filled(device: Device, trusted: Buffer, wraps: bool, single: bool) -> Buffe
         levels.append(_coarser(device, levels[-1], wraps))
     filled = _carried(device, levels, wraps, _SWEEPS)
     wide = _carried(device, levels, wraps, sweeps=0) if single else filled
-    device.run("consistency", "consistency_mix", grid[:2], trusted, grid, wide, filled)
+    device.run("consistency", "consistency_mix", grid.size, trusted, grid, wide, filled)
     return filled
 
 
 def _coarser(device: Device, fine: Buffer, wraps: bool) -> Buffer:
     """The next level of the pyramid."""
     small = device.empty(((fine.shape[0] + 1) // 2, (fine.shape[1] + 1) // 2, 4))
-    size = _grid(small, wraps)[:2]
+    size = _grid(small, wraps).size
     device.run("consistency", "consistency_push", size, fine, _grid(fine, wraps), small, size)
     return small
 
@@ -195,11 +196,11 @@ def _carried(device: Device, levels: Sequence[Buffer], wraps: bool, sweeps: int)
         grid, coarse = _grid(level, wraps), filled
         filled = device.empty((*level.shape[:2], 2))
         device.run(
-            "consistency", "consistency_pull", grid[:2], level, grid, coarse, _grid(coarse, wraps), filled
+            "consistency", "consistency_pull", grid.size, level, grid, coarse, _grid(coarse, wraps), filled
         )
-        if sweeps and grid[0] * grid[1] >= _LEAST_PIXELS:
+        if sweeps and grid.width * grid.height >= _LEAST_PIXELS:
             calls = [(level, grid, _OWN, _EDGE, colour, _RELAXATION, filled) for colour in (0, 1)]
-            half = (-(-grid[0] // 2), grid[1])
+            half = (-(-grid.width // 2), grid.height)
             device.repeat("consistency", "consistency_relax", half, calls, sweeps)
     return filled
 
@@ -207,9 +208,9 @@ def _carried(device: Device, levels: Sequence[Buffer], wraps: bool, sweeps: int)
 def _flow(device: Device, trusted: Buffer, wraps: bool) -> Buffer:
     """The flow alone, float32 (height, width, 2), px."""
     alone, grid = device.empty((*trusted.shape[:2], 2)), _grid(trusted, wraps)
-    device.run("consistency", "consistency_flow", grid[:2], trusted, grid, alone)
+    device.run("consistency", "consistency_flow", grid.size, trusted, grid, alone)
     return alone
 
 
-def _grid(buffer: Buffer, wraps: bool) -> tuple[int, int, int, int]:
-    return buffer.shape[1], buffer.shape[0], int(wraps), 0
+def _grid(buffer: Buffer, wraps: bool) -> Border:
+    return Border(buffer.shape[1], buffer.shape[0], int(wraps))

@@ -94,7 +94,7 @@ def complete(
     cells, sums = unlike.grid, device.empty((*unlike.grid.shape, 4))
     moved, other = device.upload(unlike.moved), device.upload(unlike.other)
     device.run(
-        "content", "content_gather", cells.border[:2],
+        "content", "content_gather", cells.border.size,
         difference, share, box, grid.border, mean, moved, other, cells.border, shoulder, sums,
     )  # fmt: skip
     expected = device.upload(_from_beside(sums.get(), cells.wraps))

@@ -19,7 +19,8 @@ from hugin_abflow import decision, pyramid, search
 from hugin_abflow.decision import Bearings, Candidate, Refused
 from hugin_abflow.opencl import Buffer, Device
 from hugin_abflow.pyramid import Level
-from hugin_abflow.search import Grid, SearchParameters
+from hugin_abflow.search import SearchParameters
+from hugin_abflow.working import Border
 
 
 @dataclass(frozen=True)
@@ -68,17 +69,16 @@ class Board:
     """Linear systems of one grid with the flows that solve them, one for each way (kernels/common.cl).
 
     planes  float32 (ways, 2, height, planes, pitch).
-    grid    (width, height, wraps, 0).
     """
 
     planes: Buffer
-    grid: Grid
+    grid: Border
 
     @classmethod
-    def of(cls, device: Device, ways: int, grid: Grid) -> Board:
+    def of(cls, device: Device, ways: int, grid: Border) -> Board:
         """A board of zeros."""
-        pitch = -(-((grid[0] + 1) // 2 + 1) // _ROW_GROUP) * _ROW_GROUP
-        return cls(device.zeros((ways, 2, grid[1], _PLANES, pitch)), grid)
+        pitch = -(-((grid.width + 1) // 2 + 1) // _ROW_GROUP) * _ROW_GROUP
+        return cls(device.zeros((ways, 2, grid.height, _PLANES, pitch)), grid)
 
     @property
     def pitch(self) -> int:
@@ -93,11 +93,11 @@ class Board:
     @property
     def options(self) -> str:
         """Build options of kernels that go over the board."""
-        return board_options(bool(self.grid[2]))
+        return board_options(bool(self.grid.wraps))
 
     def relax(self, device: Device, sweeps: int, relaxation: float) -> None:
         """Red-black sweeps."""
-        width, height = self.grid[:2]
+        width, height = self.grid.size
         if device.kind == "GPU" and width * height <= _SMALL:
             name = "flow_relax_small"
             most = device.largest_group("flow", name, self.options)
@@ -114,7 +114,7 @@ class Board:
 
     def solution(self, device: Device, flows: Buffer, first: int = 0) -> Buffer:
         """`flows`, float32 (2, height, width, 2) or one of them, with the board's from way `first` on."""
-        size = (*self.grid[:2], self.ways)
+        size = (*self.grid.size, self.ways)
         device.run("flow", "flow_solution", size, self.planes, self.grid, self.pitch, first, flows)
         return flows
 
@@ -149,7 +149,7 @@ def _features(device: Device, pairs: Sequence[tuple[Level, Level]], parameters: 
     for way, (level, coarser) in enumerate(pairs):
         mean = pyramid.smooth(device, coarser, parameters.mean_sigma / 2)
         device.run(
-            "flow", "flow_feature", level.grid[:2], level.image, level.mask, level.grid,
+            "flow", "flow_feature", level.grid.size, level.image, level.mask, level.grid,
             mean.image, mean.mask, mean.grid, way, features,
         )  # fmt: skip
     return features
@@ -159,16 +159,16 @@ def _refine(
     device: Device,
     features: Buffer,
     flows: Buffer,
-    grid: Grid,
+    grid: Border,
     level: int,
     parameters: FlowParameters,
     pulls: tuple[Pull | None, Pull | None],
 ) -> Buffer:
     """Improve the flows between the images on one level, both ways; `flows` is used up."""
     median = device.empty(flows.shape)
-    together = 2 * grid[0] * grid[1] * _PLANES * 4 <= _TOGETHER
+    together = 2 * grid.width * grid.height * _PLANES * 4 <= _TOGETHER
     board = Board.of(device, 2 if together else 1, grid)
-    rows, halves = (2 * board.pitch, grid[1], board.ways), (board.pitch, 2 * grid[1], board.ways)
+    rows, halves = (2 * board.pitch, grid.height, board.ways), (board.pitch, 2 * grid.height, board.ways)
     warps, sweeps = (pyramid.on_level(values, level) for values in (parameters.warps, parameters.sweeps))
     for first in range(0, 2, board.ways):
         old, new = flows, median
@@ -193,17 +193,17 @@ def _refine(
     return median if warps % 2 else flows
 
 
-def levels(grid: Grid, parameters: FlowParameters) -> int:
+def levels(grid: Border, parameters: FlowParameters) -> int:
     """How many levels the flow of images on a grid has. None that wraps is of odd width: pixels of one colour
     would meet there.
     """
-    width, shorter, count = grid[0], min(grid[:2]), 1
-    while shorter >= 2 * parameters.coarsest and not (grid[2] and width % 4):
+    width, shorter, count = grid.width, min(grid.size), 1
+    while shorter >= 2 * parameters.coarsest and not (grid.wraps and width % 4):
         width, shorter, count = width // 2, shorter // 2, count + 1
     return count
 
 
-def search_room(reach: float, grid: Grid, parameters: FlowParameters) -> int:
+def search_room(reach: float, grid: Border, parameters: FlowParameters) -> int:
     """Bytes that the search of `solve` takes at most: of images on a grid, for motion of up to `reach` px."""
     count, how = levels(grid, parameters), parameters.search
     return search.most_room(reach, count, grid, how, finest=parameters.decide_on)
@@ -236,7 +236,7 @@ def _choose(
     device: Device,
     features: Buffer,
     stacked: Buffer,
-    grid: Grid,
+    grid: Border,
     level: int,
     reach: int,
     parameters: FlowParameters,
@@ -263,7 +263,7 @@ def _decide(
     device: Device,
     features: Buffer,
     flows: list[Buffer],
-    grid: Grid,
+    grid: Border,
     level: int,
     bearings: Bearings | None,
     parameters: FlowParameters,
@@ -272,7 +272,7 @@ def _decide(
     what was refused.
     """
     plain, found = (Candidate(one.get(), _misfit(device, features, one, grid, parameters)) for one in flows)
-    how, last_level, wraps = parameters.search, parameters.decide_on, bool(grid[2])
+    how, last_level, wraps = parameters.search, parameters.decide_on, bool(grid.wraps)
 
     def textured() -> decision.Mask:
         slopes: npt.NDArray[np.float32] = features.get()[..., 1:3]
@@ -291,13 +291,13 @@ def _decide(
 
 
 def _misfit(
-    device: Device, features: Buffer, flows: Buffer, grid: Grid, parameters: FlowParameters
+    device: Device, features: Buffer, flows: Buffer, grid: Border, parameters: FlowParameters
 ) -> npt.NDArray[np.float32]:
     """What flows both ways leave unexplained, (2, height, width), where both images show something; else
     -1.
     """
-    misfit = device.empty((2, grid[1], grid[0]))
-    device.run("flow", "flow_misfit", (*grid[:2], 2), features, flows, grid, parameters.misfit, misfit)
+    misfit = device.empty((2, grid.height, grid.width))
+    device.run("flow", "flow_misfit", (*grid.size, 2), features, flows, grid, parameters.misfit, misfit)
     return misfit.get()
 
 
@@ -347,7 +347,7 @@ def solve(
     """
     parameters = parameters or FlowParameters()
     count = start.level + 1 if start else levels(a.grid, parameters)
-    reach = parameters.reach * max(a.grid[:2]) if reach is None else reach
+    reach = parameters.reach * max(a.grid.size) if reach is None else reach
     searched: dict[int, int] = {}
     if reach > 0 and not start:
         common = np.count_nonzero(a.mask.get() * b.mask.get())
@@ -362,7 +362,8 @@ def solve(
         if flows:
             flows = [_expand(device, one, grid) for one in flows]
         else:
-            flows = [_stacked(device, start.flows) if start else device.zeros((2, grid[1], grid[0], 2))]
+            its_size = 2, grid.height, grid.width, 2
+            flows = [_stacked(device, start.flows) if start else device.zeros(its_size)]
         always = parameters.search.always and level <= max(searched, default=-1)
         followed = always or len(flows) > 1
         if level in searched or (followed and level >= parameters.choose_from):
@@ -393,10 +394,10 @@ def refine(
     return flows[0], flows[1]
 
 
-def _expand(device: Device, flows: Buffer, grid: Grid) -> Buffer:
+def _expand(device: Device, flows: Buffer, grid: Border) -> Buffer:
     """Flows of both ways on the next finer level's grid."""
     ways, height, width, _ = flows.shape
-    fine = device.empty((ways, grid[1], grid[0], 2))
-    size = (*grid[:2], ways)
-    device.run("flow", "flow_expand", size, flows, (width, height, grid[2], 0), fine, grid[:2])
+    fine = device.empty((ways, grid.height, grid.width, 2))
+    size = (*grid.size, ways)
+    device.run("flow", "flow_expand", size, flows, Border(width, height, grid.wraps), fine, grid.size)
     return fine

@@ -23,7 +23,7 @@ from hugin_abflow.flow import Board, FlowParameters, Start
 from hugin_abflow.guides import Guide, Points, distances, doubts
 from hugin_abflow.opencl import Buffer, Device
 from hugin_abflow.pyramid import Level
-from hugin_abflow.working import Grid
+from hugin_abflow.working import Border, Grid
 
 _log = logging.getLogger(__name__)
 
@@ -124,7 +124,7 @@ def lead(
     refined = flow.pair_flow(device, *images, FlowParameters(), Start(0, (rivals[0].old, rivals[1].old)))
     for one, near, result in zip(refined, nearness, flows, strict=True):
         grid = images[0].grid
-        device.run("guidance", "guidance_blend", grid[:2], one, near, grid, result)
+        device.run("guidance", "guidance_blend", grid.size, one, near, grid, result)
     return flows
 
 
@@ -234,9 +234,7 @@ def _wrong(directed: Sequence[_DirectedGuides], agreement: float) -> npt.NDArray
     return np.asarray(np.any(far, axis=0))
 
 
-def _directed(
-    grid: tuple[int, int, int, int], flows: Flows, guides: ChartGuides
-) -> tuple[_DirectedGuides, _DirectedGuides]:
+def _directed(grid: Border, flows: Flows, guides: ChartGuides) -> tuple[_DirectedGuides, _DirectedGuides]:
     moves = guides.at_b - guides.at_a
     if guides.period:  # the shorter way round
         moves[:, 0] -= guides.period * np.rint(moves[:, 0] / guides.period)
@@ -268,7 +266,7 @@ class _Springs:
 
     def at(self, level: int) -> tuple[Buffer, Buffer]:
         """Start (height, width, 2) and nearness (height, width) on a level."""
-        width, height = self._image.grid[:2]
+        width, height = self._image.grid.size
         for _ in range(level):
             width, height = (width + 1) // 2, (height + 1) // 2
         start, near = self._device.empty((height, width, 2)), self._device.empty((height, width))
@@ -287,7 +285,7 @@ class _Springs:
             return
         start, near = self.at(level)
         self._device.run(
-            "guidance", "guidance_pull", board.grid[:2], start, near, board.grid, board.pitch, strength, way,
+            "guidance", "guidance_pull", board.grid.size, start, near, board.grid, board.pitch, strength, way,
             board.planes,
         )  # fmt: skip
 
@@ -306,7 +304,7 @@ def _sigmas(guides: _DirectedGuides, period: float, parameters: GuidanceParamete
     return clipped
 
 
-def _period(grid: tuple[int, int, int, int]) -> float:
+def _period(grid: Border) -> float:
     """Px after which columns repeat; infinity: they do not."""
     width, _, wraps, _ = grid
     return width if wraps else math.inf
@@ -319,7 +317,7 @@ class _Rivals:
     feature, brought    float32 (1, height, width, 4), see kernels/flow.cl.
     """
 
-    grid: tuple[int, int, int, int]
+    grid: Border
     feature: Buffer
     old: Buffer
     new: Buffer
@@ -327,12 +325,12 @@ class _Rivals:
 
     @classmethod
     def of(
-        cls, device: Device, feature: Buffer, other: Buffer, grid: tuple[int, int, int, int],
+        cls, device: Device, feature: Buffer, other: Buffer, grid: Border,
         old: Buffer, new: Buffer,
     ) -> _Rivals:  # fmt: skip
         brought = device.empty(feature.shape), device.empty(feature.shape)
         for field, target in zip((old, new), brought, strict=True):
-            device.run("guidance", "guidance_bring", grid[:2], other, field, grid, target)
+            device.run("guidance", "guidance_bring", grid.size, other, field, grid, target)
         return cls(grid, feature, old, new, brought)
 
 
@@ -383,7 +381,7 @@ def _cost(a: npt.NDArray[np.float32], b: npt.NDArray[np.float32]) -> npt.NDArray
 
 def _choose(device: Device, rivals: _Rivals, near: Buffer, parameters: GuidanceParameters) -> None:
     """Put the new flow into the old one where it explains the images better."""
-    grid, size = rivals.grid, rivals.grid[:2]
+    grid, size = rivals.grid, rivals.grid.size
     board = Board.of(device, 1, grid)
     device.run(
         "guidance", "guidance_vote", size, rivals.feature, *rivals.brought, near, grid, board.pitch,

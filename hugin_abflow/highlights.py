@@ -77,7 +77,7 @@ def measure(
     for layer, share in zip(layers, shares, strict=True):
         found = device.empty(cells.shape)
         device.run(
-            "highlights", "highlights_share", cells.border[:2], layer.pixels, layer.box, grid.border,
+            "highlights", "highlights_share", cells.border.size, layer.pixels, layer.box, grid.border,
             cells.border, (*layer.clips_at, 1.0), _NEARLY, CLIPPED, found,
         )  # fmt: skip
         share[:] = found.get()

@@ -88,7 +88,7 @@ def mean_displacements(device: Device, layer: WorkingLayer, field: Buffer, grid:
     """
     found = device.empty((*cells.shape, 4))
     device.run(
-        "membrane", "membrane_mean", cells.border[:2],
+        "membrane", "membrane_mean", cells.border.size,
         layer.pixels, field, layer.box, grid.border, cells.border, found,
     )  # fmt: skip
     return found.get().astype(np.float64)

@@ -213,7 +213,7 @@ def _add(device: Device, level: _Level, smaller: _Level | None, total: Buffer) -
 def _join(device: Device, total: Buffer, grid: Grid, smaller: Buffer | None, coarse: Grid | None) -> None:
     """Have the sum of a level's details be that level, which the next coarser one is part of."""
     device.run(
-        "multiband", "multiband_join", grid.border[:2],
+        "multiband", "multiband_join", grid.border.size,
         total, grid.border, smaller or total, coarse.border if coarse else _NONE,
     )  # fmt: skip
 

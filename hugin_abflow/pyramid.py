@@ -13,6 +13,7 @@ from typing import TypeVar
 import numpy as np
 
 from hugin_abflow.opencl import Buffer, Device
+from hugin_abflow.working import Border
 
 _Value = TypeVar("_Value")
 
@@ -26,20 +27,20 @@ class Level:
     wraps: bool
 
     @property
-    def grid(self) -> tuple[int, int, int, int]:
-        """(width, height, wraps, 0), as the kernels take it."""
-        return self.image.shape[1], self.image.shape[0], int(self.wraps), 0
+    def grid(self) -> Border:
+        """The grid as the kernels take it."""
+        return Border(self.image.shape[1], self.image.shape[0], int(self.wraps))
 
 
 def reduce(device: Device, level: Level) -> Level:
     """The next coarser level; a pixel is valid where at least half of its weight is."""
-    width, height = level.grid[:2]
+    width, height = level.grid.size
     small = Level(
         device.empty(((height + 1) // 2, (width + 1) // 2)),
         device.empty(((height + 1) // 2, (width + 1) // 2)),
         level.wraps,
     )
-    size = small.grid[:2]
+    size = small.grid.size
     device.run(
         "pyramid", "pyramid_reduce", size, level.image, level.mask, level.grid, small.image, small.mask, size
     )
@@ -71,7 +72,7 @@ def smooth(device: Device, level: Level, sigma: float) -> Level:
     )
     for source, step, normalise, target in ((level, (1, 0), 0, rows), (rows, (0, 1), 1, columns)):
         device.run(
-            "pyramid", "pyramid_smooth", grid[:2], source.image, source.mask, grid, step, taps, radius,
+            "pyramid", "pyramid_smooth", grid.size, source.image, source.mask, grid, step, taps, radius,
             normalise, target.image, target.mask,
         )  # fmt: skip
     return columns

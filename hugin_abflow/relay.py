@@ -219,10 +219,10 @@ def _take(device: Device, flow: _DirectedFlow, total: Buffer, own_weight: float,
     grid = flow.chart.border
     if held is not None and len(held):
         device.run(
-            "relay", "relay_hold", grid[:2], device.upload(held, np.float32), len(held),
+            "relay", "relay_hold", grid.size, device.upload(held, np.float32), len(held),
             _HELD / flow.chart.coarse, _AGREES, flow.forward, grid, total,
         )  # fmt: skip
-    device.run("relay", "relay_take", grid[:2], total, grid, _SURE, _AGREES, own_weight, flow.forward)
+    device.run("relay", "relay_take", grid.size, total, grid, _SURE, _AGREES, own_weight, flow.forward)
 
 
 def _legs(key: Key, via: int, reliability: dict[Key, float]) -> float:

@@ -276,7 +276,7 @@ def _shown(scene: Scene, cells: Grid) -> npt.NDArray[np.bool_]:
     inside, shown = cover.copy(), device.empty(cells.shape, np.uint8)
     for layer, field, one in zip(scene.layers, scene.fields, inside, strict=True):
         device.run(
-            "seam", "seam_shown", cells.border[:2],
+            "seam", "seam_shown", cells.border.size,
             layer.pixels, field, layer.box, grid.border, grid.lonlat, cells.border, shown,
         )  # fmt: skip
         one &= shown.get() > 0
@@ -292,7 +292,7 @@ def _weights(scene: Scene, cells: Grid) -> npt.NDArray[np.float64]:
     weights, found = np.empty((len(scene.layers), *cells.shape)), device.empty(cells.shape)
     for layer, field, one in zip(scene.layers, scene.fields, weights, strict=True):
         device.run(
-            "seam", "seam_weights", cells.border[:2], field, layer.box, rows, columns, cells.border, found
+            "seam", "seam_weights", cells.border.size, field, layer.box, rows, columns, cells.border, found
         )
         one[:] = found.get()
     return weights

@@ -16,8 +16,7 @@ import numpy as np
 
 from hugin_abflow.opencl import Buffer, Device
 from hugin_abflow.pyramid import on_level
-
-Grid = tuple[int, int, int, int]  # (width, height, wraps, 0), as the kernels take it
+from hugin_abflow.working import Border
 
 # SEARCH_MARGIN of kernels/search.cl.
 _MARGIN = 16
@@ -82,39 +81,39 @@ class SearchParameters:
             raise ValueError(f"furthest is {self.furthest}; descriptors have a margin of {_MARGIN}")
 
 
-def descriptor(device: Device, feature: Buffer, grid: Grid, parameters: SearchParameters) -> Buffer:
+def descriptor(device: Device, feature: Buffer, grid: Border, parameters: SearchParameters) -> Buffer:
     """Descriptors float32 (height, 4, columns) of one image's features (height, width, 4): see
     kernels/search.cl.
     """
-    single, wide = device.empty(feature.shape), _pitch(grid) + 2 * _MARGIN
-    energy = device.empty((grid[1], grid[0], 2))
-    device.run("search", "search_energy", grid[:2], feature, grid, energy)
-    device.run("search", "search_descriptor", grid[:2], feature, energy, grid, parameters.noise, single)
-    result = device.empty((grid[1], 4, wide))
-    device.run("search", "search_planes", (wide, grid[1]), single, grid, wide, result)
+    single, wide = device.empty(feature.shape), _pitch(grid.width) + 2 * _MARGIN
+    energy = device.empty((grid.height, grid.width, 2))
+    device.run("search", "search_energy", grid.size, feature, grid, energy)
+    device.run("search", "search_descriptor", grid.size, feature, energy, grid, parameters.noise, single)
+    result = device.empty((grid.height, 4, wide))
+    device.run("search", "search_planes", (wide, grid.height), single, grid, wide, result)
     return result
 
 
-def _pitch(grid: Grid) -> int:
+def _pitch(width: int) -> int:
     """Columns of costs, and of descriptors without margins: what is read eight at a time, from up to two
     columns further on, ends within them.
     """
-    return _CHUNK * (-(-grid[0] // _CHUNK) + 1)
+    return _CHUNK * (-(-width // _CHUNK) + 1)
 
 
 def filtered(
-    device: Device, flow: Buffer, grid: Grid, result: Buffer, first: int = 0, ways: int = 1
+    device: Device, flow: Buffer, grid: Border, result: Buffer, first: int = 0, ways: int = 1
 ) -> Buffer:
     """`result`, filled with the median of `flow`: both float32 (height, width, 2), or several of these, of
     which `ways` are filtered from `first` on.
     """
-    chunks = (-(-grid[0] // _MEDIAN_CHUNK), grid[1], ways)
+    chunks = (-(-grid.width // _MEDIAN_CHUNK), grid.height, ways)
     device.run("flow", "flow_median", chunks, flow, grid, first, result)
     return result
 
 
 def reaches(
-    reach: float, levels: int, grid: Grid, parameters: SearchParameters, finest: int = 0
+    reach: float, levels: int, grid: Border, parameters: SearchParameters, finest: int = 0
 ) -> dict[int, int]:
     """On which levels, of `levels`, how many of their px are tried, for motion of up to `reach` px of the
     finest; none but the first is finer than `finest`.
@@ -141,21 +140,21 @@ def reaches(
     return result
 
 
-def _room(level: int, largest: int, grid: Grid) -> int:
+def _room(level: int, largest: int, grid: Border) -> int:
     """Bytes that `exhaustive` takes for costs on a level, where so many of its px are tried.
 
     grid    of the finest level.
     """
-    width, height = (-(-side // (1 << level)) for side in grid[:2])
-    return 2 * 4 * height * (2 * largest + 1) ** 2 * _pitch((width, height, 0, 0))
+    width, height = (-(-side // (1 << level)) for side in grid.size)
+    return 2 * 4 * height * (2 * largest + 1) ** 2 * _pitch(width)
 
 
-def _enough_room(grid: Grid) -> int:
+def _enough_room(grid: Border) -> int:
     """Bytes that costs may take as long as there are coarser levels."""
-    return max(_ROOM * grid[0] * grid[1], _LEAST_ROOM)
+    return max(_ROOM * grid.width * grid.height, _LEAST_ROOM)
 
 
-def most_room(reach: float, levels: int, grid: Grid, parameters: SearchParameters, finest: int = 0) -> int:
+def most_room(reach: float, levels: int, grid: Border, parameters: SearchParameters, finest: int = 0) -> int:
     """Bytes that `exhaustive` takes for costs, at most, on the levels of `reaches`: for motion of up to
     `reach` px, or of any less.
     """
@@ -168,18 +167,18 @@ def most_room(reach: float, levels: int, grid: Grid, parameters: SearchParameter
 
 
 def exhaustive(
-    device: Device, a: Buffer, b: Buffer, flows: Sequence[Buffer], grid: Grid, largest: int,
+    device: Device, a: Buffer, b: Buffer, flows: Sequence[Buffer], grid: Border, largest: int,
     parameters: SearchParameters,
 ) -> list[Buffer]:  # fmt: skip
     """Both directions' flow: what is found within `largest` px and beyond doubt, elsewhere `flows`.
 
     a, b: descriptors; flows, from a to b and from b to a, and the result: float32 (height, width, 2), px.
     """
-    size = grid[:2]
+    size = grid.size
     reach = min(largest, size[0] // 2), min(largest, size[1] // 2)
     count = (2 * reach[0] + 1) * (2 * reach[1] + 1)
     # one way after the other in the same memory
-    room = [device.empty((grid[1], count, _pitch(grid))) for _ in range(2)]
+    room = [device.empty((grid.height, count, _pitch(grid.width))) for _ in range(2)]
     found, distinct = [], []
     for here, there, flow in ((a, b, flows[0]), (b, a, flows[1])):
         cost = costs(device, here, there, grid, reach, parameters.outside, room)
@@ -199,7 +198,7 @@ def exhaustive(
 
 
 def costs(
-    device: Device, a: Buffer, b: Buffer, grid: Grid, reach: tuple[int, int], outside: float,
+    device: Device, a: Buffer, b: Buffer, grid: Border, reach: tuple[int, int], outside: float,
     room: Sequence[Buffer],
 ) -> Buffer:  # fmt: skip
     """What displacements within reach cost, from a to b: float32 (height, displacements, columns), of which
@@ -207,7 +206,7 @@ def costs(
 
     a, b: descriptors; outside: the cost of what the other image does not show.
     """
-    width, height = grid[:2]
+    width, height = grid.size
     pixel_cost, cost = room
     count, pitch = cost.shape[1:]
     device.run(
@@ -220,17 +219,17 @@ def costs(
 
 
 def _coupled(
-    device: Device, cost: Buffer, flow: Buffer, grid: Grid, reach: tuple[int, int],
+    device: Device, cost: Buffer, flow: Buffer, grid: Border, reach: tuple[int, int],
     parameters: SearchParameters,
 ) -> Buffer:  # fmt: skip
     """The displacements of least cost, ever less free to differ from `flow`, then from their own mean."""
-    chunks = (-(-grid[0] // _CHUNK) * grid[1],)
+    chunks = (-(-grid.width // _CHUNK) * grid.height,)
     smooth, best, median = (device.empty(flow.shape) for _ in range(3))
     for turn, coupling in enumerate(parameters.couplings):
         if turn:
             for _ in range(2):
                 best, median = filtered(device, best, grid, median), best
-            device.run("search", "search_mean", grid[:2], best, grid, smooth)
+            device.run("search", "search_mean", grid.size, best, grid, smooth)
         device.run(
             "search", "search_best", chunks, cost, smooth if turn else flow, grid, reach, coupling,
             cost.shape[2], best,
@@ -239,7 +238,7 @@ def _coupled(
 
 
 def choose(
-    device: Device, a: Buffer, b: Buffer, flow: Buffer, other: Buffer, grid: Grid, level: int,
+    device: Device, a: Buffer, b: Buffer, flow: Buffer, other: Buffer, grid: Border, level: int,
     parameters: SearchParameters,
 ) -> Buffer:  # fmt: skip
     """`flow` from a to b, with flow from beside or of `other` where that fits better.
@@ -250,7 +249,7 @@ def choose(
     for step in on_level(parameters.steps, level):
         chosen = device.empty(flow.shape)
         device.run(
-            "search", "search_choose", grid[:2], a, b, flow, other, grid, a.shape[2], step, radius,
+            "search", "search_choose", grid.size, a, b, flow, other, grid, a.shape[2], step, radius,
             parameters.focus, (parameters.own_outside, parameters.other_outside), parameters.patience, chosen,
         )  # fmt: skip
         flow = other = chosen
@@ -258,7 +257,7 @@ def choose(
 
 
 def adopt(
-    device: Device, a: Buffer, b: Buffer, trusted: Buffer, grid: Grid, parameters: SearchParameters
+    device: Device, a: Buffer, b: Buffer, trusted: Buffer, grid: Border, parameters: SearchParameters
 ) -> Buffer:
     """`trusted`, float32 (height, width, 4), with the flow of what is trusted around where it is not and that
     fits: flow from a to b in px, trust 0..1, and something that stays.
@@ -269,7 +268,7 @@ def adopt(
     for step in parameters.adopted_steps:
         adopted = device.empty(trusted.shape)
         device.run(
-            "search", "search_adopt", grid[:2], a, b, trusted, grid, a.shape[2], step, parameters.radius[0],
+            "search", "search_adopt", grid.size, a, b, trusted, grid, a.shape[2], step, parameters.radius[0],
             parameters.focus, outside, parameters.adopted_patience, parameters.adopted_misfit,
             parameters.adopted_trust, adopted,
         )  # fmt: skip

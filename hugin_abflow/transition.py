@@ -129,8 +129,8 @@ def minimise_strain(
                 relax(device, finer, system, depth, _DEEPER_SWEEPS)
         else:
             device.run(
-                "transition", "transition_refine", cells.border[:2], shares.share, shares.first, shares.owner,
-                shares.cells.border, finer.first, finer.owner, cells.border, finer.share,
+                "transition", "transition_refine", cells.border.size, shares.share, shares.first,
+                shares.owner, shares.cells.border, finer.first, finer.owner, cells.border, finer.share,
             )  # fmt: skip
         shares = finer
         relax(device, shares, system, 1.0, _SWEEPS)
@@ -168,7 +168,7 @@ def _prices(
     for flow in flows:
         chart = flow.chart
         device.run(
-            "transition", "transition_parallax", cells.border[:2], flow.forward, flow.backward,
+            "transition", "transition_parallax", cells.border.size, flow.forward, flow.backward,
             chart.border, chart.transform, masks.buffers[flow.a],
             masks.buffers[flow.b], masks.grid.border, *textures[flow.a], *textures[flow.b],
             grid.border, grid.lonlat, cells.border, parallax, strain,

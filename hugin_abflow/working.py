@@ -13,7 +13,7 @@ import threading
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
-from typing import Any, TypeVar
+from typing import Any, NamedTuple, TypeVar
 from zlib import crc32
 
 import cv2
@@ -57,6 +57,20 @@ Place = tuple[int, int, int, int]  # left, top, width, height on a grid
 _Kind = TypeVar("_Kind", bound=np.generic)
 
 
+class Border(NamedTuple):
+    """A grid's size and border rules, as the kernels take them (kernels/common.cl); poles: as `Grid` has."""
+
+    width: int
+    height: int
+    wraps: int
+    poles: int = 0
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """(width, height), as kernels are run."""
+        return self.width, self.height
+
+
 @dataclass(frozen=True)
 class Grid:
     """A pixel grid over the region.
@@ -84,9 +98,9 @@ class Grid:
         return self.height, self.width
 
     @property
-    def border(self) -> tuple[int, int, int, int]:
-        """Grid as the kernels take it: (width, height, wraps, poles)."""
-        return self.width, self.height, int(self.wraps), self.poles
+    def border(self) -> Border:
+        """The grid as the kernels take it."""
+        return Border(self.width, self.height, int(self.wraps), self.poles)
 
     @property
     def spherical(self) -> bool:

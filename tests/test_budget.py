@@ -15,6 +15,7 @@ from hugin_abflow.budget import Work
 from hugin_abflow.errors import SettingsError
 from hugin_abflow.layer import Canvas, Layer
 from hugin_abflow.settings import Settings
+from hugin_abflow.working import Border
 
 CANVAS = Canvas.plane(301, 151)
 CELLS = SimpleNamespace(width=100, height=80)
@@ -40,7 +41,7 @@ def small(monkeypatch: pytest.MonkeyPatch) -> None:
 def work(sizes: Sequence[int], cut: int = 0, **settings: Any) -> Work:
     """On charts of so many pixels, which are not refined. cut: how many layers are."""
     charts: Any = [
-        SimpleNamespace(width=pixels, height=1, coarse=1, border=(pixels, 1, 0, 0)) for pixels in sizes
+        SimpleNamespace(width=pixels, height=1, coarse=1, border=Border(pixels, 1, 0)) for pixels in sizes
     ]
     grid: Any = SimpleNamespace(width=1000, height=1000, coarser=lambda by: CELLS)
     return Work(charts, grid, Settings(flow_quality="fast", large_motion="off", **settings), cut, 0.5)

@@ -17,14 +17,15 @@ from hugin_abflow.flow import Board
 from hugin_abflow.opencl import Device
 from hugin_abflow.pyramid import Level
 from hugin_abflow.settings import MOST_WORKING_PIXELS
+from hugin_abflow.working import Border
 
-GRIDS = {"plane": (77, 53, 0, 0), "cylinder": (78, 53, 1, 0), "odd cylinder": (77, 53, 1, 0)}
+GRIDS = {"plane": Border(77, 53, 0), "cylinder": Border(78, 53, 1), "odd cylinder": Border(77, 53, 1)}
 
 
 def run_expand(device: Device, coarse: np.ndarray, wraps: int, size: tuple[int, int]) -> np.ndarray:
     height, width = coarse.shape[:2]
     fine = device.empty((2, size[1], size[0], 2))
-    grid = (width, height, wraps, 0)
+    grid = Border(width, height, wraps)
     ways = device.upload(np.stack([0 * coarse, coarse]).astype(np.float32))
     device.run("flow", "flow_expand", (*size, 2), ways, grid, fine, size)
     assert not fine.get()[0].any()
@@ -233,7 +234,7 @@ def test_twin_of_tensor_is_the_energys_curvature() -> None:
 
 @pytest.mark.parametrize("wraps", [0, 1])
 def test_twin_of_window_is_scipys(wraps: int) -> None:
-    grid = (77, 53, wraps, 0)
+    grid = Border(77, 53, wraps)
     values = np.random.default_rng(30).normal(size=(53, 77, 4))
     taps = np.outer([1, 2, 1], [1, 2, 1]) / 16
     window, right = twin.flow_window(values, values[..., :2], grid)
@@ -280,7 +281,7 @@ def test_system_equals_its_twin(device: Device, name: str) -> None:
 
 def test_pixels_that_nothing_holds_stay(device: Device) -> None:
     """A single pixel without data."""
-    board = board_of(device, (1, 1, 0, 0), {tuple(FLOW): np.array([[[3.0, -4.0]]])})
+    board = board_of(device, Border(1, 1, 0), {tuple(FLOW): np.array([[[3.0, -4.0]]])})
     run(device, "flow_system", board, board.options, 12.0, 0.3)
     board.relax(device, 3, 1.85)
     assert np.array_equal(on_board(board, FLOW), [[[3, -4]]])
@@ -327,7 +328,7 @@ def dense_solution(left_side: np.ndarray, right_side: np.ndarray, wraps: bool) -
 @pytest.mark.parametrize("wraps", [0, 1])
 def test_relaxation_solves_the_system(device: Device, wraps: int) -> None:
     """Twin and kernel, iterated, come to the solution of dense algebra."""
-    grid = (18, 13, wraps, 0)
+    grid = Border(18, 13, wraps)
     tensor, right, moved, feature = system_of(grid, 43)
     sides = twin.flow_system(tensor, right, moved, feature, grid, 0.02, 0.3)
     expected = dense_solution(*sides, bool(wraps))
@@ -362,7 +363,7 @@ def test_relax_equals_its_twin(device: Device, name: str, colour: int) -> None:
 
 
 @pytest.mark.parametrize("group", [(1, 1), (8, 3), (2, 32)])
-@pytest.mark.parametrize("grid", [(77, 53, 0, 0), (16, 5, 1, 0), (129, 3, 0, 0)])
+@pytest.mark.parametrize("grid", [Border(77, 53, 0), Border(16, 5, 1), Border(129, 3, 0)])
 def test_one_work_group_sweeps_as_its_twin(
     device: Device, grid: tuple[int, int, int, int], group: tuple[int, int]
 ) -> None:
@@ -392,7 +393,7 @@ def test_graphics_cards_relax_small_boards_at_once(
     monkeypatch.setattr(device, "repeat", lambda *args: started.append(args[1]))
     monkeypatch.setattr(device, "run", lambda *args, **_: started.append(args[1]))
     for width in (128, 129):
-        Board.of(device, 1, (width, 128, 0, 0)).relax(device, 2, 1.5)
+        Board.of(device, 1, Border(width, 128, 0)).relax(device, 2, 1.5)
     assert started == ["flow_relax_small" if kind == "GPU" else "flow_relax", "flow_relax"]
 
 
@@ -403,7 +404,7 @@ def test_the_largest_board_is_counted_in_32_bits(
     """Its shape alone: nothing of it is made."""
     asked = list[tuple[int, ...]]()
     monkeypatch.setattr(device, "zeros", asked.append)
-    Board.of(device, 1, (MOST_WORKING_PIXELS // height, height, 0, 0))
+    Board.of(device, 1, Border(MOST_WORKING_PIXELS // height, height, 0))
     assert 1.9e9 < math.prod(asked[0]) <= np.iinfo(np.int32).max
 
 

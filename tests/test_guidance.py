@@ -20,8 +20,9 @@ from hugin_abflow import flow, guidance
 from hugin_abflow.flow import Board
 from hugin_abflow.guidance import ChartGuides, GuidanceParameters
 from hugin_abflow.opencl import Device
+from hugin_abflow.working import Border
 
-GRIDS = {"plane": (77, 53, 0, 0), "cylinder": (78, 53, 1, 0), "odd cylinder": (77, 53, 1, 0)}
+GRIDS = {"plane": Border(77, 53, 0), "cylinder": Border(78, 53, 1), "odd cylinder": Border(77, 53, 1)}
 
 
 @pytest.fixture(autouse=True)
@@ -54,7 +55,7 @@ def test_start_equals_its_twin(device: Device, name: str, scale: int) -> None:
 @pytest.mark.parametrize("width", [64, 65, 66, 67])
 def test_flow_starts_as_it_was_found_up_to_the_rim(device: Device, width: int) -> None:
     """A coarse level's last pixels may lie beyond the chart."""
-    grid, size = (width, 33, 0, 0), (-(-width // 8), 5)
+    grid, size = Border(width, 33, 0), (-(-width // 8), 5)
     found = device.upload(np.full((33, width, 2), 24, np.float32))
     guide, sigma = device.upload(np.zeros((1, 4), np.float32)), device.upload(np.ones(1, np.float32))
     start, near = device.empty((size[1], size[0], 2)), device.empty((size[1], size[0]))
@@ -64,7 +65,7 @@ def test_flow_starts_as_it_was_found_up_to_the_rim(device: Device, width: int) -
 
 def test_twin_of_start_by_hand() -> None:
     """At a guide all of its residual, far away none, around the border of a cylinder too."""
-    grid = (80, 60, 1, 0)
+    grid = Border(80, 60, 1)
     found = np.full((60, 80, 2), 0.5)
     start, near = twin.guidance_start(
         found, grid, np.array([[0.5, 30.5, 8.0, -6.0]]), np.array([5.0]), 1, (80, 60)
@@ -134,7 +135,7 @@ def test_costs_on_the_host_are_those_of_the_vote() -> None:
 
 def test_twin_of_vote_is_a_weighted_mean() -> None:
     """Right over left is each pixel's own opinion: -1 far off, 1 at a guide, evidence in between."""
-    grid = (5, 1, 0, 0)
+    grid = Border(5, 1, 0)
     feature = np.zeros((1, 5, 4))
     feature[..., 3] = 1
     old, new = feature.copy(), feature.copy()

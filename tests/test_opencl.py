@@ -18,6 +18,7 @@ import pytest
 from hugin_abflow import flow, opencl, spare, working
 from hugin_abflow.errors import DeviceError
 from hugin_abflow.opencl import Device, kernel_source
+from hugin_abflow.working import Border
 
 KERNELS = Path(__file__).parent.parent / "kernels"
 # files that are no module's own, but in front of one, or of all
@@ -115,7 +116,7 @@ def test_quotients_are_rounded_as_processors_do_where_devices_can(
 def test_the_largest_group_of_a_kernel_can_be_started(device: Device) -> None:
     most = device.largest_group("flow", "flow_relax_small")
     assert 0 < most <= device.device.max_work_group_size
-    board = flow.Board.of(device, 1, (5, 3, 0, 0))
+    board = flow.Board.of(device, 1, Border(5, 3, 0))
     device.run(
         "flow", "flow_relax_small", (most, 1, 1), board.grid, board.pitch, 1, 1.5, board.planes, group=most
     )

@@ -17,8 +17,9 @@ from tolerances import DECISIONS, SUM, TRIGONOMETRY, assert_close
 from hugin_abflow import search
 from hugin_abflow.opencl import Buffer, Device
 from hugin_abflow.search import SearchParameters
+from hugin_abflow.working import Border
 
-GRIDS = {"plane": (37, 23, 0, 0), "cylinder": (38, 23, 1, 0), "odd cylinder": (37, 23, 1, 0)}
+GRIDS = {"plane": Border(37, 23, 0), "cylinder": Border(38, 23, 1), "odd cylinder": Border(37, 23, 1)}
 REACH = (4, 3)
 
 
@@ -51,9 +52,9 @@ def run(device: Device, name: str, grid: tuple[int, int, int, int], *arguments: 
     return out.get()
 
 
-def planes(device: Device, descriptor: np.ndarray, grid: tuple[int, int, int, int]) -> Buffer:
+def planes(device: Device, descriptor: np.ndarray, grid: Border) -> Buffer:
     """Descriptors as kernels take them."""
-    wide = search._pitch(grid) + 2 * search._MARGIN
+    wide = search._pitch(grid.width) + 2 * search._MARGIN
     target = device.empty((grid[1], 4, wide))
     device.run(
         "search", "search_planes", (wide, grid[1]), device.upload(descriptor, np.float32), grid, wide, target
@@ -108,7 +109,7 @@ def test_costs_equal_their_twin(device: Device, name: str) -> None:
     grid = GRIDS[name]
     a, b = descriptors(5, grid)
     sent = planes(device, a, grid), planes(device, b, grid)
-    room = [device.empty((grid[1], 63, search._pitch(grid))) for _ in range(2)]
+    room = [device.empty((grid[1], 63, search._pitch(grid.width))) for _ in range(2)]
     cost = search.costs(device, *sent, grid, REACH, 0.5, room).get()
     assert_close(np.moveaxis(cost[..., : grid[0]], 1, 0), twin.costs(a, b, grid, REACH, 0.5), SUM)
 
@@ -179,7 +180,7 @@ def test_best_tries_all_that_could_be(
     """Wherever flow is, within reach or beyond, and however it differs among those that are tried together:
     what is found costs what the best of all does.
     """
-    rng, grid = np.random.default_rng(seed), (width, height, 0, 0)
+    rng, grid = np.random.default_rng(seed), Border(width, height, 0)
     count = (2 * reach[0] + 1) * (2 * reach[1] + 1)
     cost = rng.random((count, height, width)) * (rng.random((count, height, width)) >= zeros)
     cost = cost.astype(np.float32)
@@ -258,7 +259,7 @@ def test_distinct_and_agree_equal_their_twins(device: Device, name: str) -> None
 
 def test_agree_refuses_what_repeats(device: Device) -> None:
     """A pattern that repeats within reach says nothing: the flow before stays."""
-    grid = (40, 24, 1, 0)
+    grid = Border(40, 24, 1)
     x, y = common.pixels(40, 24)
     waves = [np.sin(2 * np.pi * (x + shift) / 4) * np.cos(y / 2.0) for shift in (0, 1, 2)]
     image = np.stack([*waves, np.ones(x.shape)], -1).astype(np.float32)
@@ -307,7 +308,7 @@ def test_adopt_equals_its_twin(device: Device, name: str, step: int, radius: int
 @pytest.mark.parametrize("by", [(0.5, 0.0), (0.0, 0.5), (-0.5, -0.5)])
 def test_windows_end_where_the_images_do(device: Device, by: tuple[float, float]) -> None:
     """What lies beyond is not known, and no pixel of the next row."""
-    grid = (37, 23, 0, 0)
+    grid = Border(37, 23, 0)
     a, b = descriptors(125, grid)
     a[..., 3] = b[..., 3] = 1
     b[:, :3], b[:3] = 9, -9  # what would be read for it
@@ -329,7 +330,7 @@ def test_windows_lie_wherever_flow_leads(
     device: Device, width: int, height: int, wraps: bool, radius: int, seed: int, far: float, t: float
 ) -> None:
     """Half beyond a border, far beyond both margins, or several times around a cylinder."""
-    rng, grid = np.random.default_rng(seed), (width, height, int(wraps), 0)
+    rng, grid = np.random.default_rng(seed), Border(width, height, int(wraps))
     a, b = (rng.normal(size=(height, width, 4)).astype(np.float32) for _ in range(2))
     for image in (a, b):
         image[..., 3] = rng.random((height, width)) < 0.9
@@ -360,7 +361,7 @@ def test_twin_of_window_by_hand() -> None:
 
 def test_levels_of_the_search(monkeypatch: pytest.MonkeyPatch) -> None:
     """The finest on which reach is at most 9 px, or the coarsest there is, and the one below it."""
-    how, grid = search.SearchParameters(coarse=9.0, furthest=(10, 7)), (120, 90, 0, 0)
+    how, grid = search.SearchParameters(coarse=9.0, furthest=(10, 7)), Border(120, 90, 0)
     assert search.reaches(0, 6, grid, how) == {}
     assert search.reaches(9, 6, grid, how) == {0: 9}
     assert search.reaches(9.1, 6, grid, how) == {1: 5, 0: 7}
@@ -369,7 +370,7 @@ def test_levels_of_the_search(monkeypatch: pytest.MonkeyPatch) -> None:
     assert search.reaches(18, 6, grid, how, finest=1) == {1: 9}
     assert search.reaches(3, 6, grid, how, finest=1) == {0: 3}
     monkeypatch.setattr(search, "_LEAST_ROOM", 0)  # as of charts that take more
-    grid = (1200, 900, 0, 0)
+    grid = Border(1200, 900, 0)
     assert search.reaches(9, 6, grid, how) == {2: 3}
     assert search.reaches(40, 6, grid, how) == {3: 5, 2: 7}
     assert search.reaches(200, 1, grid, how) == {0: 10}
@@ -383,7 +384,7 @@ def test_no_search_takes_more_room_than_is_reckoned(
     reach: float, part: float, levels: int, width: int, height: int, finest: int
 ) -> None:
     """However much less motion there is."""
-    how, grid = search.SearchParameters(), (width, height, 0, 0)
+    how, grid = search.SearchParameters(), Border(width, height, 0)
     tried = search.reaches(part * reach, levels, grid, how, finest)
     assert max(
         (search._room(level, most, grid) for level, most in tried.items()), default=0

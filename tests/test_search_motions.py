@@ -14,6 +14,7 @@ from hugin_abflow.flow import FlowParameters
 from hugin_abflow.opencl import Buffer, Device
 from hugin_abflow.pyramid import Level
 from hugin_abflow.settings import LargeMotion
+from hugin_abflow.working import Border
 
 
 def texture(seed: int, width: int, height: int) -> np.ndarray:
@@ -194,7 +195,8 @@ def test_small_overlaps_of_a_large_chart_take_no_more_memory_than_is_reckoned(
     above = y < x * 217 / 371
     a, b = (on_device(device, brightness, (mask | spots).astype(float)) for mask in (above, ~above))
     flow.solve(device, a, b, parameters, reach=60)
-    assert 0 < max(taken) <= flow.search_room(60, (371, 217, 0, 0), parameters) < 200 * 371 * 217 + (1 << 20)
+    grid = Border(371, 217, 0)
+    assert 0 < max(taken) <= flow.search_room(60, grid, parameters) < 200 * 371 * 217 + (1 << 20)
     taken.clear()
     flow.solve(device, a, a, parameters, reach=60)  # all of it
-    assert 0 < max(taken) <= flow.search_room(60, (371, 217, 0, 0), parameters)
+    assert 0 < max(taken) <= flow.search_room(60, grid, parameters)
