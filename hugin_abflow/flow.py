@@ -9,7 +9,7 @@ large for that comes from search.py.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -347,13 +347,9 @@ def solve(
     """
     parameters = parameters or FlowParameters()
     count = start.level + 1 if start else levels(a.grid, parameters)
-    reach = parameters.reach * max(a.grid.size) if reach is None else reach
-    searched: dict[int, int] = {}
-    if reach > 0 and not start:
-        common = np.count_nonzero(a.mask.get() * b.mask.get())
-        reach = min(reach, parameters.overlap * math.sqrt(common))
-        searched = search.reaches(reach, count, a.grid, parameters.search, finest=parameters.decide_on)
+    searched = {} if start else _searched(a, b, count, reach, parameters)
     pyramids = [pyramid.build(device, image, count + 1) for image in (a, b)]
+    pulls = start.pulls if start else (None, None)
     refused: list[Refused] = []
     flows: list[Buffer] = []  # without what a search found, and with it, as long as both may be taken
     for level in reversed(range(count)):
@@ -361,22 +357,49 @@ def solve(
         grid = pyramids[0][level].grid
         if flows:
             flows = [_expand(device, one, grid) for one in flows]
+        elif start:
+            flows = [_stacked(device, start.flows)]
         else:
-            its_size = 2, grid.height, grid.width, 2
-            flows = [_stacked(device, start.flows) if start else device.zeros(its_size)]
-        always = parameters.search.always and level <= max(searched, default=-1)
-        followed = always or len(flows) > 1
-        if level in searched or (followed and level >= parameters.choose_from):
-            its_reach = searched.get(level, 0)
-            chosen = _choose(device, features, flows[-1], grid, level, its_reach, parameters)
-            flows = [chosen] if always else [flows[0], chosen]
-        pulls = start.pulls if start else (None, None)
+            flows = [device.zeros((2, grid.height, grid.width, 2))]
+        flows = _with_found(device, features, flows, grid, level, searched, parameters)
         flows = [_refine(device, features, one, grid, level, parameters, pulls) for one in flows]
         if len(flows) > 1:
             flows, dropped = _decide(device, features, flows, grid, level, bearings, parameters)
             refused += dropped
     forward, backward = _unstacked(device, flows[0])
     return Solution(forward, backward, tuple(refused))
+
+
+def _searched(
+    a: Level, b: Level, count: int, reach: float | None, parameters: FlowParameters
+) -> dict[int, int]:
+    """On which of `count` levels how many of their px are tried (`search.reaches`); reach: of `solve`."""
+    reach = parameters.reach * max(a.grid.size) if reach is None else reach
+    if reach <= 0:
+        return {}
+    common = np.count_nonzero(a.mask.get() * b.mask.get())
+    reach = min(reach, parameters.overlap * math.sqrt(common))
+    return search.reaches(reach, count, a.grid, parameters.search, finest=parameters.decide_on)
+
+
+def _with_found(
+    device: Device,
+    features: Buffer,
+    flows: list[Buffer],
+    grid: Border,
+    level: int,
+    searched: Mapping[int, int],
+    parameters: FlowParameters,
+) -> list[Buffer]:
+    """The flows with which a level starts: beside that without a search, or in its place if what is found is
+    always kept, that with what is found on this level or was on coarser ones.
+    """
+    always = parameters.search.always and level <= max(searched, default=-1)
+    followed = (always or len(flows) > 1) and level >= parameters.choose_from
+    if level not in searched and not followed:
+        return flows
+    chosen = _choose(device, features, flows[-1], grid, level, searched.get(level, 0), parameters)
+    return [chosen] if always else [flows[0], chosen]
 
 
 def refine(
