@@ -216,27 +216,40 @@ def _bands(
             top, bottom = coarse_rows((0, 0, grid.width, grid.height), part, grid.row_height)
             read = places[0][places[0][:, 3] > 0]
             hidden.mark(device, fields.values, read, (0, top, grid.width, bottom - top), share)
-            used = np.flatnonzero(band.samples)
-            table = np.zeros(used.size, _LAYER)
-            for row, k in zip(table, used, strict=True):
-                box, ring, (start, end) = layers[k].layer.box, store.shelves.rings[k], band.rows[k]
-                row["place"] = box.left - region.left, box.top - region.top + start, box.width, end - start
-                row["rows"], row["ring"], row["turn"] = ring.start, ring.rows, start % ring.rows
-            for name, its_places in zip(("field", "gain", "offset"), places, strict=True):
-                table[name], table[name + "s"] = its_places[used, :4], its_places[used, 4]
-            touched = device.upload(table)
+            touched = device.upload(_table(layers, band, store.shelves, places, region))
             marks = _mark(device, store.rows, touched, fields.values, full, grid, part, options)
             latitudes = _sines_cosines(device, full.lonlat[2], -full.lonlat[3], part.top, part.height)
             out = device.empty((part.height, part.width, first.channels + 1), device_dtype(first))
             device.run(
-                "blend", "blend_band", groups, store.rows, touched, used.size, fields.values, gains.values,
-                offsets.values, longitudes, latitudes, full.border, full.lonlat, grid.border,
+                "blend", "blend_band", groups, store.rows, touched, touched.shape[0], fields.values,
+                gains.values, offsets.values, longitudes, latitudes, full.border, full.lonlat, grid.border,
                 prepared.gain_grid.border, prepared.offset_grid.border, (part.left, part.top, *size),
                 (region.left, region.top), prepared.shoulder, math.sqrt(prepared.light_unit),
                 int(settings.interpolation == "nearest"), share, marks, marks.shape[-1],
                 carried, strips, out, options=options,
             )  # fmt: skip
             yield _stored(out.get(), first.dtype)
+
+
+def _table(
+    layers: Sequence[BlendLayer],
+    band: Band,
+    shelves: _Shelves,
+    places: Sequence[npt.NDArray[np.int32]],
+    region: Box,
+) -> npt.NDArray[Any]:
+    """The layers that a band samples, as blend.cl takes them. places: of their fields, gains and offsets
+    (`Slices.take`).
+    """
+    used = np.flatnonzero(band.samples)
+    table = np.zeros(used.size, _LAYER)
+    for row, k in zip(table, used.tolist(), strict=True):
+        box, ring, (start, end) = layers[k].layer.box, shelves.rings[k], band.rows[k]
+        row["place"] = box.left - region.left, box.top - region.top + start, box.width, end - start
+        row["rows"], row["ring"], row["turn"] = ring.start, ring.rows, start % ring.rows
+    for name, its_places in zip(("field", "gain", "offset"), places, strict=True):
+        table[name], table[name + "s"] = its_places[used, :4], its_places[used, 4]
+    return table
 
 
 def _stored(values: npt.NDArray[Any], dtype: np.dtype[Any]) -> npt.NDArray[Any]:
