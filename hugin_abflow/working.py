@@ -210,9 +210,11 @@ def connected(mask: npt.NDArray[np.bool_], wraps: bool) -> npt.NDArray[np.int32]
 
 @dataclass(frozen=True)
 class WorkingLayer:
-    """A layer on the working grid: pixels float32 (height, width, 4), r, g, b (full scale is 1) and valid.
+    """A layer on the working grid.
 
     box         its place on the grid.
+    pixels      float32 (height, width, 4), r, g, b (full scale is 1) and valid. Of floats light as it is
+                stored, up to unit.py, which codes it in place: all that follows sees it coded.
     checksum    of the stored pixels: tells layers of one size and place apart.
     white       r, g, b of what is clipped, of full scale; None: of integers that, of floats nothing.
     """
