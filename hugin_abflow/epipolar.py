@@ -20,8 +20,12 @@ _FITS = tuple(np.geomspace(0.2, 0.005, 20).tolist())
 _NO_MOTION = 1e-6
 # Fewer points than this say nothing about the move.
 _LEAST = 200
-# More points than this, or about twice as many, say no more.
-_MOST = 20_000
+# Radians by which well aligned photos are turned against each other at most, a sixth of a degree, and the
+# share of the motion of what is far that such a turn leaves at most: of scenes with depth, seen from a camera
+# that moved aside, it leaves .5.
+_TURNED, _LEFT = 0.003, 0.4
+# More points than this, or about twice as many, say no more of a move, and of a turn, which is simpler.
+_MOST, _MOST_TURNED = 20_000, 2_000
 # The cosine of the angle by which motion may differ from that of still things.
 _ALONG = 0.7
 # The share that has to be still for the move to be known, and for motion to be taken for parallax.
@@ -66,12 +70,29 @@ def across(u: Points, v: Points, direction: Points) -> npt.NDArray[np.float64]:
 
 
 def known_move(u: Points, v: Points) -> Points | None:
-    """The camera's `move` that motion from u to v (n, 3) tells, if most of it is that of still things."""
-    u, v = _some(u, v)
-    if len(u) < _LEAST:
+    """The camera's `move` that motion from u to v (n, 3) tells, if most of it is that of still things: what
+    is far, and moves as photos do that are turned a little, tells none.
+    """
+    u, v = _some(u, v, _MOST)
+    if len(u) < _LEAST or _is_turn(*_some(u, v, _MOST_TURNED)):
         return None
     direction = move(u, v)
     return direction if _mostly(along(u, v, direction)) else None
+
+
+def _is_turn(u: Points, v: Points) -> bool:
+    """Whether most of the motion is that of photos turned a little against each other: v - u = w x u."""
+    motion = v - u
+    axes = np.stack([np.cross(axis, u) for axis in np.eye(3)], axis=-1)  # (n, 3, 3): w x u is axes w
+    turn, left, weights = np.zeros(3), motion, np.ones(len(u))
+    for fits in _FITS:
+        weighed = (weights[:, None, None] * axes).reshape(-1, 3)
+        turn[:] = np.linalg.lstsq(weighed.T @ axes.reshape(-1, 3), weighed.T @ motion.ravel(), rcond=None)[0]
+        left = motion - axes @ turn
+        # far less than `fits`: near things, whose motion is no turn, must not pull at one that is so small
+        weights[:] = 1 / np.maximum(np.linalg.norm(left, axis=1), fits * _TURNED)
+    after, before = (float(np.median(np.linalg.norm(one, axis=1))) for one in (left, motion))
+    return bool(np.linalg.norm(turn) < _TURNED) and after < _LEFT * before
 
 
 def parallax(known: tuple[Points, Points], found: tuple[Points, Points], either_way: bool) -> bool:
@@ -81,7 +102,7 @@ def parallax(known: tuple[Points, Points], found: tuple[Points, Points], either_
     either_way: layers that were aligned on what is near are turned against each other, so that what is
     farther goes the other way: if what is known does so, what is found may as well.
     """
-    known = _some(*known)
+    known = _some(*known, _MOST)
     if len(known[0]) < _LEAST or not len(found[0]):
         return False
     direction = move(*known)
@@ -91,9 +112,9 @@ def parallax(known: tuple[Points, Points], found: tuple[Points, Points], either_
     return either_way and _mostly(abs(others)) and _mostly(abs(its))
 
 
-def _some(u: Points, v: Points) -> tuple[Points, Points]:
-    """No more points than tell the move."""
-    step = max(1, len(u) // _MOST)
+def _some(u: Points, v: Points, most: int) -> tuple[Points, Points]:
+    """Every so many points, such that `most` to twice as many are left, if there are so many."""
+    step = max(1, len(u) // most)
     return u[::step], v[::step]
 
 

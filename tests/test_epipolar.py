@@ -119,6 +119,22 @@ def test_a_move_is_known_where_most_things_stand_still() -> None:
         assert found is not None and found @ move > np.cos(np.radians(3))
 
 
+@pytest.mark.parametrize("turn", [0.0005, 0.002])
+def test_a_turn_tells_no_move_whatever_is_near(turn: float) -> None:
+    """Photos of what is far that are aligned a little wrongly, and a railing before it in a tenth of them."""
+    rng = np.random.default_rng(7)
+    far, _ = seen(8, 3000, np.zeros(3), np.array([0, 3.0, 0]))
+    v = unit(far + np.cross(turn * unit(np.array([1.0, 0, 0.1])), far))
+    v = unit(v + 0.05 * turn * rng.normal(size=v.shape))
+    v[:300] = unit(far[:300] - 5 * turn * unit(np.array([0.3, 0, 0.9])))
+    assert epipolar.known_move(far, v) is None
+    # as much motion of what stands at several distances is a move
+    move = unit(np.array([1.0, 0, 0.2]))
+    u, v = seen(8, 3000, 5 * turn * move, np.array([0, 1.0, 0]))
+    found = epipolar.known_move(u, unit(v + 0.02 * turn * rng.normal(size=v.shape)))
+    assert found is not None and found @ move > np.cos(np.radians(5))
+
+
 def test_an_unknown_move_proves_nothing() -> None:
     """All moves at random, or hardly anything is known."""
     rng = np.random.default_rng(4)
