@@ -104,12 +104,14 @@ def decide(
         return Decision(False)
     gain = parameters.gain if last else parameters.early_gain
     trusted = trusted_misfit(plain, found, parameters.gap, wraps)
-    gained = trusted[common].mean() <= gain * plain.misfit[common].mean()
+    shows = common & textured()
+    tells = shows if shows.any() else common  # what shows nothing is explained by any flow alike
+    gained = trusted[tells].mean() <= gain * plain.misfit[tells].mean()
     if gained and (not last or apart.sum() >= parameters.wide * common.sum()):
         return Decision(True)
     remains, before = found.misfit[apart].mean(), plain.misfit[apart].mean()
     if bearings and remains <= parameters.gain_apart * before:
-        known = _seen(bearings, plain.flows, common & ~apart & textured(), level)
+        known = _seen(bearings, plain.flows, shows & ~apart, level)
         # one line of two on which it may go says little of what fits by chance: that does not lead back
         back = bool(trusted[apart].mean() <= parameters.gain_back * before)
         if epipolar.parallax(known, _seen(bearings, found.flows, apart, level), either_way=back):

@@ -60,6 +60,18 @@ def test_what_is_refused_is_told_if_it_explains_something() -> None:
     assert not decided((SMALL, 6, 0.2)).refused
 
 
+def test_what_shows_nothing_does_not_tell() -> None:
+    """A sign's letters, which are explained by far better, are a third of what is mostly a white board."""
+    letters = np.zeros((2, HEIGHT, WIDTH), bool)
+    letters[:, ::3] = True
+    plain, found = candidates((LARGE, 6, 0.1))
+    found.misfit[np.where(letters, found.flows[..., 0] != 0, False)] = 0.02
+    assert decision.decide(plain, found, 1, 1, lambda: letters, None, False, HOW).found
+    assert not decision.decide(plain, found, 1, 1, textured, None, False, HOW).found
+    # where nothing shows anything all counts
+    assert not decision.decide(plain, found, 1, 1, untextured, None, False, HOW).found
+
+
 def bearings(places: np.ndarray) -> np.ndarray:
     lon, lat = (places[:, 0] - WIDTH) / 300, (HEIGHT - places[:, 1]) / 300
     return np.stack([np.cos(lat) * np.sin(lon), np.cos(lat) * np.cos(lon), np.sin(lat)], 1)
