@@ -107,6 +107,15 @@ def test_option_is_refused(line: str, part: str) -> None:
         request(line)
 
 
+@pytest.mark.parametrize("line", ["--save-masks --load-masks", "--load-masks=m%n.tif --save-masks=s%n.tif"])
+def test_masks_are_saved_or_loaded(enblend: str, line: str) -> None:
+    """Not both, as of enblend: under one name, what somebody painted would be lost."""
+    theirs = subprocess.run([enblend, "a.tif", *line.split()], capture_output=True, text=True)
+    assert theirs.returncode == 1 and "mutually exclusive" in theirs.stderr
+    with pytest.raises(CommandLineError, match="--save-masks and --load-masks exclude each other"):
+        request(line)
+
+
 def test_inputs_are_needed_but_for_an_answer() -> None:
     with pytest.raises(CommandLineError, match="no input files"):
         read_command_line(["-o", "x.tif"])

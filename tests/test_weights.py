@@ -13,9 +13,11 @@ from pictures import one_device, texture
 
 from hugin_abflow import joint, working
 from hugin_abflow.dropin import enblend, weights
+from hugin_abflow.dropin.request import read_command_line
 from hugin_abflow.dropin.weights import name
 from hugin_abflow.errors import CommandLineError
 from hugin_abflow.layer import Layer
+from hugin_abflow.progress import silent
 
 __all__ = ["one_device"]
 pytestmark = pytest.mark.usefixtures("one_device")
@@ -35,6 +37,13 @@ def layers(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[str]:
 
 def run(*arguments: str) -> int:
     return int(enblend.main(["-v0", "-o", "out.tif", *arguments]))
+
+
+def weights_by_masks(line: str, layers: list[str]) -> list[np.ndarray]:
+    """What weights become where masks are loaded; the command line saves them only where none are."""
+    request = read_command_line(["-o", "out.tif", line, "--load-masks", *layers])
+    enblend.blend(replace(request, save_masks="s%n.tif"), silent)
+    return [tifffile.imread(f"s{number}.tif")[..., 0] for number in (1, 2)]
 
 
 def test_masks_are_the_weights(layers: list[str]) -> None:
@@ -115,8 +124,7 @@ def test_masks_decide_which_layer_is_seen(layers: list[str], crop: str, samples:
             "colour": np.stack([grey] * 3, 2),
         }[samples]
         tifffile.imwrite(f"mask-{number}.tif", stored, photometric="rgb" if samples == "colour" else None)
-    assert run(f"-f{crop}", "--load-masks", "--save-masks=s%n.tif", *layers) == 0
-    masks = [tifffile.imread(f"s{number}.tif")[..., 0] for number in (1, 2)]
+    masks = weights_by_masks(f"-f{crop}", layers)
     inside = slice(85 - left, 115 - left)
     for rows, seen in ((slice(0, 39 - top), 0), (slice(41 - top, None), 1)):
         assert (masks[seen][rows, inside] == 65535).all()
@@ -129,8 +137,7 @@ def test_masks_of_a_smaller_working_canvas(layers: list[str], monkeypatch: pytes
     monkeypatch.setattr(enblend, "Settings", lambda **chosen: settings(working_pixels=3000, **chosen))
     for number, white in ((1, 255), (2, 0)):
         tifffile.imwrite(f"mask-{number}.tif", np.full((81, 177), white, np.uint8))
-    assert run("-f177x81+9+11", "--load-masks", "--save-masks=s%n.tif", *layers) == 0
-    first = tifffile.imread("s1.tif")[..., 0]
+    first, _ = weights_by_masks("-f177x81+9+11", layers)
     assert (first[:, : 115 - 9] == 65535).all()
 
 

@@ -234,8 +234,8 @@ enblend's other options are accepted and change nothing.
 def read_command_line(arguments: Sequence[str]) -> Request:
     """The request in a command line without the program's name.
 
-    Raises `CommandLineError` for what enblend would not understand, or no inputs; `LayersMissingError` for a
-    response file that cannot be read.
+    Raises `CommandLineError` for what enblend would not understand or do, or no inputs; `LayersMissingError`
+    for a response file that cannot be read.
     """
     given, files = parse(arguments, list(OPTIONS))
     request = Request()
@@ -243,6 +243,9 @@ def read_command_line(arguments: Sequence[str]) -> Request:
         request = OPTIONS[option](request, value or "")
     if request.answer:
         return request
+    if request.save_masks and request.load_masks:
+        # by their default names, what somebody painted would be lost
+        raise CommandLineError("--save-masks and --load-masks exclude each other; give one of them")
     inputs = expand(files)
     if not inputs:
         raise CommandLineError("no input files; name the layers that are to be blended")
