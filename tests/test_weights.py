@@ -188,8 +188,23 @@ def test_masks_that_cannot_be(layers: list[str], capsys: pytest.CaptureFixture[s
     assert "m.tif has 11x9 pixels, the output has 200x100" in message
     assert "names one mask twice" in refused(capsys, "--save-masks=s.tif", *layers)
     assert "is an input" in refused(capsys, "--save-masks=%p", *layers)
-    assert "is an input" in refused(capsys, "--save-masks=%F.tif", layers[0])
+    message = refused(capsys, "--save-masks=%F.tif", layers[0])
+    assert "out.tif is the name of the panorama; choose another for masks with --save-masks" in message
     assert "%q in %q.tif means nothing" in refused(capsys, "--save-masks=%q.tif", *layers)
+
+
+def test_masks_and_lists_are_never_replaced(layers: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    for number in (1, 2):
+        tifffile.imwrite(f"m{number}.tif", np.zeros((HEIGHT, WIDTH), np.uint8))
+    Path("l.tif").write_text("@l1.tif\nb.tif\n")
+    Path("l1.tif").write_text("a.tif\n")
+    for arguments, replaced in (
+        (("-o", "m1.tif", "--load-masks=m%n.tif", *layers), "m1.tif"),
+        (("-o", "l.tif", "@l.tif"), "l.tif"),
+        (("-o", "l1.tif", "@l.tif"), "l1.tif"),
+        (("--save-masks=l%i.tif", "@l.tif"), "l1.tif"),
+    ):
+        assert f"{replaced} is an input of this panorama" in refused(capsys, *arguments)
 
 
 def test_masks_replace_no_photos_of_the_project(

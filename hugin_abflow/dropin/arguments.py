@@ -102,22 +102,32 @@ def _next(name: str, remaining: Iterable[str]) -> str:
     raise CommandLineError(f"{name} needs a value")
 
 
-def expand(names: Iterable[str]) -> list[Path]:
-    """Files, where ``@list`` stands for the names in a response file.
+def expand(names: Iterable[str]) -> tuple[list[Path], list[Path]]:
+    """Files, where ``@list`` stands for the names in a response file; and the response files that were read.
 
     A list holds one name a line, relative to its folder; ``#`` begins a comment line; lists may name lists.
     ``#glob: wildcard`` makes patterns of the names that follow, with ``* ? [ ]``, ``#glob: shell`` with
     braces and ``~``, too, and ``#glob: literal`` ends that. A list that names itself is warned of and passed
     over. Raises `LayersMissingError` for a list that cannot be read, and for a pattern that no file fits.
     """
-    return [file for name in names for file in (_listed(Path(name[1:])) if name[:1] == "@" else [Path(name)])]
+    files: list[Path] = []
+    lists: list[Path] = []
+    for name in names:
+        files += _listed(Path(name[1:]), lists) if name.startswith("@") else [Path(name)]
+    return files, lists
 
 
-def _listed(response: Path, globbing: str = "literal", outer: tuple[Path, ...] = ()) -> list[Path]:
-    """The files of a response file, which the lists `outer` name; globbing: how they take names."""
+def _listed(
+    response: Path, lists: list[Path], globbing: str = "literal", outer: tuple[Path, ...] = ()
+) -> list[Path]:
+    """The files of a response file, which the lists `outer` name; globbing: how they take names.
+
+    It and those that it names are added to `lists`.
+    """
     if response.resolve() in outer:
         _log.warning("%s names itself; passed over", response)
         return []
+    lists.append(response)
     files: list[Path] = []
     for number, line in enumerate(_lines(response), 1):
         if chosen := _GLOBBING.fullmatch(line):
@@ -127,7 +137,7 @@ def _listed(response: Path, globbing: str = "literal", outer: tuple[Path, ...] =
                 known = ", ".join(_PATTERNS)
                 _log.warning("%s, line %d: '%s' is none of %s", response, number, chosen[1], known)
         elif line.startswith("@"):
-            files += _listed(response.parent / line[1:], globbing, (*outer, response.resolve()))
+            files += _listed(response.parent / line[1:], lists, globbing, (*outer, response.resolve()))
         elif line and not line.startswith("#"):
             found = _PATTERNS[globbing](line, response.parent)
             if not found:

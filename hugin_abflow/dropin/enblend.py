@@ -12,7 +12,7 @@ from functools import partial
 
 from hugin_abflow import process
 from hugin_abflow.dropin.request import HELP, Request, read_command_line
-from hugin_abflow.dropin.weights import MaskedMerge
+from hugin_abflow.dropin.weights import MaskedMerge, mask_files
 from hugin_abflow.errors import CommandLineError, ExitCode, LayersMismatchError, LayersMissingError
 from hugin_abflow.guides import Guide
 from hugin_abflow.images import read_layers
@@ -90,7 +90,8 @@ def blend(request: Request, progress: Progress) -> None:
         _log.warning("%s", misnamed)
     layers = _read(request)
     plan = read_plan(request.project) if request.project else None
-    inputs = [*request.inputs, *([plan.file, *plan.photos] if plan else [])]
+    masks = mask_files(request.load_masks, layers, request.output) if request.load_masks else []
+    inputs = [*request.inputs, *request.lists, *masks, *([plan.file, *plan.photos] if plan else [])]
     refuse_input(request.output, inputs)
     refuse_photo(request.output)
     settings = Settings(threads=_threads(os.environ.get("OMP_NUM_THREADS", "")))

@@ -33,6 +33,7 @@ class Request:
     """One run.
 
     inputs          the layers' files.
+    lists           response files that name them.
     output          the panorama's; its ending is its type.
     crop            canvas pixels that are output; None: all that the layers cover.
     wraps           the canvas's left and right border are one.
@@ -47,6 +48,7 @@ class Request:
     """
 
     inputs: tuple[Path, ...] = ()
+    lists: tuple[Path, ...] = ()
     output: Path = Path("a.tif")
     crop: Box | None = None
     wraps: bool = False
@@ -246,7 +248,7 @@ def read_command_line(arguments: Sequence[str]) -> Request:
     if request.save_masks and request.load_masks:
         # by their default names, what somebody painted would be lost
         raise CommandLineError("--save-masks and --load-masks exclude each other; give one of them")
-    inputs = expand(files)
+    inputs, lists = expand(files)
     if not inputs:
         raise CommandLineError("no input files; name the layers that are to be blended")
-    return replace(request, inputs=tuple(inputs))
+    return replace(request, inputs=tuple(inputs), lists=tuple(lists))

@@ -14,12 +14,13 @@ import numpy.typing as npt
 from hugin_abflow import joint, multiband, unit, working
 from hugin_abflow.blend import BlendLayer, Prepared
 from hugin_abflow.colour import Correction
-from hugin_abflow.errors import CommandLineError, LayersMismatchError, LayersMissingError
+from hugin_abflow.errors import CommandLineError, LayersMismatchError, LayersMissingError, SameOutputError
 from hugin_abflow.guides import Guide
 from hugin_abflow.images import ImageWriter, check_target, read_layer
 from hugin_abflow.layer import Box, Canvas, Layer, full_scale
 from hugin_abflow.opencl import Device
 from hugin_abflow.progress import Progress, silent
+from hugin_abflow.project import file_key
 from hugin_abflow.settings import Settings
 from hugin_abflow.targets import refuse_input, refuse_photo
 from hugin_abflow.working import Grid, Place
@@ -79,7 +80,7 @@ class MaskedMerge:
     def _read(self, layers: Sequence[Layer], crop: Box) -> list[Layer]:
         """The masks, on the canvas, in the layers' order."""
         masks = []
-        for layer, path in zip(layers, _names(self.load or "", layers, self.output), strict=True):
+        for layer, path in zip(layers, mask_files(self.load or "", layers, self.output), strict=True):
             if not path.is_file():
                 raise LayersMissingError(f"{path}: no such mask for {layer.name}; --save-masks writes them")
             mask = read_layer(path)
@@ -93,17 +94,22 @@ class MaskedMerge:
 
     def _targets(self, layers: Sequence[Layer]) -> list[Path]:
         """The files of masks that are written: each its own, and none of those that are needed."""
-        targets = _names(self.save or "", layers, self.output)
+        targets = mask_files(self.save or "", layers, self.output)
         if len(set(targets)) < len(targets):
             raise CommandLineError(f"--save-masks={self.save} names one mask twice; %n gives each a number")
         for target in targets:
-            refuse_input(target, [self.output, *self.inputs], _OPTION)
+            if file_key(target) == file_key(self.output):
+                raise SameOutputError(
+                    f"{target} is the name of the panorama; choose another for masks with {_OPTION}"
+                )
+            refuse_input(target, self.inputs, _OPTION)
             refuse_photo(target, f"choose another name with {_OPTION}, or remove it")
             check_target(target, None, np.uint16, _OPTION)  # now, not when all else is done
         return targets
 
 
-def _names(template: str, layers: Sequence[Layer], output: Path) -> list[Path]:
+def mask_files(template: str, layers: Sequence[Layer], output: Path) -> list[Path]:
+    """The layers' masks, as `name` calls them."""
     return [Path(name(template, index, layer, output)) for index, layer in enumerate(layers)]
 
 
