@@ -113,6 +113,24 @@ def test_sequences_have_all_their_steps() -> None:
         assert "Description=Panorama by optical flow" in content
 
 
+def test_edited_sequences_are_kept_beside_them(hugin: Places, programs: Path) -> None:
+    """Each edit once, told, under a name that Hugin does not list; where programs lie is none."""
+    setup.install(hugin)
+    (edited, other, *_) = sorted(Path(hugin.data).iterdir())
+    other.write_bytes(other.read_bytes().replace(bytes(programs), b"/else where"))
+    shipped = edited.read_bytes()
+    first, second = shipped + b"# mine \xff\n", shipped.replace(b"[Step0]", b"[Step0]\nKeep=1")
+    for content in (first, second, first):
+        edited.write_bytes(content)
+        planned = setup.install(hugin, dry_run=True)
+        assert edited.read_bytes() == content and setup.install(hugin) == planned
+        assert f"{edited} was changed" in planned[0] and edited.read_bytes() == shipped
+    edited.write_bytes(second)
+    assert f"{edited} was changed since it was installed: it is kept as" in "\n".join(setup.uninstall(hugin))
+    kept = {f"{edited.name}.edited": first, f"{edited.name}.edited2": second}
+    assert files(Path(hugin.data)) == kept
+
+
 def test_link_to_the_preferences_stays_one(hugin: Places, tmp_path: Path) -> None:
     real = tmp_path / "dotfiles.conf"
     real.write_bytes(CONFIG)

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import argparse
+import itertools
+import re
 import shutil
 from collections.abc import Sequence
 from importlib import resources
@@ -19,6 +21,8 @@ NAME = "hugin-abflow-setup"
 _GROUP = "Enblend"
 _BLENDER = "abflow-enblend"
 _PROGRAMS = ("hugin-abflow", _BLENDER)
+
+_OURS = re.compile(rf"^Program=(?:.*[/\\])?({'|'.join(_PROGRAMS)})(\.exe)?$", re.MULTILINE | re.IGNORECASE)
 
 _CLICK_INSTALL = """\
 In Hugin, once: File, Preferences, tab Programs; as Enblend executable choose
@@ -62,7 +66,8 @@ def install(places: Places, dry_run: bool = False) -> list[str]:
     for name, content in sequences().items():
         for one, path in paths.items():
             content = content.replace(f"Program={one}\n", f"Program={wxconfig.quoted(path)}\n")
-        done += _write(Path(places.data, name), content, dry_run)
+        file = Path(places.data, name)
+        done += [*_keep_edited(file, content, dry_run), *_write(file, content, dry_run)]
     # last: where something fails, Hugin's button does what it did
     return [*done, *_set_preferences(places, paths[_BLENDER], dry_run), _AFTERWARDS]
 
@@ -70,10 +75,10 @@ def install(places: Places, dry_run: bool = False) -> list[str]:
 def uninstall(places: Places, dry_run: bool = False) -> list[str]:
     """Undo `install`; gives what was done, in words. Raises `SetupError` as it does."""
     done = _restore_preferences(places, dry_run)
-    for name in sequences():
+    for name, content in sequences().items():
         path = Path(places.data, name)
         if path.exists():
-            done += _remove(path, dry_run)
+            done += [*_keep_edited(path, content, dry_run), *_remove(path, dry_run)]
     return done
 
 
@@ -82,6 +87,25 @@ def sequences() -> dict[str, str]:
     folder = resources.files("hugin_abflow.dropin") / "sequences"
     files = sorted(folder.iterdir(), key=lambda file: file.name)
     return {file.name: file.read_text("utf-8") for file in files if file.name.endswith(".executor")}
+
+
+def _keep_edited(path: Path, shipped: str, dry_run: bool) -> list[str]:
+    """Copy a sequence that differs from what we ship to a name that Hugin does not list; what was done."""
+    now = _read(path) if path.exists() else None
+    if now is None or _by_name(now) == _by_name(shipped):
+        return []
+    endings = itertools.chain([".edited"], map(".edited{}".format, itertools.count(2)))
+    copies = (path.with_name(path.name + ending) for ending in endings)
+    copy = next(copy for copy in copies if _read(copy) in (None, now))  # a second edit is another one
+    return [
+        f"{path} was changed since it was installed: it is kept as {copy.name}",
+        *_write(copy, now, dry_run),
+    ]
+
+
+def _by_name(sequence: str) -> str:
+    """A sequence that calls our programs wherever they are."""
+    return _OURS.sub(r"Program=\1", sequence)
 
 
 def _set_preferences(places: Places, blender: str, dry_run: bool) -> list[str]:
