@@ -74,7 +74,8 @@ def _output(request: Request, value: str) -> Request:
 
 
 def _crop(request: Request, value: str) -> Request:
-    found = re.fullmatch(r"(\d{1,9})x(\d{1,9})(?:\+(\d{1,9})\+(\d{1,9}))?", value)
+    # enblend's help has +xXOFFSET+yYOFFSET; it takes that, but leaves the offsets out
+    found = re.fullmatch(r"(\d{1,9})x(\d{1,9})(?:\+x?(\d{1,9})\+y?(\d{1,9}))?", value)
     width, height, left, top = (int(number or 0) for number in found.groups()) if found else (0, 0, 0, 0)
     if not width or not height:
         raise CommandLineError(f"-f {value}: give WIDTHxHEIGHT or WIDTHxHEIGHT+X+Y in pixels")
