@@ -143,6 +143,17 @@ def test_response_file_that_names_itself_is_passed_over(
     assert len(expand([f"@{tmp_path / 'a.txt'}"] * 2)[0]) == 4
 
 
+def test_names_that_are_empty(tmp_path: Path) -> None:
+    """They would be the current folder."""
+    with pytest.raises(CommandLineError, match="'' among the arguments names no file; name a layer"):
+        expand(["a.tif", ""])
+    with pytest.raises(CommandLineError, match="'@' among the arguments names no file; name a list"):
+        expand(["@"])
+    (tmp_path / "a.txt").write_text("a.tif\n@\n")
+    with pytest.raises(LayersMissingError, match=r"a\.txt, line 2: @ names no list; correct the list"):
+        expand([f"@{tmp_path / 'a.txt'}"])
+
+
 def test_response_file_that_is_missing(tmp_path: Path) -> None:
     with pytest.raises(LayersMissingError, match=r"gone\.txt cannot be read: No such file"):
         expand([f"@{tmp_path / 'gone.txt'}"])

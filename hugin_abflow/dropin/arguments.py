@@ -108,11 +108,15 @@ def expand(names: Iterable[str]) -> tuple[list[Path], list[Path]]:
     A list holds one name a line, relative to its folder; ``#`` begins a comment line; lists may name lists.
     ``#glob: wildcard`` makes patterns of the names that follow, with ``* ? [ ]``, ``#glob: shell`` with
     braces and ``~``, too, and ``#glob: literal`` ends that. A list that names itself is warned of and passed
-    over. Raises `LayersMissingError` for a list that cannot be read, and for a pattern that no file fits.
+    over. Raises `CommandLineError` for an empty name, `LayersMissingError` for a list that cannot be read or
+    names an empty one, and for a pattern that no file fits.
     """
     files: list[Path] = []
     lists: list[Path] = []
     for name in names:
+        if name in ("", "@"):  # as a path it would be the current folder
+            wanted = "a list of layers after @" if name else "a layer"
+            raise CommandLineError(f"'{name}' among the arguments names no file; name {wanted}")
         files += _listed(Path(name[1:]), lists) if name.startswith("@") else [Path(name)]
     return files, lists
 
@@ -136,6 +140,8 @@ def _listed(
             else:
                 known = ", ".join(_PATTERNS)
                 _log.warning("%s, line %d: '%s' is none of %s", response, number, chosen[1], known)
+        elif line == "@":
+            raise LayersMissingError(f"{response}, line {number}: @ names no list; correct the list")
         elif line.startswith("@"):
             files += _listed(response.parent / line[1:], lists, globbing, (*outer, response.resolve()))
         elif line and not line.startswith("#"):
