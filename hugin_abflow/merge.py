@@ -36,6 +36,13 @@ from hugin_abflow.targets import refuse_input, refuse_photo
 
 _log = logging.getLogger(__name__)
 
+# Names of the types of files that do not hold all samples, and the widest that they hold.
+_MOST: dict[str, tuple[str, np.dtype[Any]]] = {
+    "jpeg": ("JPEG", np.dtype(np.uint8)),
+    "png": ("PNG", np.dtype(np.uint16)),
+    "openexr": ("EXR", np.dtype(np.float32)),
+}
+
 # What `joint.merge` looks like.
 Method = Callable[
     [Device, Sequence[Layer], Canvas, Settings, Progress, Sequence[Guide]],
@@ -139,14 +146,18 @@ def write_panorama(
             _write(writer, bands)
 
 
-def _depth(target: Path, layer: Layer, wanted: npt.DTypeLike | None) -> npt.DTypeLike:
+def _depth(target: Path, layer: Layer, wanted: npt.DTypeLike | None) -> np.dtype[Any]:
     """Samples of a file: what is wanted, or else the layers', if files of its kind hold them."""
-    kind, depth = ENDINGS.get(target.suffix.lower()), np.dtype(layer.dtype if wanted is None else wanted)
+    kind = ENDINGS.get(target.suffix.lower(), "")
+    depth: np.dtype[Any] = np.dtype(layer.dtype if wanted is None else wanted)
     if kind == "tiff" and wanted is None and depth == np.float16:
-        return np.float32  # few programs read TIFF with half floats; enblend writes floats, too
-    if kind == "openexr" and depth.kind != "f":
-        _log.warning("%s: EXR holds no %s samples; they are written as float", target, depth)
-        return np.float32
+        return np.dtype(np.float32)  # few programs read TIFF with half floats; enblend writes floats, too
+    name, most = _MOST.get(kind, ("", depth))
+    # unless somebody asks for samples, fewer bits are what the type of file is chosen for
+    narrowed = wanted is not None and depth.itemsize > most.itemsize
+    if narrowed or (kind == "openexr" and depth.kind != "f"):
+        _log.warning("%s: %s holds no %s samples; they are written as %s", target, name, depth, most)
+        return most
     return depth
 
 

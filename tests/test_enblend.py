@@ -360,6 +360,9 @@ def test_photos_are_not_replaced(
         ("one.tif", "only one layer"),
         ("one.tif inside.tif", "inside.tif is not used"),
         ("--fine-mask -x one.tif one.tif", "change nothing here: --fine-mask, -x"),
+        ("-d 16 -o a.jpg one.tif one.tif", "a.jpg: JPEG holds no uint16 samples; they are written as uint8"),
+        ("-d r32 -o a.png one.tif one.tif", "PNG holds no float32 samples; they are written as uint16"),
+        ("-d r64 -o a.exr one.tif one.tif", "EXR holds no float64 samples; they are written as float32"),
     ],
 )
 def test_warnings(layers: list[str], line: str, said: str, capsys: pytest.CaptureFixture[str]) -> None:
