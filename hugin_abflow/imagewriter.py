@@ -27,6 +27,7 @@ from hugin_abflow.exif import Metadata, embed, place_in_png
 from hugin_abflow.layer import full_scale, native
 from hugin_abflow.scratch import part_beside, put
 from hugin_abflow.targets import explained, final_file, may_grow
+from hugin_abflow.tifftags import FURTHEST
 
 Pixels = npt.NDArray[Any]
 
@@ -54,7 +55,6 @@ _KNOWN = {
 }  # fmt: skip
 _PNG_LEVEL = 4  # twice as fast as zlib's usual 6 for 2 % more bytes
 _JPEG_LIMIT = 65500  # pixels a side, of libjpeg
-_FURTHEST = 10_000_000  # pixels from the canvas's corner; TIFF tells positions as fractions of 32 bits
 _JPEG_LEAST = 1 << 16  # bytes of a JPEG beside its samples
 _JPEG_BLANK = 1 / 64  # bytes that nothing takes for each sample
 _CLASSIC_LIMIT = 0xFFFFFFFF - (16 << 20)  # bytes of a classic TIFF, with room for tags and metadata
@@ -116,8 +116,8 @@ class ImageWriter:
         tall = height if self.format == "jpeg" else 0  # within TIFF each strip is a JPEG
         if self.compression.startswith("jpeg") and max(width, tall) > _JPEG_LIMIT:
             raise OutputError(f"{path}: JPEG ends at {_JPEG_LIMIT} pixels a side; choose a TIFF with LZW")
-        if not all(isinstance(one, Integral) and abs(one) <= _FURTHEST for one in offset):
-            raise OutputError(f"{path}: it lies at {offset}; give whole pixels, up to {_FURTHEST}")
+        if not all(isinstance(one, Integral) and abs(one) <= FURTHEST for one in offset):
+            raise OutputError(f"{path}: it lies at {offset}; give whole pixels, up to {FURTHEST}")
         self._offset, self._icc = offset, icc
         self._spec = self._make_spec(offset, icc, canvas_size)
         self._done = 0

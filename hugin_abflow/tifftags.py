@@ -22,6 +22,11 @@ from hugin_abflow.errors import ImageReadError
 
 SUBFILE_TYPE, X_RESOLUTION, Y_RESOLUTION, X_POSITION, Y_POSITION = 254, 282, 283, 286, 287
 FULL_WIDTH, FULL_HEIGHT = 33300, 33301
+_IN_PIXELS = {
+    X_POSITION: "XPosition", Y_POSITION: "YPosition", FULL_WIDTH: "ImageFullWidth",
+    FULL_HEIGHT: "ImageFullLength",
+}  # fmt: skip
+FURTHEST = 10_000_000  # pixels from the canvas's corner; TIFF tells positions as fractions of 32 bits
 MAIN, EXIF, GPS = 0, 34665, 34853  # directories, by the tag in the main one that points to them
 ASCII, SHORT, LONG, RATIONAL, UNDEFINED = 2, 3, 4, 5, 7  # TIFF types
 # Software, DateTime, Artist, XMP, Photoshop's own, EXIF: editors and exiftool write some of these, nona none.
@@ -97,11 +102,16 @@ class _Layout:
 
 
 def read_places(path: Path) -> list[Place]:
-    """The places of all pages, in file order. Raises `ImageReadError` for what is no TIFF file."""
+    """The places of all pages, in file order.
+
+    Raises `ImageReadError` for what is no TIFF file, and for places and canvases that cannot be.
+    """
     try:
         with path.open("rb") as file:
             layout, first = _read_header(file)
-            return [_place(_numbers(file, layout, start)) for start in _directories(file, layout, first)]
+            return [
+                _place(path, _numbers(file, layout, start)) for start in _directories(file, layout, first)
+            ]
     except (OSError, struct.error, OverflowError, ValueError) as error:
         raise ImageReadError(f"{path} is not a readable TIFF file ({error}); make the layer again") from None
 
@@ -268,14 +278,23 @@ def _numbers(file: BinaryIO, layout: _Layout, start: int) -> dict[int, float]:
     return found
 
 
-def _place(tags: dict[int, float]) -> Place:
+def _place(path: Path, tags: dict[int, float]) -> Place:
     """Interpret the numbers of one directory."""
-    width, height = round(tags.get(FULL_WIDTH, 0)), round(tags.get(FULL_HEIGHT, 0))
+
+    def pixels(tag: int, resolution: float = 1) -> int:
+        number = tags.get(tag, 0) * resolution
+        if not abs(number) <= FURTHEST:  # so is what is no number
+            raise ImageReadError(
+                f"{path}: its tag {_IN_PIXELS[tag]} tells {number:.9g} pixels; make the layer again"
+            )
+        return round(number)
+
+    width, height = pixels(FULL_WIDTH), pixels(FULL_HEIGHT)
     kind = int(tags.get(SUBFILE_TYPE, 0))
     return Place(
         # without a resolution the position can only be meant in pixels
-        x=round(tags.get(X_POSITION, 0) * (tags.get(X_RESOLUTION, 0) or 1)),
-        y=round(tags.get(Y_POSITION, 0) * (tags.get(Y_RESOLUTION, 0) or 1)),
+        x=pixels(X_POSITION, tags.get(X_RESOLUTION, 0) or 1),
+        y=pixels(Y_POSITION, tags.get(Y_RESOLUTION, 0) or 1),
         canvas=(width, height) if width and height else None,
         reduced=bool(kind & 1),
         paged=bool(kind & 2),
