@@ -53,6 +53,8 @@ log = logging.getLogger("hugin_abflow.nona")
 # and numbers and endings follow.
 _LONGEST_NAME = 200
 
+_NAMED = 5  # photos that a warning names: a small crop may leave out hundreds
+
 _STEPS = ("remapping ", "saving ")  # what nona -v says at the end of a photo's loading and remapping
 _LOADING = "loading "  # and at its beginning
 # What libtiff and libjpeg say of a photo that nona remaps as if it were whole: pixels are missing; or may
@@ -202,6 +204,7 @@ def _make_all(plan: Plan, folder: Path, keep: bool, progress: Progress) -> Found
             "whether the photos are RGB or grey"
         )
     check_made(plan, made)
+    _report_none([image for image in plan.images if image.index not in made])
     return Found(prefix, _keep(prefix, made) if keep else made)
 
 
@@ -224,19 +227,30 @@ def _make_missing(
 ) -> dict[int, Path]:
     """Have nona make the layers that are not there; images that miss the crop have none."""
     refuse_to_make(plan, missing, prefix if keep else None, anew=False)
-    project = _project_for_nona(plan, folder)
+    project, beyond = _project_for_nona(plan, folder), set[int]()
     with progress("remap", len(_STEPS) * len(missing)) as advance:
         for image in missing:
             code, lines = _run(plan, project, [image], folder, ["-i", str(image.index)], advance)
             if code and f"image with number {image.index}" in " ".join(lines):
                 # nona does not count an image outside the crop as one of the project's
                 log.info("image %d (%s) misses the crop: it has no layer", image.index, image.name)
+                beyond.add(image.index)
             elif code:
                 _require_photo(plan, image)
                 raise failure(plan, [image], folder, code, lines)
     made = _made(plan, folder)
     check_made(plan, made)
+    _report_none([image for image in missing if image.index not in made.keys() | beyond])
     return _keep(prefix, made) if keep else made
+
+
+def _report_none(images: Sequence[PlannedImage]) -> None:
+    """Warn of images of which a run of nona that succeeded made no layer: they may be missed."""
+    if not images:
+        return
+    names = ", ".join(image.name for image in images[:_NAMED])
+    more = f" and {len(images) - _NAMED} more" if len(images) > _NAMED else ""
+    log.warning("nona made no layer of %s%s: left out (what lies outside the crop has none)", names, more)
 
 
 def _require_photo(plan: Plan, image: PlannedImage) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -187,3 +188,24 @@ def test_photos_are_named_of_which_layers_were_made(make_project, nona, caplog):
     caplog.clear()
     with open_layers(plan, remap="always"):
         assert "of photo 0.tif: photo 1.tif;" in caplog.text
+
+
+@pytest.mark.skipif(os.name == "nt", reason="the stand-in is a shell script")
+def test_photos_of_which_nona_makes_no_layer_are_told(make_project, nona, tmp_path, monkeypatch, caplog):
+    """Also of one that was to be made beside others; a small crop may leave out many, and few are named."""
+    folder = tmp_path / "bin"
+    folder.mkdir()
+    (folder / "nona").write_text(
+        f'#!/bin/sh\n{nona} "$@" || exit\nwhile [ "$1" != -o ]; do shift; done\nrm -f "$2"000[1-6].tif\n'
+    )
+    (folder / "nona").chmod(0o755)
+    monkeypatch.setenv("PATH", f"{folder}{os.pathsep}{os.environ['PATH']}")
+    plan = read_plan(make_project(yaws=range(0, 210, 30)))
+    with open_layers(plan, keep_layers=True) as layers:
+        assert len(layers) == 1
+    names = ", ".join(image.name for image in plan.images[1:6])
+    assert f"nona made no layer of {names} and 1 more: left out" in caplog.text
+    caplog.clear()
+    with open_layers(replace(plan, images=plan.images[:2])) as layers:
+        assert len(layers) == 1
+    assert f"nona made no layer of {plan.images[1].name}: left out" in caplog.text
