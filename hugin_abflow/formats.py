@@ -33,6 +33,11 @@ def picture_format(data: bytes) -> str | None:
     return next((name for at, start, name in _BEGINNINGS if data[at:].startswith(start)), None)
 
 
+def holds_text(data: bytes) -> bool:
+    """Whether a file that begins so may be a text: pictures, camera raws and videos have a NUL soon."""
+    return b"\0" not in data
+
+
 def foreign_format(photo: Path) -> str | None:
     """The format of a photo that Hugin's programs do not read; None: they do, or it is not known."""
     if photo.suffix.lower() in _RAW:

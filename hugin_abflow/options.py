@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -11,8 +12,13 @@ import click
 
 from hugin_abflow import memory
 from hugin_abflow.errors import SettingsError
+from hugin_abflow.formats import holds_text
 from hugin_abflow.images import COMPRESSIONS, ENDINGS
+from hugin_abflow.scratch import is_special
 from hugin_abflow.settings import MOST_MEMORY, Settings
+
+# Enough of a file's beginning to tell a text from a picture.
+_BEGINNING = 4096
 
 # Where a context keeps the arguments as they were given.
 ARGUMENTS = "hugin_abflow.arguments"
@@ -108,7 +114,7 @@ class OldFile(click.Path):
 
 class NewFile(click.Path):
     """A file to be written: no project and, unless `image`, no photo, as where its own name was forgotten
-    before ``*.pto``.
+    before ``*.pto``. A photo is also told by what it holds: camera raws and hard links have other names.
     """
 
     def __init__(self, image: bool = False) -> None:
@@ -124,7 +130,18 @@ class NewFile(click.Path):
                 self.fail(f"{value} is a project, which is never written to; name another file", param, ctx)
             if name.endswith(tuple(ENDINGS)) and not self.image:
                 self.fail(f"{value} is an image by its name; name another file", param, ctx)
+        if not self.image and not _may_be_text(path):
+            self.fail(f"{value} is there, and is no text; name another file, or remove it", param, ctx)
         return path
+
+
+def _may_be_text(path: Path) -> bool:
+    """Whether a file may be a text, such as one of ours from before; so may what cannot be looked into."""
+    with suppress(OSError):  # writing will tell what is the matter
+        if not is_special(path):  # who opens a pipe waits until somebody writes
+            with path.open("rb") as file:
+                return holds_text(file.read(_BEGINNING))
+    return True
 
 
 class Command(click.Command):
