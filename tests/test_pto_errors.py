@@ -174,6 +174,18 @@ def test_a_picture_is_told_as_such() -> None:
     assert caught.value.line == 0
 
 
+def test_of_what_is_no_project_little_is_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A video, larger than memory, and a log."""
+    with (tmp_path / "clip.mp4").open("wb") as video:
+        video.truncate(1 << 40)
+    with pytest.raises(PtoError, match=r"clip\.mp4, line 1: .* without NUL bytes"):
+        pto.load(tmp_path / "clip.mp4")
+    (tmp_path / "log").write_bytes(b"c\n" * 5000)
+    monkeypatch.setattr(pto.parser, "_LARGEST", 9999)
+    with pytest.raises(PtoError, match=r"log: found 'more than .* MiB', expected a project; name the \.pto"):
+        pto.load(tmp_path / "log")
+
+
 def test_utf16_is_refused_by_its_nul_bytes() -> None:
     with pytest.raises(PtoError, match="NUL") as caught:
         pto.loads(HUGIN.decode().encode("utf-16"))

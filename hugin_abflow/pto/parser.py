@@ -13,7 +13,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from hugin_abflow.errors import ProjectError, PtoError
-from hugin_abflow.formats import picture_format
+from hugin_abflow.formats import holds_text, picture_format
 from hugin_abflow.pto import grammar
 from hugin_abflow.pto.fields import Line
 from hugin_abflow.pto.lines import (
@@ -32,6 +32,9 @@ from hugin_abflow.pto.model import Image, Project
 
 _BOM = b"\xef\xbb\xbf"
 _FILE_VERSION = re.compile(rb"#-fileversion[ \t]+(\d{1,9})(?!\S)")
+# A project of thousands of photos has some tens of MiB. Videos lie beside projects, and devices never end.
+_LARGEST = 64 << 20
+_BEGINNING = 1 << 16  # of what is no text, no more is read
 # PTGui counts its dummy image in c- and v-lines since this file version (Hugin's Panorama.cpp).
 _FIRST_VERSION_COUNTING_THE_DUMMY = 8
 
@@ -39,13 +42,20 @@ _FIRST_VERSION_COUNTING_THE_DUMMY = 8
 def load(path: str | Path) -> Project:
     """Read a project file.
 
-    Raises `PtoError` for a malformed one, `ProjectError` for one that cannot be read.
+    Raises `PtoError` for a malformed one and for what is too large to be one, `ProjectError` for one that
+    cannot be read.
     """
     try:
-        data = Path(path).read_bytes()
+        with Path(path).open("rb") as file:
+            data = file.read(_BEGINNING)
+            if holds_text(data):
+                data += file.read(_LARGEST + 1 - len(data))
     except (OSError, ValueError) as error:  # ValueError: a NUL in the name
         reason = getattr(error, "strerror", None) or error
         raise ProjectError(f"{path}: cannot be read ({reason}); check name and permissions") from error
+    if len(data) > _LARGEST:
+        expected = "a project; name the .pto that Hugin saved"
+        raise PtoError(str(path), 0, f"more than {_LARGEST >> 20} MiB", expected)
     return loads(data, str(path))
 
 
