@@ -159,6 +159,9 @@ def test_files_are_meant_from_the_folder_of_the_settings(calls: Calls, shoot: Pa
         ("jpeg-quality = 101", ["--jpeg-quality", "101"]),
         ("softmax-sharpness = nan", ["'--softmax-sharpness': nan; choose a value from 0 to 1000"]),
         ("seam = off", ["no TOML", "line 1"]),
+        (f"jobs = {'9' * 5000}", ["cannot be read", "digits", "delete that"]),
+        (f"jobs = 0x{'9' * 5000}", ["jobs is a number of more than 64 bits; give a whole number"]),
+        (f"layers = {'[' * 5000}", ["cannot be read", "nested lists", "delete that"]),
         ("resume = true\nforce = true", ["abflow.toml: --resume and --force contradict"]),
     ],
 )

@@ -15,6 +15,7 @@ from hugin_abflow.errors import ConfigError
 from hugin_abflow.scratch import is_folder, is_special
 
 NAME = "abflow.toml"
+_MOST_BITS = 64  # of a whole number, as TOML has it
 
 
 def find_config(project: Path, places: Iterable[Path]) -> Path | None:
@@ -58,6 +59,11 @@ def read_config(
         ) from None
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
         raise ConfigError(f"{file} is no TOML: {error}") from None
+    except (ValueError, RecursionError):  # which tomllib has for these alone
+        raise ConfigError(
+            f"{file} cannot be read: it holds a number of thousands of digits, or hundreds of nested lists; "
+            "delete that"
+        ) from None
     for name, value in values.items():
         if isinstance(value, dict):
             raise ConfigError(
@@ -117,7 +123,7 @@ _WORDS = {
 
 def _check(file: Path, name: str, value: object, kind: str, choices: Sequence[str]) -> None:
     """Raise `ConfigError` unless a value is of its kind; which of its choices it is, is not asked."""
-    number = isinstance(value, int) and not isinstance(value, bool)
+    number = isinstance(value, int) and not isinstance(value, bool) and value.bit_length() <= _MOST_BITS
     fits = {
         "bool": isinstance(value, bool),
         "int": number,
@@ -141,4 +147,6 @@ def _as_written(value: object) -> str:
         return f"[{', '.join(map(_as_written, value))}]"
     if isinstance(value, dict):
         return f"{{{', '.join(f'{name} = {_as_written(one)}' for name, one in value.items())}}}"
+    if isinstance(value, int) and value.bit_length() > _MOST_BITS:
+        return f"a number of more than {_MOST_BITS} bits"  # thousands of digits are an error to str
     return repr(value) if isinstance(value, str) else str(value)
