@@ -36,7 +36,7 @@ _ours: set[Path] = set()  # what this process may have made and not yet removed
 def tidy() -> None:
     """Remove what this process left where Ctrl-C came between making and using, or while it was removed."""
     for path in tuple(_ours):
-        if path.is_dir():
+        if is_folder(path):
             shutil.rmtree(path, ignore_errors=True)
         else:
             with suppress(OSError):

@@ -439,4 +439,7 @@ def test_state_that_cannot_be_written_is_a_warning(make: Make, shoot: Path) -> N
     (shoot / ".abflow").write_text("a file where the folder belongs")
     record = make()
     assert record.result == "made" and record.exit_code == 0
-    assert "will be made again" in record.warnings[0]
+    file = shoot / ".abflow" / "tiny.pto.json"
+    assert record.warnings == [
+        f"{file} cannot be written (File exists): {shoot / 'tiny.pto'} will be made again"
+    ]

@@ -256,6 +256,16 @@ def test_control_c_while_a_folder_is_removed(root: Path, monkeypatch: pytest.Mon
     assert names_in(root) == []
 
 
+def test_what_must_not_be_looked_at_keeps_nothing_else(root: Path) -> None:
+    """As a folder that is closed, or a name that is too long, which root's system refuses, too."""
+    with pytest.raises(OSError, match="File name too long"), part_beside(root / ("x" * 300) / "a.tif"):
+        pass
+    (left := root / "left").touch()
+    scratch._ours.add(left)
+    scratch.tidy()
+    assert not left.exists() and not scratch._ours
+
+
 @pytest.mark.skipif(sys.platform == "win32", reason="another mechanism there")
 def test_file_system_without_locks_keeps_everything(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     import fcntl

@@ -206,9 +206,8 @@ class State:
             }
             write_json(self.file, values)
         except OSError as error:
-            _log.warning(
-                "%s cannot be written (%s): %s will be made again", self.file, error, self._plan.file
-            )
+            why = error.strerror  # without the name of a temporary file
+            _log.warning("%s cannot be written (%s): %s will be made again", self.file, why, self._plan.file)
 
     def _left_out(self) -> list[str]:
         """Outputs that are checked in the project, but lack a program here."""
