@@ -27,6 +27,7 @@ from hugin_abflow.errors import OutputError
 _HOST = hashlib.blake2b(platform.node().encode(), digest_size=4).hexdigest()
 _PART = re.compile(r"\.abflow-([0-9a-f]{8})-[0-9a-f]{12}(\.\w+)?")
 _FOLDER = re.compile(r"hugin-abflow-([0-9a-f]{8})-\w+")
+_OPEN_FILES = re.compile(r"/dev/fd|/proc/\d+/(task/\d+/)?fd")  # folders of such
 _LOCK = "in use"
 _WEEK = 7 * 24 * 3600.0
 _ours: set[Path] = set()  # what this process may have made and not yet removed
@@ -45,12 +46,28 @@ def tidy() -> None:
 
 
 def is_special(path: Path) -> bool:
-    """Whether it is a pipe or a device, or leads to one: it can be written to, but not replaced."""
+    """Whether it is a pipe, a device or what a process has open (/dev/stdout), or leads to such: it can be
+    written to, but not replaced.
+    """
     try:
         mode = path.stat().st_mode
     except OSError:  # there is nothing yet, or writing will tell why not
         return False
-    return not stat.S_ISREG(mode) and not stat.S_ISDIR(mode)
+    if stat.S_ISDIR(mode):
+        return False
+    return not stat.S_ISREG(mode) or _leads_to_open_file(path)
+
+
+def _leads_to_open_file(path: Path) -> bool:
+    """Whether a name that is there is one of a file that a process has open, or a link to such a name."""
+    while True:
+        folder = os.path.realpath(path.parent)
+        if _OPEN_FILES.fullmatch(folder):
+            return True
+        try:
+            path = Path(folder, path.readlink())
+        except OSError:  # no link
+            return False
 
 
 def is_file(path: Path) -> bool:

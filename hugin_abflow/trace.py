@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import json
 import os
-import stat
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -18,6 +17,7 @@ from typing import Any, TextIO
 
 from hugin_abflow.errors import OutputError
 from hugin_abflow.progress import Advance, Progress
+from hugin_abflow.scratch import is_special
 
 # What is told of: steps of a run; work on the device; files; copies between host and device.
 PHASE, KERNEL, FILE, TRANSFER = "phase", "kernel", "file", "transfer"
@@ -62,12 +62,11 @@ class _Recorder:
 
     def write(self, file: TextIO, path: Path) -> None:
         """Write all into `file` and close it; of half a trace nothing is left."""
-        ordinary = stat.S_ISREG(os.fstat(file.fileno()).st_mode)  # a device stays
         try:
             with file:
                 json.dump({"traceEvents": self.take(), "displayTimeUnit": "ms"}, file)
         except BaseException:
-            if ordinary:
+            if not is_special(path):
                 with suppress(OSError):
                     path.resolve().unlink()  # through a link, as it was written
             raise
@@ -102,7 +101,8 @@ def recording(path: Path | None) -> Iterator[None]:
         yield
         return
     try:
-        file = path.open("w", encoding="utf-8")  # now: a run may be long
+        # now: a run may be long; stdout may be a file, in which the panoramas' names stay
+        file = path.open("a" if is_special(path) else "w", encoding="utf-8")
     except OSError as error:
         raise _unwritable(path, error) from None
     recorder = _recorder = _Recorder()

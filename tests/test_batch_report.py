@@ -6,6 +6,8 @@ import json
 import os
 import re
 import shutil
+import subprocess
+import sys
 from collections.abc import Callable
 from pathlib import Path
 
@@ -16,7 +18,7 @@ from shoots import HEIGHT, WIDTH, textured, write_project
 
 from hugin_abflow import cli
 from hugin_abflow.batch import run
-from hugin_abflow.batch.record import Record
+from hugin_abflow.batch.record import Record, write_json
 from hugin_abflow.batch.report import SCHEMA, summary, write_report
 from hugin_abflow.errors import ClusterError, ExitCode, OutputError
 
@@ -184,3 +186,31 @@ def test_a_pipe_gets_one_report(replace: Callable[..., None], tmp_path: Path) ->
     finally:
         os.close(reader)
     assert (tmp_path / "pipe").is_fifo() and (tmp_path / "link").is_symlink()
+
+
+@pytest.mark.skipif(not Path("/dev/stdout").exists(), reason="needs a name of stdout")
+def test_stdout_gets_one_report_also_where_it_is_a_file(tmp_path: Path) -> None:
+    """It is not replaced, and keeps the panorama's name; a trace comes behind. Nothing else is there."""
+    write_project(tmp_path / "a.pto")
+    (tmp_path / "link").symlink_to("/dev/stdout")
+    words = ["a.pto", "--no-flow", "--report", "link", "--profile", "/dev/fd/1"]
+    command = [sys.executable, "-m", "hugin_abflow", *words]
+    folder = os.environ | {"PYTHONPATH": str(Path(__file__).resolve().parent.parent)}
+    with (tmp_path / "out").open("w") as out:
+        subprocess.run(command, check=True, cwd=tmp_path, env=folder, stdout=out)
+    name, _, rest = (tmp_path / "out").read_text().partition("\n")
+    report, end = json.JSONDecoder().raw_decode(rest)
+    assert Path(name).name == "a.tif" and report["made"] == 1
+    assert json.loads(rest[end:])["traceEvents"]
+    assert {path.name for path in tmp_path.iterdir()} == {
+        "a.pto", "a0000.tif", "a0001.tif", "a.tif", "link", "out"
+    }  # fmt: skip
+
+
+def test_what_is_remembered_goes_through_no_links(tmp_path: Path) -> None:
+    """As into a photo; nobody names that file, as he names a report."""
+    (tmp_path / "photo.jpg").write_text("photo")
+    (tmp_path / "pano.pto.json").symlink_to("photo.jpg")
+    write_json(tmp_path / "pano.pto.json", {"schema": 1})
+    assert (tmp_path / "photo.jpg").read_text() == "photo"
+    assert json.loads((tmp_path / "pano.pto.json").read_text()) == {"schema": 1}

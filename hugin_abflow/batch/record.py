@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from hugin_abflow.errors import ExitCode
-from hugin_abflow.scratch import is_special, part_beside
+from hugin_abflow.scratch import part_beside
 
 Result = Literal["made", "skipped", "failed"]
 
@@ -66,20 +66,17 @@ class Record:
         return {**values, "project": str(self.project), "exit_code": int(self.exit_code)}
 
 
-def write_json(path: Path, values: object) -> None:
-    """Write values as readable JSON. Raises OSError.
-
-    A file is written whole or not at all, through links; a pipe or a device directly.
-    """
+def as_json(values: object) -> bytes:
+    """Readable JSON."""
     # names that are not UTF-8 stay readable for JSON's readers as escapes
-    text = json.dumps(values, indent=2, ensure_ascii=False).encode("utf-8", "backslashreplace")
-    if is_special(path):
-        path.write_bytes(text + b"\n")
-        return
-    final = Path(os.path.realpath(path))  # through a link: replace what it points to, not the link
+    return json.dumps(values, indent=2, ensure_ascii=False).encode("utf-8", "backslashreplace") + b"\n"
+
+
+def write_json(final: Path, values: object) -> None:
+    """Write values as JSON; a file, or a link, is replaced whole or not at all. Raises OSError."""
     with part_beside(final) as part:
         with part.open("wb") as file:
-            file.write(text + b"\n")
+            file.write(as_json(values))
             file.flush()
             os.fsync(file.fileno())  # else a power cut may leave an empty file of the final name
         part.replace(final)

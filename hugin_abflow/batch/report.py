@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Sequence
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
 from hugin_abflow.batch.display import duration, name_of
-from hugin_abflow.batch.record import Record, write_json
+from hugin_abflow.batch.record import Record, as_json, write_json
 from hugin_abflow.errors import OutputError
 from hugin_abflow.memory import size
 from hugin_abflow.metadata import PROGRAM, version
+from hugin_abflow.scratch import is_special
 from hugin_abflow.terminal import console
 
 SCHEMA = 1
@@ -44,9 +46,17 @@ def print_table(records: Sequence[Record]) -> None:
 
 
 def write_report(path: Path, records: Sequence[Record], arguments: Sequence[str]) -> None:
-    """Write the report as `write_json` does. Raises `OutputError`."""
+    """Write the report: whole or not at all, through links; into a pipe, a device or stdout directly.
+
+    Raises `OutputError`.
+    """
+    report = summary(records, arguments)
     try:
-        write_json(path, summary(records, arguments))
+        if is_special(path):
+            with path.open("ab") as file:  # stdout may be a file, in which the panoramas' names stay
+                file.write(as_json(report))
+        else:
+            write_json(Path(os.path.realpath(path)), report)  # what a link leads to, not the link
     except OSError as error:
         raise OutputError(
             f"{path} cannot be written: {error.strerror}; name another file with --report"
