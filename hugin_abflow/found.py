@@ -122,9 +122,10 @@ def is_another_projects(plan: Plan, file: Path) -> bool:
     own = plan.file.parent.resolve() / plan.file.name
     for project in (file.with_suffix(ending) for ending in (".pto", ".PTO")):
         named = project.parent.resolve() / project.name
+        if not is_file(named) or named == own:
+            continue
         # where case is ignored both names may be the plan's
-        linked = own.is_symlink() or named.is_symlink()
-        if named.is_file() and named != own and (linked or not named.samefile(own)):
+        if own.is_symlink() or named.is_symlink() or not named.samefile(own):
             return True
     return False
 

@@ -10,7 +10,13 @@ import pytest
 import tifffile
 from conftest import ICC, names_in, photo_pixels, remap
 
-from hugin_abflow.errors import ImageReadError, LayersMismatchError, NonaFailedError, ProjectError
+from hugin_abflow.errors import (
+    ImageReadError,
+    LayersMismatchError,
+    NonaFailedError,
+    OutputError,
+    ProjectError,
+)
 from hugin_abflow.nona import open_layers
 from hugin_abflow.project import read_plan
 
@@ -68,6 +74,11 @@ def test_a_project_with_a_name_as_long_as_file_systems_take(make_project, nona):
     plan = read_plan(project.rename(project.with_name("ö" * 125 + "a.pto")))
     with open_layers(plan) as layers:
         assert len(layers) == 3
+    with (
+        pytest.raises(OutputError, match=r"0000\.tif cannot be written: .*; leave out --keep-layers"),
+        open_layers(plan, keep_layers=True),
+    ):
+        pass
 
 
 def test_photo_that_must_not_be_read(make_project, nona, as_nobody):
