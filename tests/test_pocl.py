@@ -307,6 +307,22 @@ def test_disks_that_hold_no_programs_are_passed_over(
 
 
 @only_linux
+def test_a_named_cache_that_holds_no_programs_is_not_used(
+    monkeypatch: pytest.MonkeyPatch, nobody: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """PoCL would end the process, or have no device."""
+    monkeypatch.setenv("POCL_CACHE_DIR", str(nobody))
+    pocl.find_cache()
+    assert pocl.kernel_folder() == nobody and not caplog.messages
+    monkeypatch.setenv("POCL_CACHE_DIR", str(tmp_path / "home" / "cache"))  # home is no folder
+    for _ in range(2):
+        pocl.find_cache()
+    assert "POCL_CACHE_DIR" not in os.environ
+    (said,) = caplog.messages
+    assert f"{tmp_path}/home/cache, which cannot hold" in said and "32 MiB" in said
+
+
+@only_linux
 def test_no_place_for_a_cache_is_said(
     monkeypatch: pytest.MonkeyPatch, nobody: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
