@@ -152,8 +152,11 @@ def test_the_error_reaches_another_process() -> None:
 
 @pytest.mark.parametrize(
     ("line", "token"),
-    [(b"p w0", "w0"), (b"p v-5", "v-5"), (b"p S1,2,3", "S1,2,3"), (b'p P"1 x"', 'P"1 x"'), (b"p Rx", "Rx")],
-)
+    [
+        (b"p w0", "w0"), (b"p v-5", "v-5"), (b"p S1,2,3", "S1,2,3"), (b'p P"1 x"', 'P"1 x"'), (b"p Rx", "Rx"),
+        (b"p Snan,1,2,3", "Snan,1,2,3"),
+    ],
+)  # fmt: skip
 def test_p_lines(line: bytes, token: str) -> None:
     with pytest.raises(PtoError) as caught:
         pto.loads(b"\xef\xbb\xbf# x\n" + line)
