@@ -31,7 +31,7 @@ _RIVALS = (
     ("resume", "force", "--resume and --force contradict each other"),
     ("prefix", "layers", "--prefix and --layers both name the layers; give one of them"),
 )
-# Parameters that say what is made of which files; `stitch.show_project` puts them into its commands.
+# Parameters that say what is made of which files; `shown.show_project` puts them into its commands.
 _OF_FILES = frozenset(
     {"output", "prefix", "layers", "remap", "keep_layers", "compression", "jpeg_quality"}
 )  # fmt: skip

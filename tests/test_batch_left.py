@@ -15,6 +15,7 @@ from conftest import ProjectMaker, age, names_in, require_program
 from shoots import Deaf, write_project
 
 from hugin_abflow import cli, scratch
+from hugin_abflow.asked import asked_panoramas
 from hugin_abflow.batch import pool, run, task
 from hugin_abflow.batch.record import Record
 from hugin_abflow.batch.task import Task, perform
@@ -24,7 +25,8 @@ from hugin_abflow.metadata import saved_by
 from hugin_abflow.outputs import Kind
 from hugin_abflow.project import read_plan
 from hugin_abflow.settings import Settings
-from hugin_abflow.stitch import asked_panoramas, show_project, stitch_project
+from hugin_abflow.shown import show_project
+from hugin_abflow.stitch import stitch_project
 from hugin_abflow.tifftags import MAIN
 
 GIMP = "GIMP 2.10"

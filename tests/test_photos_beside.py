@@ -12,6 +12,7 @@ from test_hugin import CANVAS
 from test_stitch import asked
 
 from hugin_abflow import cli
+from hugin_abflow.asked import asked_panoramas
 from hugin_abflow.batch.task import Task, perform
 from hugin_abflow.errors import OutputError
 from hugin_abflow.exif import Metadata, embed, text
@@ -19,7 +20,8 @@ from hugin_abflow.images import ENDINGS, write_image
 from hugin_abflow.outputs import Kind, results
 from hugin_abflow.project import read_plan
 from hugin_abflow.settings import Settings
-from hugin_abflow.stitch import asked_panoramas, show_project, stitch_project
+from hugin_abflow.shown import show_project
+from hugin_abflow.stitch import stitch_project
 from hugin_abflow.tifftags import EXIF, MAIN, RATIONAL, Value
 
 EXPOSURE_TIME = {33434: Value(RATIONAL, (1).to_bytes(4, "little") + (250).to_bytes(4, "little"))}

@@ -32,7 +32,8 @@ from hugin_abflow.images import read_layer
 from hugin_abflow.merge import merge_project
 from hugin_abflow.outputs import Kind
 from hugin_abflow.settings import Settings
-from hugin_abflow.stitch import show_project, stitch_project
+from hugin_abflow.shown import show_project
+from hugin_abflow.stitch import stitch_project
 
 __all__ = ["one_device"]
 PART = 'f2 w400 h200 v250 S20,380,10,180 n"TIFF_m c:LZW r:CROP"'

@@ -18,7 +18,7 @@ from hugin_abflow.batch.report import print_table, write_report
 from hugin_abflow.batch.task import Task, left_alone
 from hugin_abflow.errors import AbflowError, ExitCode, OutputError, SameOutputError
 from hugin_abflow.oneline import commented
-from hugin_abflow.stitch import show_project
+from hugin_abflow.shown import show_project
 from hugin_abflow.targets import unwritable
 from hugin_abflow.terminal import complain, label, messages, print_path, print_result, say
 

@@ -17,6 +17,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
+from hugin_abflow.asked import asked_panoramas, is_more_asked, names_one
 from hugin_abflow.batch.record import Record, write_json
 from hugin_abflow.errors import AbflowError, ImageReadError
 from hugin_abflow.found import layers_there
@@ -25,7 +26,6 @@ from hugin_abflow.jpeg import is_cut
 from hugin_abflow.metadata import saved_by, version
 from hugin_abflow.outputs import checked_outputs, impossible, possible_outputs, results
 from hugin_abflow.project import read_plan
-from hugin_abflow.stitch import asked_panoramas, is_more_asked, names_one
 
 _log = logging.getLogger(__name__)
 

@@ -20,7 +20,8 @@ from hugin_abflow.errors import AbflowError, ExitCode, NonaMissingError, OutputE
 from hugin_abflow.outputs import Kind
 from hugin_abflow.project import read_plan
 from hugin_abflow.settings import Settings
-from hugin_abflow.stitch import show_project, stitch_project
+from hugin_abflow.shown import show_project
+from hugin_abflow.stitch import stitch_project
 
 __all__ = ["one_device", "programs"]
 pytestmark = pytest.mark.usefixtures("one_device")
