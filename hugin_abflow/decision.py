@@ -105,7 +105,8 @@ def decide(
     gain = parameters.gain if last else parameters.early_gain
     trusted = trusted_misfit(plain, found, parameters.gap, wraps)
     shows = common & textured()
-    tells = shows if shows.any() else common  # what shows nothing is explained by any flow alike
+    # what shows nothing is explained by any flow alike; a small thing alone does not tell of all the rest
+    tells = shows if shows.sum() >= parameters.tells * common.sum() else common
     gained = trusted[tells].mean() <= gain * plain.misfit[tells].mean()
     if gained and (not last or apart.sum() >= parameters.wide * common.sum()):
         return Decision(True)

@@ -60,6 +60,7 @@ class SearchParameters:
     gain_apart: float = 0.75  # where it leads elsewhere, if motion there is that of what stands still
     gain_back: float = 0.9  # and if it goes either way, if only what leads back explains anything
     textured: float = 0.02  # gradient of h from which on a pixel tells motion
+    tells: float = 0.1  # the share of the overlap that has to be textured for all to be judged by that
     gap: float = 2.0  # px of a level between start and return from which on flow is not consistent
     always: bool = False  # keep what is found, whatever becomes of it
     # px from which flow is taken over, in turns, per level as for `radius`: short on finer levels, where the

@@ -68,8 +68,16 @@ def test_what_shows_nothing_does_not_tell() -> None:
     found.misfit[np.where(letters, found.flows[..., 0] != 0, False)] = 0.02
     assert decision.decide(plain, found, 1, 1, lambda: letters, None, False, HOW).found
     assert not decision.decide(plain, found, 1, 1, textured, None, False, HOW).found
-    # where nothing shows anything all counts
+    # where nothing shows anything, or only a small thing, all counts
     assert not decision.decide(plain, found, 1, 1, untextured, None, False, HOW).found
+    letters[:, :, : WIDTH // 3] = False
+    letters[:, :, 2 * WIDTH // 3 :] = False
+    assert letters.mean() > HOW.tells
+    assert decision.decide(plain, found, 1, 1, lambda: letters, None, False, HOW).found
+    letters[:, 1::2] = False
+    letters[:, :21] = False
+    assert letters.mean() < HOW.tells
+    assert not decision.decide(plain, found, 1, 1, lambda: letters, None, False, HOW).found
 
 
 def bearings(places: np.ndarray) -> np.ndarray:
