@@ -7,12 +7,12 @@ import os
 import re
 import shutil
 import subprocess
-from collections import deque
-from collections.abc import Callable, Iterator, Sequence
+from collections import Counter, deque
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
-from typing import get_args
+from typing import NamedTuple, get_args
 
 from hugin_abflow import programs, pto
 from hugin_abflow.errors import (
@@ -24,6 +24,7 @@ from hugin_abflow.errors import (
     OutputError,
     PhotoMissingError,
     ProgramFailedError,
+    ProgramMissingError,
     SettingsError,
 )
 from hugin_abflow.failures import check_made, failure
@@ -53,7 +54,7 @@ log = logging.getLogger("hugin_abflow.nona")
 # and numbers and endings follow.
 _LONGEST_NAME = 200
 
-_NAMED = 5  # photos that a warning names: a small crop may leave out hundreds
+_NAMED = 5  # photos that a warning names
 
 _STEPS = ("remapping ", "saving ")  # what nona -v says at the end of a photo's loading and remapping
 _LOADING = "loading "  # and at its beginning
@@ -193,10 +194,10 @@ def _make_all(plan: Plan, folder: Path, keep: bool, progress: Progress) -> Found
     prefix = str(plan.folder / plan.layer_prefix(plan.stem))
     refuse_to_make(plan, plan.images, prefix if keep else None, anew=True)
     with progress("remap", len(_STEPS) * len(plan.images)) as advance:
-        code, lines = _run(plan, _project_for_nona(plan, folder), plan.images, folder, [], advance)
+        ended = _run(plan, _project_for_nona(plan, folder), plan.images, folder, [], advance)
     made = _made(plan, folder)
-    if code:
-        raise failure(plan, plan.images, folder, code, lines)
+    if ended.code:
+        raise failure(plan, plan.images, folder, ended.code, ended.lines)
     if not made:
         raise LayersMissingError(
             f"{plan.file}: nona made no layer: it sees no active image that shows anything in the crop; "
@@ -204,7 +205,7 @@ def _make_all(plan: Plan, folder: Path, keep: bool, progress: Progress) -> Found
             "whether the photos are RGB or grey"
         )
     check_made(plan, made)
-    _report_none([image for image in plan.images if image.index not in made])
+    _tell_of_none(plan.images, made, ended.loaded)
     return Found(prefix, _keep(prefix, made) if keep else made)
 
 
@@ -227,30 +228,35 @@ def _make_missing(
 ) -> dict[int, Path]:
     """Have nona make the layers that are not there; images that miss the crop have none."""
     refuse_to_make(plan, missing, prefix if keep else None, anew=False)
-    project, beyond = _project_for_nona(plan, folder), set[int]()
+    project, loaded = _project_for_nona(plan, folder), list[Path]()
     with progress("remap", len(_STEPS) * len(missing)) as advance:
         for image in missing:
-            code, lines = _run(plan, project, [image], folder, ["-i", str(image.index)], advance)
-            if code and f"image with number {image.index}" in " ".join(lines):
-                # nona does not count an image outside the crop as one of the project's
-                log.info("image %d (%s) misses the crop: it has no layer", image.index, image.name)
-                beyond.add(image.index)
-            elif code:
+            ended = _run(plan, project, [image], folder, ["-i", str(image.index)], advance)
+            loaded += ended.loaded
+            # nona does not count an image outside the crop as one of the project's
+            if ended.code and f"image with number {image.index}" not in " ".join(ended.lines):
                 _require_photo(plan, image)
-                raise failure(plan, [image], folder, code, lines)
+                raise failure(plan, [image], folder, ended.code, ended.lines)
     made = _made(plan, folder)
     check_made(plan, made)
-    _report_none([image for image in missing if image.index not in made.keys() | beyond])
+    _tell_of_none(missing, made, loaded)
     return _keep(prefix, made) if keep else made
 
 
-def _report_none(images: Sequence[PlannedImage]) -> None:
-    """Warn of images of which a run of nona that succeeded made no layer: they may be missed."""
-    if not images:
-        return
-    names = ", ".join(image.name for image in images[:_NAMED])
-    more = f" and {len(images) - _NAMED} more" if len(images) > _NAMED else ""
-    log.warning("nona made no layer of %s%s: left out (what lies outside the crop has none)", names, more)
+def _tell_of_none(images: Sequence[PlannedImage], made: Collection[int], loaded: Iterable[Path]) -> None:
+    """Tell of images of which a run of nona that succeeded made no layer: such as it loaded, which does not
+    happen outside the crop, will be missed.
+    """
+    loads = Counter(loaded)
+    loads.subtract(image.photo for image in images if image.index in made)
+    none = [image for image in images if image.index not in made]
+    for image in none:
+        if loads[image.photo] <= 0:
+            log.info("image %d (%s) misses the crop: it has no layer", image.index, image.name)
+    if lost := [image for image in none if loads[image.photo] > 0]:
+        names = ", ".join(image.name for image in lost[:_NAMED])
+        more = f" and {len(lost) - _NAMED} more" if len(lost) > _NAMED else ""
+        log.warning("nona made no layer of %s%s: left out; look at their masks in Hugin", names, more)
 
 
 def _require_photo(plan: Plan, image: PlannedImage) -> None:
@@ -266,6 +272,16 @@ def _require_photo(plan: Plan, image: PlannedImage) -> None:
         )
 
 
+class _Ended(NamedTuple):
+    """How nona ended: its exit code, its last lines, and the photos that it had loaded, each as often as it
+    had.
+    """
+
+    code: int
+    lines: list[str]
+    loaded: list[Path]
+
+
 def _run(
     plan: Plan,
     project: Path,
@@ -273,14 +289,14 @@ def _run(
     folder: Path,
     options: list[str],
     advance: Callable[[int], None],
-) -> tuple[int, list[str]]:
-    """Run nona as Hugin does; its exit code and last lines. It does not outlive an exception.
+) -> _Ended:
+    """Run nona as Hugin does. It does not outlive an exception.
 
-    Raises `ImageReadError` for a photo of which pixels are missing.
+    Raises `ImageReadError` for a photo of which pixels are missing, `NonaMissingError`, `NonaFailedError`.
     """
     command = remapping(plan, options, _prefix(plan, folder), str(project))
     lines: deque[str] = deque(maxlen=LAST_LINES)
-    photo, doubts = plan.file, set[str]()
+    loaded, doubts = list[Path](), set[str]()
     try:
         with started(command, stdin=subprocess.DEVNULL, stderr=subprocess.STDOUT) as process:
             assert process.stdout is not None
@@ -291,13 +307,16 @@ def _run(
                 if line.startswith(_STEPS):
                     advance(1)
                 elif line.startswith(_LOADING):
-                    photo = plan.folder / line.removeprefix(_LOADING).strip()
+                    loaded.append(plan.folder / line.removeprefix(_LOADING).strip())
                 elif _LOSS in line:
+                    photo = loaded[-1] if loaded else plan.file
                     raise ImageReadError(
                         f"{photo} is damaged ({line.strip()}); copy it from the camera again"
                     )
                 elif any(mark in line for mark in _DOUBTS):
                     doubts.add(line.strip())
+    except ProgramMissingError as error:  # it is there, but not its interpreter
+        raise NonaMissingError(f"{error}; or name layers that exist with --prefix or --layers") from None
     except ProgramFailedError as error:
         raise NonaFailedError(str(error)) from None
     for doubt in sorted(doubts):
@@ -306,7 +325,7 @@ def _run(
         log.warning(
             "%s may be damaged (%s); look at the panorama", ", ".join(cut) or "one of the photos", doubt
         )
-    return process.returncode, list(lines)
+    return _Ended(process.returncode, list(lines), loaded)
 
 
 def remapping(plan: Plan, options: Sequence[str], prefix: str, project: str) -> list[str]:

@@ -14,6 +14,7 @@ from hugin_abflow.errors import (
     ImageReadError,
     LayersMismatchError,
     NonaFailedError,
+    NonaMissingError,
     OutputError,
     ProjectError,
 )
@@ -179,6 +180,17 @@ def test_nona_without_memory(make_project, tmp_path, monkeypatch):
     assert "TMPDIR" not in str(error.value)
 
 
+def test_nona_that_has_no_interpreter(make_project, tmp_path, monkeypatch):
+    (tmp_path / "nona").write_text("#!/nowhere/sh\n")
+    (tmp_path / "nona").chmod(0o755)
+    monkeypatch.setenv("PATH", str(tmp_path))
+    with (
+        pytest.raises(NonaMissingError, match="nona cannot be run; or name layers that exist with --prefix"),
+        open_layers(read_plan(make_project())),
+    ):
+        pass
+
+
 def test_nona_that_must_not_be_run(make_project, tmp_path, monkeypatch):
     """As where it was copied from a file system that knows no permissions."""
     (tmp_path / "nona").write_text("#!/bin/sh\n")
@@ -201,6 +213,16 @@ def test_photos_are_named_of_which_layers_were_made(make_project, nona, caplog):
         assert "of photo 0.tif: photo 1.tif;" in caplog.text
 
 
+def test_photos_outside_the_crop_are_no_reason_to_warn(make_project, nona, caplog):
+    """Somebody has cropped them off."""
+    panorama = 'f2 w600 h300 v360 k0 E0 R0 S250,350,100,200 n"TIFF_m c:LZW r:CROP"'
+    plan = read_plan(make_project(panorama=panorama, yaws=(0, 20, 180)))
+    with caplog.at_level("INFO", "hugin_abflow"), open_layers(plan) as layers:
+        assert len(layers) == 2
+    assert "image 2 (photo 2.tif) misses the crop" in caplog.text
+    assert not any(record.levelname == "WARNING" for record in caplog.records)
+
+
 @pytest.mark.skipif(os.name == "nt", reason="the stand-in is a shell script")
 def test_photos_of_which_nona_makes_no_layer_are_told(make_project, nona, tmp_path, monkeypatch, caplog):
     """Also of one that was to be made beside others; a small crop may leave out many, and few are named."""
@@ -215,8 +237,8 @@ def test_photos_of_which_nona_makes_no_layer_are_told(make_project, nona, tmp_pa
     with open_layers(plan, keep_layers=True) as layers:
         assert len(layers) == 1
     names = ", ".join(image.name for image in plan.images[1:6])
-    assert f"nona made no layer of {names} and 1 more: left out" in caplog.text
+    assert f"nona made no layer of {names} and 1 more: left out;" in caplog.text
     caplog.clear()
     with open_layers(replace(plan, images=plan.images[:2])) as layers:
         assert len(layers) == 1
-    assert f"nona made no layer of {plan.images[1].name}: left out" in caplog.text
+    assert f"nona made no layer of {plan.images[1].name}: left out;" in caplog.text
