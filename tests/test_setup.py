@@ -117,16 +117,19 @@ def test_edited_sequences_are_kept_beside_them(hugin: Places, programs: Path) ->
     """Each edit once, told, under a name that Hugin does not list; where programs lie is none."""
     setup.install(hugin)
     (edited, other, *_) = sorted(Path(hugin.data).iterdir())
-    other.write_bytes(other.read_bytes().replace(bytes(programs), b"/else where"))
+    moved = other.read_bytes().replace(bytes(programs), b"/else where")
+    other.write_bytes(moved.replace(b"\n", b"\r\n"))  # as editors of Windows save it
     shipped = edited.read_bytes()
     first, second = shipped + b"# mine \xff\n", shipped.replace(b"[Step0]", b"[Step0]\nKeep=1")
     for content in (first, second, first):
         edited.write_bytes(content)
         planned = setup.install(hugin, dry_run=True)
         assert edited.read_bytes() == content and setup.install(hugin) == planned
-        assert f"{edited} was changed" in planned[0] and edited.read_bytes() == shipped
+        assert f"{edited} differs" in planned[0] and edited.read_bytes() == shipped
     edited.write_bytes(second)
-    assert f"{edited} was changed since it was installed: it is kept as" in "\n".join(setup.uninstall(hugin))
+    assert f"{edited} differs from what this version installs: it is kept as" in "\n".join(
+        setup.uninstall(hugin)
+    )
     kept = {f"{edited.name}.edited": first, f"{edited.name}.edited2": second}
     assert files(Path(hugin.data)) == kept
 

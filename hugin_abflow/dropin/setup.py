@@ -98,14 +98,15 @@ def _keep_edited(path: Path, shipped: str, dry_run: bool) -> list[str]:
     copies = (path.with_name(path.name + ending) for ending in endings)
     copy = next(copy for copy in copies if _read(copy) in (None, now))  # a second edit is another one
     return [
-        f"{path} was changed since it was installed: it is kept as {copy.name}",
+        f"{path} differs from what this version installs: it is kept as {copy.name}; to have it in Hugin's "
+        "menu, give it a name of its own that ends in .executor",
         *_write(copy, now, dry_run),
     ]
 
 
 def _by_name(sequence: str) -> str:
     """A sequence that calls our programs wherever they are."""
-    return _OURS.sub(r"Program=\1", sequence)
+    return _OURS.sub(r"Program=\1", sequence.replace("\r\n", "\n"))
 
 
 def _set_preferences(places: Places, blender: str, dry_run: bool) -> list[str]:
