@@ -21,6 +21,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from functools import partial
 from pathlib import Path
+from typing import TextIO
 
 from hugin_abflow.errors import OutputError
 
@@ -56,6 +57,17 @@ def is_special(path: Path) -> bool:
     if stat.S_ISDIR(mode):
         return False
     return not stat.S_ISREG(mode) or _leads_to_open_file(path)
+
+
+def open_to_add(path: Path, buffering: int = -1) -> TextIO:
+    """A file to the end of which text is added. Where it is our stdout or stderr, their own place in it moves
+    along: what is printed next comes behind. Raises OSError.
+    """
+    for number in (1, 2):
+        with suppress(OSError):  # closed, or nothing is there
+            if os.path.samestat(os.fstat(number), path.stat()):
+                return os.fdopen(os.dup(number), "a", buffering, "utf-8", "backslashreplace")
+    return path.open("a", buffering, "utf-8", "backslashreplace")
 
 
 def _leads_to_open_file(path: Path) -> bool:

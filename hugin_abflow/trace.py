@@ -17,7 +17,7 @@ from typing import Any, TextIO
 
 from hugin_abflow.errors import OutputError
 from hugin_abflow.progress import Advance, Progress
-from hugin_abflow.scratch import is_special
+from hugin_abflow.scratch import is_special, open_to_add
 
 # What is told of: steps of a run; work on the device; files; copies between host and device.
 PHASE, KERNEL, FILE, TRANSFER = "phase", "kernel", "file", "transfer"
@@ -101,8 +101,8 @@ def recording(path: Path | None) -> Iterator[None]:
         yield
         return
     try:
-        # now: a run may be long; stdout may be a file, in which the panoramas' names stay
-        file = path.open("a" if is_special(path) else "w", encoding="utf-8")
+        # now: a run may be long
+        file = open_to_add(path) if is_special(path) else path.open("w", encoding="utf-8")
     except OSError as error:
         raise _unwritable(path, error) from None
     recorder = _recorder = _Recorder()

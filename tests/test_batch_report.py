@@ -198,10 +198,11 @@ def test_stdout_gets_one_report_also_where_it_is_a_file(tmp_path: Path) -> None:
     folder = os.environ | {"PYTHONPATH": str(Path(__file__).resolve().parent.parent)}
     with (tmp_path / "out").open("w") as out:
         subprocess.run(command, check=True, cwd=tmp_path, env=folder, stdout=out)
+        out.write("next")  # as of a script's next command
     name, _, rest = (tmp_path / "out").read_text().partition("\n")
     report, end = json.JSONDecoder().raw_decode(rest)
     assert Path(name).name == "a.tif" and report["made"] == 1
-    assert json.loads(rest[end:])["traceEvents"]
+    assert json.loads(rest[end:].removesuffix("next"))["traceEvents"] and rest.endswith("next")
     assert {path.name for path in tmp_path.iterdir()} == {
         "a.pto", "a0000.tif", "a0001.tif", "a.tif", "link", "out"
     }  # fmt: skip

@@ -16,6 +16,7 @@ from hugin_abflow.batch.task import Task
 from hugin_abflow.errors import OutputError
 from hugin_abflow.memory import size
 from hugin_abflow.progress import Advance
+from hugin_abflow.scratch import open_to_add
 from hugin_abflow.terminal import console, display_progress, label, on_terminal, say
 
 _WIDEST = 40  # characters of a project's name before a bar
@@ -65,7 +66,7 @@ def open_log(path: Path | None) -> Iterator[TextIO | None]:
         yield None
         return
     try:
-        file = path.open("a", encoding="utf-8", errors="backslashreplace", buffering=1)
+        file = open_to_add(path, buffering=1)
     except OSError as error:
         raise OutputError(
             f"{path} cannot be written: {error.strerror}; name another file with --log"

@@ -13,7 +13,7 @@ from hugin_abflow.batch.record import Record, as_json, write_json
 from hugin_abflow.errors import OutputError
 from hugin_abflow.memory import size
 from hugin_abflow.metadata import PROGRAM, version
-from hugin_abflow.scratch import is_special
+from hugin_abflow.scratch import is_special, open_to_add
 from hugin_abflow.terminal import console
 
 SCHEMA = 1
@@ -53,8 +53,8 @@ def write_report(path: Path, records: Sequence[Record], arguments: Sequence[str]
     report = summary(records, arguments)
     try:
         if is_special(path):
-            with path.open("ab") as file:  # stdout may be a file, in which the panoramas' names stay
-                file.write(as_json(report))
+            with open_to_add(path) as file:
+                file.write(as_json(report).decode())
         else:
             write_json(Path(os.path.realpath(path)), report)  # what a link leads to, not the link
     except OSError as error:
