@@ -12,7 +12,7 @@ import click
 
 from hugin_abflow import memory
 from hugin_abflow.errors import SettingsError
-from hugin_abflow.formats import holds_text
+from hugin_abflow.formats import holds_text, picture_format
 from hugin_abflow.images import COMPRESSIONS, ENDINGS
 from hugin_abflow.scratch import is_special
 from hugin_abflow.settings import MOST_MEMORY, Settings
@@ -84,11 +84,11 @@ class Text(click.ParamType):  # type: ignore[type-arg]
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> str:
         """The text; ends with click's message where there is none."""
-        _refuse_empty(self, value, param, ctx)
+        _refuse_no_name(self, value, param, ctx)
         return str(value)
 
 
-def _refuse_empty(
+def _refuse_no_name(
     kind: click.ParamType,  # type: ignore[type-arg]
     value: object,
     param: click.Parameter | None,
@@ -96,6 +96,8 @@ def _refuse_empty(
 ) -> None:
     if value == "":  # of a path pathlib would make the current folder
         kind.fail("it is empty; name something, or leave it out (is a variable not set?)", param, ctx)
+    if isinstance(value, str) and "\0" in value:
+        kind.fail("it has a NUL, which no file's name has; choose another", param, ctx)
 
 
 class OldFile(click.Path):
@@ -108,7 +110,7 @@ class OldFile(click.Path):
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Path:
         """Its path; ends with click's message where it has no name."""
-        _refuse_empty(self, value, param, ctx)
+        _refuse_no_name(self, value, param, ctx)
         return Path(os.fsdecode(super().convert(value, param, ctx)))
 
 
@@ -123,7 +125,7 @@ class NewFile(click.Path):
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Path:
         """Its path; ends with click's message for none, or a project or a photo, also behind a link."""
-        _refuse_empty(self, value, param, ctx)
+        _refuse_no_name(self, value, param, ctx)
         path = Path(os.fsdecode(super().convert(value, param, ctx)))
         for name in (str(path).lower(), os.path.realpath(path).lower()):
             if name.endswith(".pto"):
@@ -131,7 +133,7 @@ class NewFile(click.Path):
             if name.endswith(tuple(ENDINGS)) and not self.image:
                 self.fail(f"{value} is an image by its name; name another file", param, ctx)
         if not self.image and not _may_be_text(path):
-            self.fail(f"{value} is there, and is no text; name another file, or remove it", param, ctx)
+            self.fail(f"{value} is there, and may be a photo: it is no text; name another file", param, ctx)
         return path
 
 
@@ -140,7 +142,8 @@ def _may_be_text(path: Path) -> bool:
     with suppress(OSError):  # writing will tell what is the matter
         if not is_special(path):  # who opens a pipe waits until somebody writes
             with path.open("rb") as file:
-                return holds_text(file.read(_BEGINNING))
+                data = file.read(_BEGINNING)
+            return holds_text(data) and picture_format(data) is None
     return True
 
 

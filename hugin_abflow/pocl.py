@@ -8,8 +8,8 @@ compiler does not end. Either device is given the name of another processor.
 
 **A home that cannot be written**, as in containers, and of services. PoCL keeps what it compiled there, and
 offers no device if it cannot; pyopencl fails as well. On a full disk, or one that no program may be run from,
-it ends the process. They are given a folder among temporary files. POCL_CACHE_DIR is
-passed over where it names such a place.
+it ends the process. They are given a folder among temporary files. POCL_CACHE_DIR is passed over where it
+names such a place.
 
 **Empty files among what it compiled**, as a power cut or a full disk leaves them. PoCL takes them for whole:
 each run after that is ended by the system, or finds programs without kernels. They are removed.
@@ -75,10 +75,11 @@ def find_cache() -> None:
     """
     if sys.platform != "linux":
         return
-    if (named := os.environ.get("POCL_CACHE_DIR")) and not _holds_programs(Path(named)):
+    named = os.environ.get("POCL_CACHE_DIR")
+    if named is not None and not (named and _holds_programs(Path(named))):
         del os.environ["POCL_CACHE_DIR"]
         _log.warning(
-            "POCL_CACHE_DIR is %s, which cannot hold compiled kernels, and is not used: name a folder that "
+            "POCL_CACHE_DIR is '%s', which cannot hold compiled kernels, and is not used: name a folder that "
             "you can write, with %d MiB of room, on a disk from which programs may be run, or unset it",
             named,
             _LEAST_ROOM >> 20,

@@ -65,7 +65,7 @@ def test_environment_that_may_hide_devices_is_named(
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="other systems have other loaders")
-@pytest.mark.parametrize("name", ["OCL_ICD_VENDORS", "POCL_DEVICES"])  # on Linux the third is removed
+@pytest.mark.parametrize("name", ["OCL_ICD_VENDORS", "POCL_DEVICES"])  # find_cache removes POCL_CACHE_DIR
 def test_environment_that_hides_devices_is_named_by_the_program(name: str) -> None:
     """These variables really do what the message says; they are read when OpenCL is loaded."""
     if "Portable" not in Device().device.platform.name:

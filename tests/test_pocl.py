@@ -319,7 +319,10 @@ def test_a_named_cache_that_holds_no_programs_is_not_used(
         pocl.find_cache()
     assert "POCL_CACHE_DIR" not in os.environ
     (said,) = caplog.messages
-    assert f"{tmp_path}/home/cache, which cannot hold" in said and "32 MiB" in said
+    assert f"'{tmp_path}/home/cache', which cannot hold" in said and "32 MiB" in said
+    monkeypatch.setenv("POCL_CACHE_DIR", "")  # which is no folder
+    pocl.find_cache()
+    assert "POCL_CACHE_DIR" not in os.environ and "POCL_CACHE_DIR is ''" in caplog.messages[1]
 
 
 @only_linux

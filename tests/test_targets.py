@@ -57,7 +57,7 @@ def test_names_that_differ_by_case_are_one_where_the_file_is(tmp_path: Path) -> 
 
 @pytest.mark.parametrize("option", ["--log", "--report", "--profile"])
 @pytest.mark.parametrize(
-    ("name", "why"), [("none/a", "No such file"), ("file/a", "Not a dir"), ("folder", "")]
+    ("name", "why"), [("none/a", "No such file"), ("file/a", "Not a dir"), ("folder", "Is a directory")]
 )
 @pytest.mark.skipif(sys.platform == "win32", reason="says it in other words")
 def test_what_the_run_could_not_write_is_refused_where_it_is_only_shown(

@@ -143,8 +143,8 @@ class Keys:
         """The key of a token and where its value begins.
 
         A token with an unknown key is kept as it is. A known key with a value of the wrong type raises
-        `PtoError`, except where the letters go on and make an unknown key (``ve5`` is not ``v``); one with a
-        comma behind it is a list's first item (``Snan,1,2,3``).
+        `PtoError`, except where the letters go on and make an unknown key: ``ve5`` is not ``v``, but
+        ``Snan,1,2,3`` is a crop.
         """
         found = self._known.match(token)
         name = _NAME.match(token)
@@ -152,7 +152,8 @@ class Keys:
             key, accepts = self._accepts[found[0]]
             if accepts(token[found.end() :]):
                 return key, found.end()
-            if not name or name.end() <= found.end() or token[name.end() :][:1] in (b"", b","):
+            rest = token[name.end() :] if name and name.end() > found.end() else b""
+            if not rest or (rest.startswith(b",") and self.types[key] is BOX):
                 raise PtoError(file, line, show(token), f"{self.types[key].expected} after '{key}'")
         if name:
             return name[0].decode(), name.end()
