@@ -56,6 +56,9 @@ _LONGEST_NAME = 200
 
 _NAMED = 5  # photos that a warning names
 
+# What to do where nona cannot make layers, beside mending that.
+_OTHERWISE = "or name layers that exist with --prefix or --layers"
+
 _STEPS = ("remapping ", "saving ")  # what nona -v says at the end of a photo's loading and remapping
 _LOADING = "loading "  # and at its beginning
 # What libtiff and libjpeg say of a photo that nona remaps as if it were whole: pixels are missing; or may
@@ -268,7 +271,7 @@ def _require_photo(plan: Plan, image: PlannedImage) -> None:
     if not is_file(image.photo):
         raise PhotoMissingError(
             f"{image.photo} (image {image.index}) is not there, or its folder is closed to you, and its "
-            "layer must be made from it; put it back, or name layers that exist with --prefix or --layers"
+            f"layer must be made from it; put it back, {_OTHERWISE}"
         )
 
 
@@ -316,7 +319,7 @@ def _run(
                 elif any(mark in line for mark in _DOUBTS):
                     doubts.add(line.strip())
     except ProgramMissingError as error:  # it is there, but not its interpreter
-        raise NonaMissingError(f"{error}; or name layers that exist with --prefix or --layers") from None
+        raise NonaMissingError(f"{error}; {_OTHERWISE}") from None
     except ProgramFailedError as error:
         raise NonaFailedError(str(error)) from None
     for doubt in sorted(doubts):
@@ -381,9 +384,7 @@ def refuse_to_make(plan: Plan, images: Sequence[PlannedImage], kept_as: str | No
     for image in images if anew else ():  # beside other layers it may miss the crop, and need no photo
         _require_photo(plan, image)
     if shutil.which("nona", os.F_OK) is None:  # why one that is there cannot be run is told when it is
-        raise NonaMissingError(
-            f"{programs.missing('nona')}; or name layers that exist with --prefix or --layers"
-        )
+        raise NonaMissingError(f"{programs.missing('nona')}; {_OTHERWISE}")
 
 
 def _refuse_to_keep(plan: Plan, images: Sequence[PlannedImage], prefix: str) -> None:

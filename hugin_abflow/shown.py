@@ -43,9 +43,8 @@ def show_project(
     """What `stitch.stitch_project` would do, as lines of a shell script: a comment on the plan, then the
     commands.
 
-    options     of our own command line that say how to blend; the other arguments are
-                `stitch_project`'s.
-                Of settings and metadata the commands know by these options alone.
+    options     of our own command line that say how to blend; the other arguments are `stitch_project`'s. Of
+                settings and metadata the commands know by these options alone.
 
     As the run does, the script makes what is no output in a temporary folder, so that nothing is replaced but
     outputs. It ends at the first error. Photos that miss the crop, which nona tells later, are taken for part

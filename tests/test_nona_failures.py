@@ -180,26 +180,26 @@ def test_nona_without_memory(make_project, tmp_path, monkeypatch):
     assert "TMPDIR" not in str(error.value)
 
 
-def test_nona_that_has_no_interpreter(make_project, tmp_path, monkeypatch):
-    (tmp_path / "nona").write_text("#!/nowhere/sh\n")
-    (tmp_path / "nona").chmod(0o755)
+@pytest.mark.parametrize(
+    ("interpreter", "mode", "raised", "said"),
+    [
+        (
+            "/nowhere/sh",
+            0o755,
+            NonaMissingError,
+            "nona cannot be run; or name layers that exist with --prefix",
+        ),
+        ("/bin/sh", 0o644, NonaFailedError, "nona cannot be run: Permission denied"),
+    ],
+)
+def test_nona_that_is_there_and_cannot_be_run(
+    make_project, tmp_path, monkeypatch, interpreter, mode, raised, said
+):
+    """As where it was copied from another machine, or a file system that knows no permissions."""
+    (tmp_path / "nona").write_text(f"#!{interpreter}\n")
+    (tmp_path / "nona").chmod(mode)
     monkeypatch.setenv("PATH", str(tmp_path))
-    with (
-        pytest.raises(NonaMissingError, match="nona cannot be run; or name layers that exist with --prefix"),
-        open_layers(read_plan(make_project())),
-    ):
-        pass
-
-
-def test_nona_that_must_not_be_run(make_project, tmp_path, monkeypatch):
-    """As where it was copied from a file system that knows no permissions."""
-    (tmp_path / "nona").write_text("#!/bin/sh\n")
-    (tmp_path / "nona").chmod(0o644)
-    monkeypatch.setenv("PATH", str(tmp_path))
-    with (
-        pytest.raises(NonaFailedError, match="nona cannot be run: Permission denied"),
-        open_layers(read_plan(make_project())),
-    ):
+    with pytest.raises(raised, match=said), open_layers(read_plan(make_project())):
         pass
 
 

@@ -66,17 +66,17 @@ class Record:
         return {**values, "project": str(self.project), "exit_code": int(self.exit_code)}
 
 
-def as_json(values: object) -> bytes:
-    """Readable JSON."""
-    # names that are not UTF-8 stay readable for JSON's readers as escapes
-    return json.dumps(values, indent=2, ensure_ascii=False).encode("utf-8", "backslashreplace") + b"\n"
+def as_json(values: object) -> str:
+    """Readable JSON; names that are not UTF-8 are to be written as escapes (``backslashreplace``)."""
+    return json.dumps(values, indent=2, ensure_ascii=False) + "\n"
 
 
 def write_json(final: Path, values: object) -> None:
     """Write values as JSON; a file, or a link, is replaced whole or not at all. Raises OSError."""
     with part_beside(final) as part:
         with part.open("wb") as file:
-            file.write(as_json(values))
+            # names that are not UTF-8 stay readable for JSON's readers
+            file.write(as_json(values).encode("utf-8", "backslashreplace"))
             file.flush()
             os.fsync(file.fileno())  # else a power cut may leave an empty file of the final name
         part.replace(final)

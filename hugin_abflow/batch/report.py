@@ -54,7 +54,7 @@ def write_report(path: Path, records: Sequence[Record], arguments: Sequence[str]
     try:
         if is_special(path):
             with open_to_add(path) as file:
-                file.write(as_json(report).decode())
+                file.write(as_json(report))
         else:
             write_json(Path(os.path.realpath(path)), report)  # what a link leads to, not the link
     except OSError as error:

@@ -91,7 +91,7 @@ def sequences() -> dict[str, str]:
 
 def _keep_edited(path: Path, shipped: str, dry_run: bool) -> list[str]:
     """Copy a sequence that differs from what we ship to a name that Hugin does not list; what was done."""
-    now = _read(path) if path.exists() else None
+    now = _read(path) if path.exists() else None  # where no folder is, writing tells it
     if now is None or _by_name(now) == _by_name(shipped):
         return []
     endings = itertools.chain([".edited"], map(".edited{}".format, itertools.count(2)))
