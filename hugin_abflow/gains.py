@@ -103,41 +103,20 @@ def solve(
     strict: reject outliers earlier, so that what moved stays visible in the residual.
     unknown: (height, width), cells where what is seen tells nothing of exposure, and no difference weighs.
     """
-    cells, inside, differences = measured.grid, measured.inside, measured.differences
-    area = cells.bounded_widths[:, None]
-    number = np.zeros(inside.shape, np.int32)  # of a layer's cell among the unknowns
-    count = int(np.count_nonzero(inside))
-    number[inside] = np.arange(count)
-    evidence = []
-    for d in differences:
-        # what a layer is measured to be beside its own cells binds nothing else
-        both = inside[d.a][d.cells] & inside[d.b][d.cells]
-        evidence.append(d.values[..., 3] * area[d.cells[0]] * both)
-    link, weight = _steps(
-        [(number[d.a][d.cells], number[d.b][d.cells], e) for d, e in zip(differences, evidence, strict=True)],
-        count,
-    )
-    difference = np.concatenate([d.values[e > 0, :3] for d, e in zip(differences, evidence, strict=True)])
-    bounds = _Bounds(measured, number, area, count)
-    step, stiffness = _slopes(inside, area, cells.wraps)
-    smooth = step.T @ scipy.sparse.diags_array(stiffness) @ step
-    if unknown is not None:
-        smooth += _TOGETHER * _apart(measured, number, area, count, unknown)
+    numbering = _Numbering.of(measured)
+    agreement, bounds = _Agreement(measured, numbering), _Bounds(measured, numbering)
+    smooth = _smoothness(measured, numbering, unknown)
+    blocks = _blocks(measured.inside)
     # a step between blocks stands for _BLOCK steps, each of that part of it: their squares are less by that
-    blocks = _blocks(inside)
     smooth_blocks = blocks.T @ smooth @ blocks / _BLOCK
-    own_area = np.broadcast_to(area, inside.shape)[inside]
-    round_ = cells.circumference / (cells.lonlat[1] or 1.0)  # cells
-    solution, solver, rough_solver = np.zeros((count, 3)), _Solver(), _Solver()
+    solution, solver, rough_solver = np.zeros((numbering.count, 3)), _Solver(), _Solver()
     rounds = _STRICT if strict else _ROUNDS
     for data, limit in rounds:
         fade = _TREND_FADE if strict and data < rounds[-1][0] else _FADE
-        hold = own_area / max(1.0, fade * round_) ** 2
-        off = link @ solution + difference if solution.any() else np.zeros_like(difference)
-        trusted = data * weight * _biweight(off, limit)
+        agreeing, towards = agreement.active(solution, data, limit)
         held, pull = bounds.active(solution, limit)
-        data_term = scipy.sparse.diags_array(hold + held) + link.T @ scipy.sparse.diags_array(trusted) @ link
-        wanted = pull - link.T @ (trusted[:, None] * difference)
+        data_term = scipy.sparse.diags_array(_fading(measured, numbering, fade) + held) + agreeing
+        wanted = pull + towards
         if data <= _ROUGH:
             matrix = blocks.T @ data_term @ blocks + smooth_blocks
             solution = blocks @ rough_solver.solve(matrix, blocks.T @ wanted)
@@ -146,20 +125,58 @@ def solve(
     return np.asarray(solution)
 
 
+@dataclass(frozen=True)
+class _Numbering:
+    """The layers' cells as unknowns, in the order of `np.nonzero(measured.inside)`.
+
+    number  (layers, height, width): of each cell among the unknowns; 0 where a layer is not.
+    count   how many unknowns there are.
+    area    of each row's cells, (height, 1).
+    """
+
+    number: _Numbers
+    count: int
+    area: npt.NDArray[np.float64]
+
+    @classmethod
+    def of(cls, measured: Measured) -> _Numbering:
+        """The numbering of all cells that layers have."""
+        number, count = np.zeros(measured.inside.shape, np.int32), int(np.count_nonzero(measured.inside))
+        number[measured.inside] = np.arange(count)
+        return cls(number, count, measured.grid.bounded_widths[:, None])
+
+
+def _fading(measured: Measured, numbering: _Numbering, fade: float) -> npt.NDArray[np.float64]:
+    """How strongly each gain is held at 0, (count,), for it to fade out over the share `fade` of the canvas's
+    width: area / fade^2.
+    """
+    cells = measured.grid
+    around = cells.circumference / (cells.lonlat[1] or 1.0)  # the canvas's width in cells
+    own_area = np.broadcast_to(numbering.area, measured.inside.shape)[measured.inside]
+    return np.asarray(own_area / max(1.0, fade * around) ** 2)
+
+
+def _smoothness(
+    measured: Measured, numbering: _Numbering, unknown: npt.NDArray[np.bool_] | None
+) -> scipy.sparse.csr_array:
+    """The quadratic form (count, count) of how uneven gains are, and, around `unknown`, their differences."""
+    step, stiffness = _slopes(measured.inside, numbering.area, measured.grid.wraps)
+    smooth = step.T @ scipy.sparse.diags_array(stiffness) @ step
+    if unknown is not None:
+        smooth += _TOGETHER * _apart(measured, numbering, unknown)
+    return smooth
+
+
 def _apart(
-    measured: Measured,
-    number: _Numbers,
-    area: npt.NDArray[np.float64],
-    count: int,
-    unknown: npt.NDArray[np.bool_],
+    measured: Measured, numbering: _Numbering, unknown: npt.NDArray[np.bool_]
 ) -> scipy.sparse.csr_array:
     """The quadratic form (count, count) of how uneven differences of layers' gains are around `unknown`."""
-    inside, differences = measured.inside, measured.differences
+    inside, differences, number = measured.inside, measured.differences, numbering.number
     shared = np.stack([inside[d.a] & inside[d.b] for d in differences])
     pairs = [(number[d.a], number[d.b], its) for d, its in zip(differences, shared, strict=True)]
-    step, stiffness = _slopes(shared, area, measured.grid.wraps)
+    step, stiffness = _slopes(shared, numbering.area, measured.grid.wraps)
     beside = abs(step) @ np.broadcast_to(unknown, shared.shape)[shared] > 0
-    apart = step[beside] @ _steps(pairs, count)[0]
+    apart = step[beside] @ _steps(pairs, numbering.count)[0]
     return apart.T @ scipy.sparse.diags_array(stiffness[beside]) @ apart
 
 
@@ -224,21 +241,45 @@ class _Solver:
         return solution
 
 
+class _Agreement:
+    """Corrected layers are to agree where both are seen: g_a - g_b = -d_ab."""
+
+    def __init__(self, measured: Measured, numbering: _Numbering) -> None:
+        links, differences = [], []
+        for d in measured.differences:
+            # what a layer is measured to be beside its own cells binds nothing else
+            both = measured.inside[d.a][d.cells] & measured.inside[d.b][d.cells]
+            evidence = d.values[..., 3] * numbering.area[d.cells[0]] * both
+            links.append((numbering.number[d.a][d.cells], numbering.number[d.b][d.cells], evidence))
+            differences.append(d.values[evidence > 0, :3])
+        self._link, self._weight = _steps(links, numbering.count)
+        self._difference = np.concatenate(differences)
+
+    def active(
+        self, solution: npt.NDArray[np.float64], data: float, limit: float
+    ) -> tuple[scipy.sparse.csr_array, npt.NDArray[np.float64]]:
+        """Matrix (count, count) and right side (count, 3) of the normal equations of a round, in which
+        differences weigh `data`, and nothing if a solution is off by `limit`.
+        """
+        link, difference = self._link, self._difference
+        off = link @ solution + difference if solution.any() else np.zeros_like(difference)
+        trusted = data * self._weight * _biweight(off, limit)
+        return link.T @ scipy.sparse.diags_array(trusted) @ link, -(link.T @ (trusted[:, None] * difference))
+
+
 class _Bounds:
     """Where only one of two layers is clipped, the other is to be raised by their difference at least."""
 
-    def __init__(
-        self, measured: Measured, number: _Numbers, area: npt.NDArray[np.float64], count: int
-    ) -> None:
+    def __init__(self, measured: Measured, numbering: _Numbering) -> None:
         unknowns, targets, weights = [], [], []
         for d in measured.differences:
             for other, sign in ((d.b, 1.0), (d.a, -1.0)):
                 its = measured.inside[other][d.cells]
-                weight = np.maximum(sign * d.beyond[..., 3], 0) * area[d.cells[0]] * its
-                unknowns.append(number[other][d.cells][weight > 0])
+                weight = np.maximum(sign * d.beyond[..., 3], 0) * numbering.area[d.cells[0]] * its
+                unknowns.append(numbering.number[other][d.cells][weight > 0])
                 targets.append(sign * d.beyond[weight > 0, :3])
                 weights.append(weight[weight > 0])
-        self._count = count
+        self._count = numbering.count
         self._unknowns, self._targets, self._weights = map(np.concatenate, (unknowns, targets, weights))
 
     def active(
