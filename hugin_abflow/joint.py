@@ -138,9 +138,16 @@ def prepare(
         advance(1)
     gains = aligned.correction
     return Prepared(
-        tuple(final), full, grid, gains.grid, offsets.grid, gains.shoulder, light_unit, aligned.unlike,
-        aligned.carried,
-    )  # fmt: skip
+        layers=tuple(final),
+        full=full,
+        grid=grid,
+        gain_grid=gains.grid,
+        offset_grid=offsets.grid,
+        shoulder=gains.shoulder,
+        light_unit=light_unit,
+        unlike=aligned.unlike,
+        carried=aligned.carried,
+    )
 
 
 @dataclass(frozen=True)

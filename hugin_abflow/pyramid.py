@@ -29,7 +29,7 @@ class Level:
     @property
     def grid(self) -> Border:
         """The grid as the kernels take it."""
-        return Border(self.image.shape[1], self.image.shape[0], int(self.wraps))
+        return Border.of(self.image, self.wraps)
 
 
 def reduce(device: Device, level: Level) -> Level:

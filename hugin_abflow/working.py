@@ -65,6 +65,12 @@ class Border(NamedTuple):
     wraps: int
     poles: int = 0
 
+    @classmethod
+    def of(cls, image: Buffer, wraps: bool) -> Border:
+        """The border rules of an image, (height, width, ...), that is no whole sphere."""
+        height, width = image.shape[:2]
+        return cls(width, height, int(wraps))
+
     @property
     def size(self) -> tuple[int, int]:
         """(width, height), as kernels are run."""
