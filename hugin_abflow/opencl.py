@@ -1,16 +1,14 @@
-"""The OpenCL device: build, run. With `devices`, `lane` and `launch` the only module that uses pyopencl."""
+"""The OpenCL device: its memory, and what it runs.
+
+With `compiler`, `devices`, `lane` and `launch` the only module that uses pyopencl.
+"""
 
 from __future__ import annotations
 
-import logging
 import math
 import threading
-import time
-import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from functools import cache
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -18,14 +16,10 @@ import numpy.typing as npt
 import pyopencl as cl
 
 from hugin_abflow import launch, memory, pocl, signals, trace
+from hugin_abflow.compiler import Compiler
 from hugin_abflow.devices import choose, kind_of, limited
 from hugin_abflow.errors import DeviceError
 from hugin_abflow.lane import Lane, StoppedError
-
-_log = logging.getLogger(__name__)
-
-# Seconds from which on a program was compiled; where a driver has kept what it compiled before it takes less.
-_COMPILED = 0.5
 
 # Bytes of buffers that are worth giving back after each of many layers or pairs.
 MUCH = 16 << 20
@@ -35,40 +29,6 @@ _SMALL = 1 << 16
 
 # Work-group: rows suit both a GPU's wavefronts and the vector units of a CPU.
 _GROUP = 256
-
-
-@cache
-def _kernel_files() -> dict[str, str]:
-    """By name, in the package (wheel) or beside it (checkout); read once: they may be replaced meanwhile."""
-    package = Path(__file__).resolve().parent
-    folder = next(f for f in (package / "kernels", package.parent / "kernels") if f.is_dir())
-    return {path.stem: path.read_text("utf-8") for path in folder.glob("*.cl")}
-
-
-# These are built for a kind of pixels. All others are built at once: PoCL keeps what it has compiled, but
-# reads OpenCL's headers each time, which takes longer than all of ours.
-_OF_PIXELS = frozenset({"blend", "working"})
-
-
-def kernel_source(*modules: str) -> str:
-    """Source of ``kernels/<module>.cl``, in front of it common.cl, and in front of both what is their own, as
-    blend_rows.cl of blend.cl; #line keeps messages true.
-    """
-    names = [name for one in ("common", *modules) for name in (*_parts(one), one)]
-    return "".join(f'#line 1 "{name}.cl"\n{_kernel_files()[name]}\n' for name in names)
-
-
-def _parts(module: str) -> list[str]:
-    """The files that are in front of a module's own, whose names begin with its name."""
-    return sorted(name for name in _kernel_files() if name.startswith(f"{module}_"))
-
-
-def _built_with(module: str, options: str) -> tuple[str, ...]:
-    """The modules that are built with this one, and itself."""
-    files = _kernel_files().keys()
-    parts = {part for one in files for part in _parts(one)}
-    others = sorted(files - parts - _OF_PIXELS - {"common"})
-    return tuple(others) if module in others and not options else (module,)
 
 
 class DeviceMemoryError(DeviceError):
@@ -201,10 +161,7 @@ class Device:
         self._free, self._entering, self._entered = list[Lane](), threading.Lock(), threading.local()
         self._bytes, self._counting = 0, threading.RLock()  # buffers may be collected while it is held
         self._freed = 0
-        self._kernels: dict[tuple[str, str], dict[str, cl.Kernel]] = {}
-        self._programs: dict[tuple[str, str], cl.Program] = {}  # Intel's driver does not keep a kernel's own
-        self._building, self._one_by_one, self._compiled = threading.Lock(), False, False
-        self._repeated: dict[tuple[str, str, str], list[cl.Kernel]] = {}
+        self._compiler = Compiler(self.device, self.context)
         self._arguments = threading.Lock()  # a kernel keeps its arguments from when they are set to its start
 
     @property
@@ -233,14 +190,6 @@ class Device:
     def kind(self) -> str:
         """ "GPU", "CPU" or "other"."""
         return kind_of(self.device)
-
-    @property
-    def _exactness(self) -> tuple[str, ...]:
-        """Build options: quotients and roots rounded as processors round them, where the device can do that.
-        OpenCL allows 2.5 ulp, with which a share of a sum of one is not 1.
-        """
-        exact = self.device.single_fp_config & cl.device_fp_config.CORRECTLY_ROUNDED_DIVIDE_SQRT
-        return ("-cl-fp32-correctly-rounded-divide-sqrt",) if exact else ()
 
     @property
     def current(self) -> Lane:
@@ -298,51 +247,9 @@ class Device:
         """Kernel `name` of ``kernels/<module>.cl``, built once per set of options."""
         return self.build(module, options)[name]
 
-    def build(self, module: str, options: str = "") -> dict[str, cl.Kernel]:
+    def build(self, module: str, options: str = "") -> Mapping[str, cl.Kernel]:
         """The kernels of ``kernels/<module>.cl`` by name, built if they are not yet. For any thread."""
-        key = module, options
-        if key not in self._kernels:  # what is built does not wait for what is being built
-            with self._building:
-                if key not in self._kernels:
-                    self._build_with_others(module, options)
-        return self._kernels[key]
-
-    def _build_with_others(self, module: str, options: str) -> None:
-        modules = (module,) if self._one_by_one else _built_with(module, options)
-        try:
-            kernels = self._build(modules, options)
-        except DeviceError:
-            if len(modules) == 1:
-                raise
-            self._one_by_one = True  # perhaps one fails that is not needed, else its name is told
-            modules, kernels = (module,), self._build((module,), options)
-        self._kernels |= {(one, options): kernels for one in modules}
-
-    def _build(self, modules: Sequence[str], options: str) -> dict[str, cl.Kernel]:
-        file, began = f"kernels/{modules[0]}.cl", time.perf_counter()  # of several nobody is told
-        try:
-            # compilers chat; errors come with the exception
-            with warnings.catch_warnings(), signals.held():
-                warnings.simplefilter("ignore", cl.CompilerWarning)
-                program = cl.Program(self.context, kernel_source(*modules))
-                program.build(["-cl-std=CL1.2", *self._exactness, *options.split()])
-        except cl.Error as error:
-            raise DeviceError(
-                f"{file} does not build on {self.device.name.strip()}: {error}; "
-                "update the OpenCL driver or choose another --device"
-            ) from error
-        if not self._compiled and time.perf_counter() - began > _COMPILED:
-            self._compiled = True
-            _log.info("kernels: compiled for this device, and kept: later runs take less time")
-        self._programs |= {(one, options): program for one in modules}
-        kernels = {kernel.function_name: kernel for kernel in program.all_kernels()}
-        if not kernels:  # some drivers call that a success
-            kept = pocl.kernel_folder() if "pocl" in self.device.version.lower() else None
-            remedy = f"remove {kept}, which may be damaged, or " if kept else ""
-            raise DeviceError(
-                f"{file} has no kernels for {self.device.name.strip()}; {remedy}use another --device"
-            )
-        return kernels
+        return self._compiler.build(module, options)
 
     def largest_group(self, module: str, name: str, options: str = "") -> int:
         """How many work items a work-group of a kernel may have."""
@@ -389,20 +296,13 @@ class Device:
         lane, groups = self._started(), launch.work_groups(size, group)
         self.build(module, options)  # before others have to wait
         with self._arguments, _device_errors(f"running {name}"):
-            kernels = self._instances(module, name, options, len(calls))
+            kernels = self._compiler.instances(module, name, options, len(calls))
             for kernel, args in zip(kernels, calls, strict=True):
                 launch.set_arguments(kernel, _values(args, lane))
             for _ in range(times):
                 for kernel in kernels:
                     event = cl.enqueue_nd_range_kernel(lane.queue, kernel, *groups)
                     lane.timed(name, trace.KERNEL, event)
-
-    def _instances(self, module: str, name: str, options: str, count: int) -> list[cl.Kernel]:
-        """Objects of one kernel, each with arguments of its own; they are slow to make."""
-        first = self.kernel(module, name, options)
-        made = self._repeated.setdefault((module, name, options), [first])
-        made += [cl.Kernel(self._programs[module, options], name) for _ in range(count - len(made))]
-        return made[:count]
 
     def give_back(self, least: int = 0) -> None:
         """Return freed memory to the system, on the device and the host, at the end of a step. The driver

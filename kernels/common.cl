@@ -1,4 +1,4 @@
-/* Rules every kernel shares; put in front of each source by hugin_abflow/opencl.py.
+/* Rules every kernel shares; put in front of each source by hugin_abflow/compiler.py.
 
    Frames. A grid is an array of pixels; positions on it are continuous, x right, y down, and pixel (i, j)
    covers [i, i+1) x [j, j+1), so its centre is at (i + 0.5, j + 0.5). "Point" is a place in the scene's

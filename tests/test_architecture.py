@@ -24,7 +24,7 @@ USERS = {
     "rich": {"batch", "terminal"},
     "distributed": {"batch"},
     "OpenImageIO": {"images", "imagewriter"},
-    "pyopencl": {"devices", "opencl", "lane", "launch"},
+    "pyopencl": {"compiler", "devices", "lane", "launch", "opencl"},
     "tifffile": {"tiffreader", "tiffwriter"},
     "imagecodecs": {"tiffwriter"},
 }
