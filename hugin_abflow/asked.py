@@ -7,9 +7,9 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from hugin_abflow.encoding import COMPRESSIONS
 from hugin_abflow.errors import ProgramMissingError
 from hugin_abflow.found import Remap, layers_there
-from hugin_abflow.images import COMPRESSIONS
 from hugin_abflow.merge import default_target
 from hugin_abflow.outputs import (
     PANORAMAS,

@@ -9,8 +9,8 @@ from typing import Any
 import click
 
 from hugin_abflow.batch.config import NAME, read_config, write_config
+from hugin_abflow.encoding import ENDINGS
 from hugin_abflow.errors import ConfigError
-from hugin_abflow.imagewriter import ENDINGS
 from hugin_abflow.oneline import commented
 from hugin_abflow.options import kind_of, long_name, long_names
 from hugin_abflow.settings import Settings

@@ -17,9 +17,9 @@ from hugin_abflow.batch.task import Task
 from hugin_abflow.batch.watch import watch
 from hugin_abflow.choices import OF_THE_RUN, choose, config_texts, for_several, ineffective, words
 from hugin_abflow.devices import list_devices
+from hugin_abflow.encoding import COMPRESSIONS
 from hugin_abflow.errors import EXIT_CODES, AbflowError, ExitCode
 from hugin_abflow.found import Remap
-from hugin_abflow.images import COMPRESSIONS
 from hugin_abflow.metadata import PROGRAM, version
 from hugin_abflow.options import ARGUMENTS, Command, Compression, NewFile, Number, OldFile, Option, Size, Text
 from hugin_abflow.scratch import is_folder, misnamed_root

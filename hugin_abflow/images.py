@@ -18,23 +18,11 @@ import OpenImageIO as oiio  # noqa: N813
 
 from hugin_abflow import tiffreader, tifftags, trace
 from hugin_abflow.errors import ImageReadError
-from hugin_abflow.imagewriter import (
-    COMPRESSIONS,
-    DEFAULTS,
-    ENDINGS,
-    JPEG_QUALITY,
-    ImageWriter,
-    check_target,
-    write_image,
-)
+from hugin_abflow.imagewriter import ImageWriter, check_target, write_image
 from hugin_abflow.layer import Box, Layer, full_scale
 from hugin_abflow.targets import named_in_unicode
 
 __all__ = [
-    "COMPRESSIONS",
-    "DEFAULTS",
-    "ENDINGS",
-    "JPEG_QUALITY",
     "ImageWriter",
     "check_target",
     "image_size",

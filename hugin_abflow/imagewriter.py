@@ -22,16 +22,17 @@ import numpy.typing as npt
 import OpenImageIO as oiio  # noqa: N813
 
 from hugin_abflow import tiffwriter, trace
+from hugin_abflow.encoding import format_of, stored_dtype, to_depth, used_compression
 from hugin_abflow.errors import OutputError
 from hugin_abflow.exif import Metadata, embed, place_in_png
-from hugin_abflow.layer import full_scale, native
+from hugin_abflow.layer import native
 from hugin_abflow.scratch import part_beside, put
 from hugin_abflow.targets import explained, final_file, may_grow
 from hugin_abflow.tifftags import FURTHEST
 
 Pixels = npt.NDArray[Any]
 
-log = logging.getLogger("hugin_abflow.images")
+_log = logging.getLogger(__name__)
 
 _OIIO_NAMES = {
     np.dtype(np.uint8): "uint8",
@@ -39,20 +40,6 @@ _OIIO_NAMES = {
     np.dtype(np.float16): "half",
     np.dtype(np.float32): "float",
 }
-# What TIFF holds beside these.
-_WIDE_NAMES = {np.dtype(np.float64): "double"}
-ENDINGS = {".tif": "tiff", ".tiff": "tiff", ".jpg": "jpeg", ".jpeg": "jpeg", ".png": "png", ".exr": "openexr"}
-# What the documentation names; more is understood, since projects and other programs say it. What is usual.
-COMPRESSIONS = {
-    "TIFF": ("none", "packbits", "lzw", "deflate", "zstd", "jpeg"),
-    "EXR": ("none", "rle", "zips", "zip", "piz"),
-}
-DEFAULTS, JPEG_QUALITY = {"tiff": "lzw", "openexr": "zip", "jpeg": "jpeg", "png": "deflate"}, 90
-_KNOWN = {
-    "tiff": {name: name for name in tiffwriter.COMPRESSIONS} | {"zip": "deflate"},
-    "openexr": {name: name for name in COMPRESSIONS["EXR"]},
-    "jpeg": {"jpeg": "jpeg"}, "png": {"deflate": "deflate", "zip": "deflate"},
-}  # fmt: skip
 _PNG_LEVEL = 4  # twice as fast as zlib's usual 6 for 2 % more bytes
 _JPEG_LIMIT = 65500  # pixels a side, of libjpeg
 _JPEG_LEAST = 1 << 16  # bytes of a JPEG beside its samples
@@ -64,7 +51,7 @@ _OVERSHOOT = 1.2  # of white, beside edges that were sampled by cubic and longer
 class ImageWriter:
     """Write an image from top to bottom; the file appears, whole, when the ``with`` block ends.
 
-    path            format by its ending, see `ENDINGS`; an existing file is replaced.
+    path            format by its ending, see `encoding.ENDINGS`; an existing file is replaced.
     width, height   pixels.
     channels        1 (grey) or 3 (RGB); rows have one more, alpha.
     dtype           of the rows: uint8, uint16, float16, float32.
@@ -108,9 +95,9 @@ class ImageWriter:
         self.path, self.metadata, self._named_with = Path(path), metadata, named_with
         self._threads = threads or os.cpu_count() or 1
         self.width, self.height, self.channels, self.dtype = width, height, channels, np.dtype(dtype)
-        self.format = _format_of(self.path)
-        self.stored = _stored_dtype(self.path, self.format, self.dtype, depth)
-        self.compression, self._option = _compression(
+        self.format = format_of(self.path)
+        self.stored = stored_dtype(self.path, self.format, self.dtype, depth)
+        self.compression = used_compression(
             self.path, self.format, self.stored, channels, compression, jpeg_quality
         )
         tall = height if self.format == "jpeg" else 0  # within TIFF each strip is a JPEG
@@ -118,8 +105,10 @@ class ImageWriter:
             raise OutputError(f"{path}: JPEG ends at {_JPEG_LIMIT} pixels a side; choose a TIFF with LZW")
         if not all(isinstance(one, Integral) and abs(one) <= FURTHEST for one in offset):
             raise OutputError(f"{path}: it lies at {offset}; give whole pixels, up to {FURTHEST}")
+        if self.format == "tiff" and min(offset) < 0:
+            raise OutputError(f"{path}: TIFF holds no negative position {offset}; choose .exr")
         self._offset, self._icc = offset, icc
-        self._spec = self._make_spec(offset, icc, canvas_size)
+        self._spec: Any = None if self.format == "tiff" else self._make_spec(offset, icc, canvas_size)
         self._done = 0
         self._clipped = False
         self._output: Any = None
@@ -130,22 +119,19 @@ class ImageWriter:
     def _make_spec(
         self, offset: tuple[int, int], icc: bytes | None, canvas_size: tuple[int, int] | None
     ) -> Any:
+        """What OpenImageIO is to write."""
         samples = self.channels if self.format == "jpeg" else self.channels + 1
-        spec = oiio.ImageSpec(self.width, self.height, samples, (_OIIO_NAMES | _WIDE_NAMES)[self.stored])
+        spec = oiio.ImageSpec(self.width, self.height, samples, _OIIO_NAMES[self.stored])
         colours = ("R", "G", "B") if self.channels == 3 else ("Y",)
         spec.channelnames = colours if self.format == "jpeg" else (*colours, "A")
         spec.alpha_channel = -1 if self.format == "jpeg" else self.channels
         spec["oiio:UnassociatedAlpha"] = 1  # else OpenImageIO takes colours for premultiplied
-        if self._option is not None:
-            spec["compression"] = self._option
         if icc is not None:
             spec.attribute("ICCProfile", oiio.TypeDesc(f"uint8[{len(icc)}]"), np.frombuffer(icc, np.uint8))
             if self.format == "png":
                 spec["oiio:ColorSpace"] = "unknown"  # else the file claims sRGB beside its profile
-        if self.format == "tiff":
-            if min(offset) < 0:
-                raise OutputError(f"{self.path}: TIFF holds no negative position {offset}; choose .exr")
-        elif self.format == "openexr":
+        if self.format == "openexr":
+            spec["compression"] = self.compression
             spec.x, spec.y = spec.full_x, spec.full_y = offset
             if canvas_size is not None:
                 spec.full_x, spec.full_y = 0, 0
@@ -158,6 +144,7 @@ class ImageWriter:
         elif self.format == "png":
             spec["png:compressionLevel"] = _PNG_LEVEL
         elif self.format == "jpeg":
+            spec["compression"] = self.compression
             spec["jpeg:subsampling"] = "4:4:4"  # as enblend: colour edges stay sharp
         return spec
 
@@ -173,7 +160,7 @@ class ImageWriter:
                 self._spec.erase_attribute("ICCProfile")
                 fault, why = why.splitlines()[0], self._open()
                 if not why:
-                    log.warning("%s: written without the layers' ICC profile (%s)", self.path, fault)
+                    _log.warning("%s: written without the layers' ICC profile (%s)", self.path, fault)
             if why:
                 raise self._failure(why)
         except BaseException:
@@ -270,8 +257,8 @@ class ImageWriter:
         if self.dtype.kind == "f" and self.stored.kind == "u" and not self._clipped:
             self._clipped = bool((rows[..., :-1] > _OVERSHOOT).any())
             if self._clipped:
-                log.warning("%s: values above 1.0 are clipped; choose .exr or .tif to keep them", self.path)
-        rows = _to_depth(rows, self.stored)
+                _log.warning("%s: values above 1.0 are clipped; choose .exr or .tif to keep them", self.path)
+        rows = to_depth(rows, self.stored)
         if self.format == "jpeg":
             alpha = rows[..., -1:].astype(np.uint16)
             return ((rows[..., :-1] * alpha + 127) // 255).astype(np.uint8)
@@ -352,77 +339,9 @@ def check_target(
 
     samples     that it is to hold, if that is known. named_with: as `ImageWriter` has it.
     """
-    final, kind = final_file(path, named_with), _format_of(path)
+    final, kind = final_file(path, named_with), format_of(path)
     with explained(path, final, named_with):
         os.stat(f"{final.parent}{os.sep}")  # noqa: PTH116 - so a file is no folder
     if samples is not None:
-        _stored_dtype(path, kind, np.dtype(samples), None)
-    _compression(path, kind, np.dtype(np.uint8), 3, compression, None)
-
-
-def _format_of(path: Path) -> str:
-    if path.suffix.lower() not in ENDINGS:
-        raise OutputError(f"{path}: the ending must be one of {', '.join(ENDINGS)}")
-    return ENDINGS[path.suffix.lower()]
-
-
-def _stored_dtype(
-    path: Path, format_name: str, dtype: np.dtype[Any], depth: npt.DTypeLike | None
-) -> np.dtype[Any]:
-    if dtype not in _OIIO_NAMES:
-        raise OutputError(f"{path}: samples of type {dtype}; possible are uint8, uint16, float16, float32")
-    wanted = dtype if depth is None else np.dtype(depth)
-    if format_name == "tiff":
-        return wanted
-    if format_name == "jpeg":
-        return np.dtype(np.uint8)
-    if format_name == "png":
-        return wanted if wanted == np.uint8 else np.dtype(np.uint16)
-    if wanted.kind != "f":
-        raise OutputError(
-            f"{path}: EXR holds half or float, and these are {wanted}; choose .tif, .png or .jpg"
-        )
-    return wanted if wanted == np.float16 else np.dtype(np.float32)
-
-
-def _jpeg_quality(path: Path, quality: int | None) -> int:
-    quality = JPEG_QUALITY if quality is None else quality
-    if not isinstance(quality, Integral) or not 1 <= quality <= 100:
-        raise OutputError(f"{path}: JPEG quality {quality}; choose 1 to 100")
-    return quality
-
-
-def _compression(
-    path: Path, kind: str, stored: np.dtype[Any], channels: int, name: str | None, jpeg_quality: int | None
-) -> tuple[str, str | None]:
-    """(what is really used, OpenImageIO's name for it)."""
-    known = _KNOWN[kind]
-    wanted = (name or DEFAULTS[kind]).lower()
-    if wanted not in known:
-        offered = ", ".join(COMPRESSIONS.get({"tiff": "TIFF", "openexr": "EXR"}.get(kind, ""), known))
-        raise OutputError(f"{path}: compression {name!r}; choose one of {offered}")
-    if kind == "jpeg":
-        quality = f"jpeg:{_jpeg_quality(path, jpeg_quality)}"
-        return quality, quality
-    used = known[wanted]
-    if used == "jpeg":
-        if stored != np.uint8 or channels != 3:  # of grey OpenImageIO misreads the alpha
-            log.warning("%s: jpeg in TIFF is for 8-bit RGB; deflate is used", path)
-            return "deflate", None
-        return f"jpeg:{_jpeg_quality(path, jpeg_quality)}", None
-    return used, None if kind == "png" else used
-
-
-def _to_depth(rows: Pixels, stored: np.dtype[Any]) -> Pixels:
-    """Rescale samples to another depth, rounded to nearest; 0 and full scale stay what they are."""
-    if rows.dtype == stored:
-        return rows
-    if rows.dtype.kind == stored.kind == "f":
-        return rows.astype(stored)
-    scaled: Pixels = rows.astype(np.float64 if stored == np.float64 else np.float32)
-    scaled /= full_scale(rows.dtype)
-    if stored.kind == "u":
-        np.clip(scaled, 0, 1, out=scaled)
-        scaled *= full_scale(stored)
-        np.rint(scaled, out=scaled)
-    return scaled.astype(stored)
+        stored_dtype(path, kind, np.dtype(samples), None)
+    used_compression(path, kind, np.dtype(np.uint8), 3, compression, None)

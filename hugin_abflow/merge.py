@@ -16,12 +16,13 @@ import numpy.typing as npt
 from hugin_abflow import joint, sequential
 from hugin_abflow.brackets import of_one_exposure, to_be_made
 from hugin_abflow.devices import choose
+from hugin_abflow.encoding import ENDINGS
 from hugin_abflow.errors import LayersMissingError
 from hugin_abflow.exif import Metadata
 from hugin_abflow.found import Remap, candidates
 from hugin_abflow.guides import Guide, check_guides
 from hugin_abflow.holes import Coverage
-from hugin_abflow.images import ENDINGS, ImageWriter, check_target, use_threads
+from hugin_abflow.images import ImageWriter, check_target, use_threads
 from hugin_abflow.kept import in_use, kept_device
 from hugin_abflow.layer import Canvas, Layer, check_canvas, check_layers
 from hugin_abflow.metadata import describe

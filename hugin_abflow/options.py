@@ -11,9 +11,9 @@ from typing import Any
 import click
 
 from hugin_abflow import memory
+from hugin_abflow.encoding import COMPRESSIONS, ENDINGS
 from hugin_abflow.errors import SettingsError
 from hugin_abflow.formats import holds_text, picture_format
-from hugin_abflow.images import COMPRESSIONS, ENDINGS
 from hugin_abflow.scratch import is_special
 from hugin_abflow.settings import MOST_MEMORY, Settings
 

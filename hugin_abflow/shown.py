@@ -11,8 +11,8 @@ from pathlib import Path
 
 from hugin_abflow.asked import asked_panoramas, remap_for, stored_as, wanted_branches, wanted_steps
 from hugin_abflow.brackets import to_be_made
+from hugin_abflow.encoding import DEFAULTS, ENDINGS, JPEG_QUALITY
 from hugin_abflow.found import Remap, layer_name, layers_there
-from hugin_abflow.images import DEFAULTS, ENDINGS, JPEG_QUALITY
 from hugin_abflow.merge import check_early, default_target, storable, target_of
 from hugin_abflow.nona import open_layers, planned_layers, refuse_to_make, remapping
 from hugin_abflow.oneline import commented

@@ -9,10 +9,11 @@ from itertools import groupby
 from pathlib import Path
 
 from hugin_abflow.asked import remap_for, stored_as, wanted_branches, wanted_steps
+from hugin_abflow.encoding import ENDINGS
 from hugin_abflow.errors import LayersMismatchError
 from hugin_abflow.exif import embed
 from hugin_abflow.found import Remap
-from hugin_abflow.images import ENDINGS, read_layer
+from hugin_abflow.images import read_layer
 from hugin_abflow.layer import Layer, check_layers
 from hugin_abflow.merge import OpenDevice, guides_of, merge_project, write_panorama
 from hugin_abflow.metadata import describe

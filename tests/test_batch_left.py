@@ -19,8 +19,9 @@ from hugin_abflow.asked import asked_panoramas
 from hugin_abflow.batch import pool, run, task
 from hugin_abflow.batch.record import Record
 from hugin_abflow.batch.task import Task, perform
+from hugin_abflow.encoding import ENDINGS
 from hugin_abflow.exif import Metadata, embed, text
-from hugin_abflow.images import ENDINGS, write_image
+from hugin_abflow.images import write_image
 from hugin_abflow.metadata import saved_by
 from hugin_abflow.outputs import Kind
 from hugin_abflow.project import read_plan

@@ -13,7 +13,8 @@ import tifffile
 from conftest import ICC, photo_pixels, require_program
 from pictures import one_device
 
-from hugin_abflow.images import COMPRESSIONS, read_layer, write_image
+from hugin_abflow.encoding import COMPRESSIONS
+from hugin_abflow.images import read_layer, write_image
 from hugin_abflow.layer import Layer, full_scale
 from hugin_abflow.merge import merge_project
 from hugin_abflow.settings import Settings

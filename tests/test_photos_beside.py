@@ -14,9 +14,10 @@ from test_stitch import asked
 from hugin_abflow import cli
 from hugin_abflow.asked import asked_panoramas
 from hugin_abflow.batch.task import Task, perform
+from hugin_abflow.encoding import ENDINGS
 from hugin_abflow.errors import OutputError
 from hugin_abflow.exif import Metadata, embed, text
-from hugin_abflow.images import ENDINGS, write_image
+from hugin_abflow.images import write_image
 from hugin_abflow.outputs import Kind, results
 from hugin_abflow.project import read_plan
 from hugin_abflow.settings import Settings

@@ -12,8 +12,8 @@ import numpy as np
 import numpy.typing as npt
 
 from hugin_abflow.dropin.arguments import Option, expand, parse
+from hugin_abflow.encoding import COMPRESSIONS
 from hugin_abflow.errors import CommandLineError
-from hugin_abflow.images import COMPRESSIONS
 from hugin_abflow.layer import Box
 
 _PROJECT = "abflow-project="
