@@ -50,11 +50,17 @@ class Run:
 
     def __post_init__(self) -> None:
         named: dict[str, str] = {}
-        for option, file in (("--report", self.report), ("--log", self.log), ("--profile", self.profile)):
-            if file and not scratch.is_special(file):  # a terminal or /dev/null takes all of them
+        for option, file in self.files.items():
+            if not scratch.is_special(file):  # a terminal or /dev/null takes all of them
                 other = named.setdefault(os.path.realpath(file), option)
                 if other != option:
                     raise SameOutputError(f"{other} and {option} both name {file}; give each its own file")
+
+    @property
+    def files(self) -> dict[str, Path]:
+        """What is written beside panoramas, by the options that name it."""
+        named = {"--report": self.report, "--log": self.log, "--profile": self.profile}
+        return {option: file for option, file in named.items() if file}
 
 
 def default_jobs() -> int:
@@ -94,12 +100,7 @@ def run(tasks: Iterable[Task | str | None], how: Run, lone: bool = False) -> Exi
                     for record in performers.run(tasks):
                         records.append(record)
                         running.discard(record.project)
-                        if not how.quiet:
-                            try:
-                                for file in record.files:
-                                    print_path(file)
-                            except OutputError as error:
-                                unprinted = error  # the panoramas are there, and others wait
+                        unprinted = (None if how.quiet else _print_files(record)) or unprinted
             complete = True
         except KeyboardInterrupt:
             interrupted = True
@@ -110,16 +111,32 @@ def run(tasks: Iterable[Task | str | None], how: Run, lone: bool = False) -> Exi
                 print_table(records)
             if not complete and not lone and isinstance(tasks, Sequence):
                 display.note(_rest(tasks, len(records), interrupted))
-            if how.report:
-                try:
-                    write_report(how.report, records, how.arguments)
-                except OutputError as error:
-                    if complete:
-                        raise
-                    complain(str(error))  # beside what ended the run, not instead of it
+            _report(how, records, complete)
     if unprinted:
         raise unprinted
     return combine([record.exit_code for record in records])
+
+
+def _print_files(record: Record) -> OutputError | None:
+    """Print the names of a project's panoramas; returns an error: they are there, and others wait."""
+    try:
+        for file in record.files:
+            print_path(file)
+    except OutputError as error:
+        return error
+    return None
+
+
+def _report(how: Run, records: Sequence[Record], complete: bool) -> None:
+    """Write the report, if one is wanted. complete: whether nothing ended the run before its end."""
+    if not how.report:
+        return
+    try:
+        write_report(how.report, records, how.arguments)
+    except OutputError as error:
+        if complete:
+            raise
+        complain(str(error))  # beside what ended the run, not instead of it
 
 
 def _rest(tasks: Sequence[Task | str | None], done: int, interrupted: bool) -> str:
@@ -175,8 +192,8 @@ def show(tasks: Iterable[Task], words: Mapping[Path, Sequence[str]], how: Run) -
 
     Raises `OutputError` for a log, a report or a profile that cannot be written, as `run` does.
     """
-    for option, file in (("--log", how.log), ("--profile", how.profile), ("--report", how.report)):
-        if file and (why := unwritable(file, replaced=option == "--report")):
+    for option, file in sorted(how.files.items()):  # in the order in which a run opens them
+        if why := unwritable(file, replaced=option == "--report"):
             raise OutputError(f"{file} cannot be written: {why}; name another file with {option}")
     codes = []
     for text in how.warnings:
