@@ -80,13 +80,12 @@ class ChartGuides:
         return ChartGuides(self.at_a[chosen], self.at_b[chosen], names, self.period)
 
 
-def on_chart(guides: Sequence[Guide], start: int, chart: Chart, grid: Grid) -> ChartGuides:
-    """The guides of one pair of layers on its chart, from layer `start` to the other.
+def on_chart(guides: Sequence[Guide], chart: Chart, grid: Grid) -> ChartGuides:
+    """The guides of one pair of layers, all from a to b, on its chart.
 
     grid    the working grid.
     """
-    ends = [(g.at_a, g.at_b) if g.a == start else (g.at_b, g.at_a) for g in guides]
-    places = np.array(ends, np.float64).reshape(-1, 2, 2)
+    places = np.array([(guide.at_a, guide.at_b) for guide in guides], np.float64).reshape(-1, 2, 2)
     at_a, at_b = (chart.positions(grid.points(places[:, end])) for end in (0, 1))
     return ChartGuides(at_a, at_b, tuple(guide.name for guide in guides), chart.period)
 

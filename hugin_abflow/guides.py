@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -85,13 +85,21 @@ def doubts(places: Points, moves: Points, radius: float, period: float = math.in
     return reasons
 
 
-def by_pair(guides: Iterable[Guide]) -> dict[tuple[int, int], list[Guide]]:
-    """The guides of each two layers a < b, turned where they are named the other way round."""
+def by_pair(guides: Iterable[Guide], numbers: Sequence[int]) -> dict[tuple[int, int], list[Guide]]:
+    """The guides of each two of some layers, a < b, with their indices among these; such as are about others
+    are left out.
+
+    numbers     what guides call each of the layers.
+    """
+    index = {number: k for k, number in enumerate(numbers)}
     pairs: dict[tuple[int, int], list[Guide]] = {}
     for guide in guides:
-        turned = replace(guide, a=guide.b, b=guide.a, at_a=guide.at_b, at_b=guide.at_a)
-        chosen = guide if guide.a < guide.b else turned
-        pairs.setdefault((chosen.a, chosen.b), []).append(chosen)
+        if guide.a not in index or guide.b not in index:
+            continue
+        a, b = index[guide.a], index[guide.b]
+        its = replace(guide, a=a, b=b)
+        its = its if a < b else replace(its, a=b, b=a, at_a=its.at_b, at_b=its.at_a)
+        pairs.setdefault((its.a, its.b), []).append(its)
     return pairs
 
 

@@ -215,7 +215,7 @@ def _flow(
         return pairflow.Solution([], [], [])
     return pairflow.solve(
         device, used.layers, used.pairs, charts, grid, progress, settings,
-        by_pair(guides if settings.guides else ()), used.numbers, abreast,
+        by_pair(guides if settings.guides else (), used.numbers), abreast,
         partial(relay.inferable, used.pairs, overlaps, used.masks.grid),
     )  # fmt: skip
 

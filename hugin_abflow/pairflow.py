@@ -23,9 +23,10 @@ from hugin_abflow.abreast import side_by_side
 from hugin_abflow.cells import SingleSource, View
 from hugin_abflow.chart import Chart
 from hugin_abflow.consistency import WeightedFlow
+from hugin_abflow.decision import Refused
 from hugin_abflow.geometry import Pair, PairFlow
 from hugin_abflow.guides import Guide
-from hugin_abflow.opencl import Device
+from hugin_abflow.opencl import Buffer, Device
 from hugin_abflow.progress import Advance, Progress
 from hugin_abflow.pyramid import Level
 from hugin_abflow.settings import Settings
@@ -100,19 +101,18 @@ def solve(
     progress: Progress,
     settings: Settings,
     guides: Mapping[tuple[int, int], Sequence[Guide]],
-    numbers: Sequence[int],
     abreast: int,
     inferable: Callable[[], Sequence[bool]],
 ) -> Solution:
     """Flow of every pair of layers, and what is told by it.
 
     drawn       the charts of `pairs`, on which flow is found.
-    guides      of each two layers, by their numbers; numbers: what guides call each of `layers`.
+    guides      of each pair (a, b), as `guides.by_pair` gives them.
     abreast     how many pairs are worked on at a time; no flow depends on it.
     inferable   gives of which pairs others should know the flow, so that it need not be found.
     """
     compared = bool(settings.relay and relay.triangles(pairs))
-    solver = _Solver(device, layers, grid, settings, guides, numbers, compared, abreast)
+    solver = _Solver(device, layers, grid, settings, guides, compared, abreast)
     ends = finest(drawn, grid, settings)
     jobs = {i: _Job(*one) for i, one in enumerate(zip(pairs, drawn, ends, strict=True))}
     left_out = inferable() if compared else [False] * len(pairs)
@@ -206,7 +206,6 @@ class _Solver:
     grid: Grid
     settings: Settings
     guides: Mapping[tuple[int, int], Sequence[Guide]]
-    numbers: Sequence[int]
     compared: bool
     abreast: int
 
@@ -224,29 +223,49 @@ class _Solver:
         """The flow of a pair, found on one chart and refined on another."""
         device, pair, its_chart, settings = self.device, job.pair, job.chart, self.settings
         parameters = quality.flow_parameters(settings.flow_quality, settings.large_motion)
-        images = self._images(pair, its_chart)
+        images, guides = self._images(pair, its_chart), self._guides(pair, its_chart)
         bearings = its_chart.projection.bearings if its_chart.projection else None
         furthest = reach(its_chart, self.grid, settings)
         solved = flow.solve(device, *images, parameters, reach=furthest, bearings=bearings)
-        found = (solved.forward, solved.backward)
-        guides, held = self._guides(pair, its_chart), tuple[guidance.Values, ...]()
-        if guides:
-            found = guidance.lead(device, images, found, guides, its_chart.circumference(self.grid))
-        if guides and self.compared:
-            scale = job.finest.width / its_chart.width
-            held = tuple(scale * one for one in guidance.held(images, found, guides))
-        from_one = None
-        if settings.seam and (settings.foreground or (settings.movers and its_chart.projection)):
-            views = (View.of(images[0]), View.of(images[1]))
-            arrays, points = (found[0].get(), found[1].get()), (guides.at_a, guides.at_b)
-            from_one = single.find(its_chart, arrays, views, points, solved.refused, settings)
-        its_flow = PairFlow(pair.a, pair.b, its_chart, *found)
+        flows, held = self._led(job, images, (solved.forward, solved.backward), guides)
+        from_one = self._single(its_chart, images, flows, guides, solved.refused)
         if job.finest is not its_chart:
             images = self._images(pair, job.finest)
-            found = flow.refine(device, *images, *found, parameters)
-            its_flow = PairFlow(pair.a, pair.b, job.finest, *found)
+            flows = flow.refine(device, *images, *flows, parameters)
             from_one = from_one and from_one.finer()
+        its_flow = PairFlow(pair.a, pair.b, job.finest, *flows)
         return _Solved(consistency.weigh(device, its_flow, images, parameters, from_one), from_one, held)
+
+    def _led(
+        self,
+        job: _Job,
+        images: tuple[Level, Level],
+        flows: tuple[Buffer, Buffer],
+        guides: guidance.ChartGuides,
+    ) -> tuple[tuple[Buffer, Buffer], tuple[guidance.Values, ...]]:
+        """A pair's flows, led by its guides, and what these hold (`_Solved.held`)."""
+        if not guides:
+            return flows, ()
+        flows = guidance.lead(self.device, images, flows, guides, job.chart.circumference(self.grid))
+        if not self.compared:
+            return flows, ()
+        scale = job.finest.width / job.chart.width
+        return flows, tuple(scale * one for one in guidance.held(images, flows, guides))
+
+    def _single(
+        self,
+        its_chart: Chart,
+        images: tuple[Level, Level],
+        flows: tuple[Buffer, Buffer],
+        guides: guidance.ChartGuides,
+        refused: Sequence[Refused],
+    ) -> SingleSource | None:
+        """What is taken from a single layer of a pair. refused: flow that a search found and nothing uses."""
+        settings = self.settings
+        if not (settings.seam and (settings.foreground or (settings.movers and its_chart.projection))):
+            return None
+        views, arrays = (View.of(images[0]), View.of(images[1])), (flows[0].get(), flows[1].get())
+        return single.find(its_chart, arrays, views, (guides.at_a, guides.at_b), refused, settings)
 
     def unsolved(self, job: _Job) -> _Solved:
         """A pair whose flow is not found: it is to be inferred from others."""
@@ -265,9 +284,7 @@ class _Solver:
         return not guidance.contradict(inferred.chart, flows, guides, times)
 
     def _guides(self, pair: Pair, its_chart: Chart) -> guidance.ChartGuides:
-        first, second = self.numbers[pair.a], self.numbers[pair.b]
-        its_guides = self.guides.get((min(first, second), max(first, second)), ())
-        return guidance.on_chart(its_guides, first, its_chart, self.grid)
+        return guidance.on_chart(self.guides.get((pair.a, pair.b), ()), its_chart, self.grid)
 
     def _images(self, pair: Pair, its_chart: Chart) -> tuple[Level, Level]:
         """What both layers of a pair show on a chart."""

@@ -124,15 +124,16 @@ def test_guides_on_a_chart_are_where_kernels_put_them(name: str) -> None:
     chart = pair_chart(overlap, grid, grid)
     ends = [(9.5 + grid.region.left, 4.25 + grid.region.top), (12.0 + grid.region.left, 9 + grid.region.top)]
     guides = [Guide(0, 1, *ends, "there"), Guide(1, 0, ends[1], ends[0], "back"), Guide(0, 2, *ends, "other")]
-    pairs = by_pair(guides)
-    assert sorted(pairs) == [(0, 1), (0, 2)]
-    placed = on_chart(pairs[0, 1], 0, chart, grid)
+    assert sorted(by_pair(guides, [0, 1, 2])) == [(0, 1), (0, 2)]
+    (pair,) = by_pair(guides, [0, 1]).values()
+    placed = on_chart(pair, chart, grid)
     assert placed.names == ("there", "back")
     for found, end in ((placed.at_a, ends[0]), (placed.at_b, ends[1])):
         x, y = np.array(end) - (grid.region.left, grid.region.top)
         u, v = common.chart_position(common.canvas_point(x, y, grid.lonlat), chart.transform)
         assert np.allclose(found, [(u, v)] * 2, atol=1e-3)
-    back = on_chart(pairs[0, 1], 1, chart, grid)
+    (pair,) = by_pair(guides, [1, 0]).values()
+    back = on_chart(pair, chart, grid)
     assert np.array_equal(back.at_a, placed.at_b) and np.array_equal(back.at_b, placed.at_a)
 
 
@@ -163,15 +164,14 @@ def test_guides_that_lead_beyond_a_chart_of_a_cylinder_go_the_shorter_way(first:
     assert not chart.wraps and chart.period == 800
     starts = [(first + column, row) for column, row in ((5, 40), (95, 100), (-10, 110), (108, 120))]
     guides = [Guide(0, 1, (x % 800, y), ((x + move) % 800, y)) for x, y in starts]
-    its = on_chart(guides, 0, chart, grid)
+    its = on_chart(guides, chart, grid)
     there = np.zeros((chart.height, chart.width, 2), np.float32)
     there[..., 0] = move
     assert not guidance.contradict(chart, (there, -there), its, 1)
     assert guidance.contradict(chart, (-there, there), its, 1)
     # one that is farther away the other way round is a neighbour: three of them outvote the last one
-    odd = on_chart(
-        [*guides[:3], Guide(0, 1, (first % 800, 90), ((first + 30 - move) % 800, 130))], 0, chart, grid
-    )
+    last = Guide(0, 1, (first % 800, 90), ((first + 30 - move) % 800, 130))
+    odd = on_chart([*guides[:3], last], chart, grid)
     for one in (its, odd):
         directed = guidance._directed(chart.border, (there, -there), one)
         leading = guidance._leading(one, directed, 200.0, GuidanceParameters(agreement=-1.0))
