@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any, get_args
@@ -289,7 +289,8 @@ def command(projects: tuple[Path, ...], **given: Any) -> ExitCode:
     place = places[0] if places else Path()
     first = config or find_config(place / "any" if is_folder(place) else place, places)
     values = _chosen(first)
-    recursive, resume, force, how = _run_options(**values, warnings=ineffective(values))
+    recursive, resume, force = (values[name] for name in ("recursive", "resume", "force"))
+    how = _how_to_run(values)
 
     def options(project: Path) -> tuple[Path | None, dict[str, Any]]:
         file = config or find_config(project, places)
@@ -343,27 +344,15 @@ def _saved(
             complain(f"{project}: {error.format_message() if isinstance(error, click.UsageError) else error}")
 
 
-def _run_options(
-    *,
-    recursive: bool,
-    resume: bool,
-    force: bool,
-    jobs: int | None,
-    report: Path | None,
-    log: Path | None,
-    quiet: bool,
-    verbose: bool,
-    profile: Path | None,
-    scheduler: str | None,
-    warnings: Sequence[str],
-    **others: Any,
-) -> tuple[bool, bool, bool, Run]:
-    """What the options say about the run as a whole: --recursive, --resume, --force, and how it is done."""
-    arguments = click.get_current_context().meta[ARGUMENTS]
+def _how_to_run(values: Mapping[str, Any]) -> Run:
+    """What all options say about the run as a whole."""
+    named = ("jobs", "report", "log", "quiet", "verbose", "profile", "scheduler")
     misnamed = misnamed_root()
-    said = [*warnings, misnamed] if misnamed else warnings
-    how = Run(jobs, report, log, quiet, verbose, arguments, profile, scheduler, said)
-    return recursive, resume, force, how
+    return Run(
+        **{name: values[name] for name in named},
+        arguments=click.get_current_context().meta[ARGUMENTS],
+        warnings=[*ineffective(values), *([misnamed] if misnamed else [])],
+    )
 
 
 def _options(
