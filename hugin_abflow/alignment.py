@@ -1,7 +1,7 @@
-"""Layers that agree: geometry and colour that bring them together, and one layer, whole, where nothing does.
+"""Makes layers agree: by geometry and colour, and where neither can, by taking one layer, whole.
 
-What flow cannot explain spoils the exposure around it. So regions of it are found after a stricter
-correction, and the final one is solved without them.
+What flow cannot explain, such as people, would be taken for a difference of exposure. So regions of it are
+found after a first, stricter correction of exposure, and the final correction leaves them out.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""What is to be made of a project: what is asked for, but for files that are left as they are."""
+"""What is to be made of a project: the outputs that it asks for, less those whose files are to stay."""
 
 from __future__ import annotations
 

@@ -1,8 +1,8 @@
-"""Charts: the flat grid on which one pair's flow lives (kernels/chart.cl, formulas in common.cl).
+"""Charts: the flat grids on which flow is found, one for each pair (kernels/chart.cl, formulas in common.cl).
 
-On a sphere the overlap of two layers is a band or a patch anywhere, over a pole as well. Its chart is an
-equirectangular projection about an axis of its own, turned so that the overlap lies along the chart's
-equator: there is no pole in it and hardly any stretch. On a plane it is the canvas's own grid.
+On a sphere the overlap of two layers is a band or a patch anywhere, even over a pole. Its chart is an
+equirectangular projection about an axis of its own, chosen so that the overlap lies along the chart's
+equator: no pole is in it, and hardly any stretch. On a plane it is the canvas's own grid.
 """
 
 from __future__ import annotations

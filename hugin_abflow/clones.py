@@ -1,20 +1,25 @@
 """Somebody whom two layers show at two places, shown once (kernels/clones.cl).
 
-Who walks along while photos are taken may stand twice in the overlap of two layers: here one shows him, and
-the other what is behind, there it is the other way round. A cut between both places costs nothing, so that
-the labelling of least energy (regions.py) shows him at both. He is told by what he looks like: with a and b
-what two aligned, corrected layers show in a cell p, and d the cells from one of his places to the other,
+Somebody who walks along while photos are taken may stand twice in the overlap of two layers: at his first
+place one layer shows him, and the other one what is behind him; at his second place it is the other way
+round. A cut between both places costs nothing, so the labelling of least energy (regions.py) shows him at
+both.
+
+He is recognised by his looks. With a and b what two aligned, corrected layers show in a cell p, and d the
+way from his one place to the other, in cells, he is there if
 
     sum_p max(0, <(|a(p) - b(p)|^2 + |a(p + d) - b(p + d)|^2) / 2 - l |a(p) - b(p + d)|^2>)
 
-is large, < > the mean of 3 x 3 cells, over cells in which it is positive. What is behind him is alike at both
-places as well, and gives the same for -d; but unlike it he ends where his outline is. Of his two places, the
-one without which the energy is less is taken from the other layer, unless he reaches beyond that one, and a
-part of him would stay. What stands still and repeats, such as windows, is found as far away again.
+is large. < > is the mean of 3 x 3 cells; the sum is over the cells in which it is positive. What is behind
+him is alike at both places as well, and gives the same for -d; but unlike him it does not end at his
+outline. What stands still and repeats, such as windows, is found as far away again.
 
-Where one layer was taken for all of a region, which is dearer than a cut, lest somebody is there twice, a cut
-that shows him once is better, if his places are beside each other: what else the region has is taken from
-whichever layer suits it.
+He is taken away at that of his two places without which the energy is less, by taking it from the other
+layer; unless he reaches beyond that layer, and a part of him would stay.
+
+Where all of a region was taken from one layer lest somebody is there twice, which costs more than a cut, a
+cut that shows him once is better, if his places are beside each other: the rest of the region then comes
+from whichever layer suits it.
 """
 
 from __future__ import annotations

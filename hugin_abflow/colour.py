@@ -1,13 +1,14 @@
 """Smooth exposure and colour correction of each layer (kernels/colour.cl).
 
-The aligned layers are compared in their overlaps, on a coarse grid, on the exposure scale of common.cl (log
-odds of integer images, log of floats' roots). Smooth gains that explain how they differ (gains.py) correct
-them. A difference counts as far as it can be trusted, how much it tells (dark samples little) and how far
-both layers are seen.
+The aligned layers are compared in their overlaps, on a coarse grid and on the exposure scale of common.cl:
+log odds for integer images, logarithms of roots for floats. The correction is smooth gains that explain how
+the layers differ (gains.py). A difference counts the more the better it can be trusted, the more it tells
+(dark samples tell little), and the more both layers are seen.
 
-Cameras' curves level off towards white, by which log odds move colours as exposure does; others run straight
-into it. The scale's shoulder, between both, is the one that leaves the least of the differences: else a
-gain is too large for bright things and too small for dark ones beside them, and steps remain.
+Most cameras' curves level off towards white; there log odds change colours as exposure does. Others run
+straight into white. The scale has a shoulder that lies between both, and the one is used that leaves least
+of the differences: with a wrong one a gain is too large for bright things and too small for dark ones beside
+them, and steps remain.
 """
 
 from __future__ import annotations

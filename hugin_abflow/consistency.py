@@ -1,13 +1,16 @@
-"""Flow that leads back to where it started is trusted; elsewhere it is filled (kernels/consistency.cl).
+"""Trust in flow that leads back to where it started, and filling of the rest (kernels/consistency.cl).
 
 A flow from a to b and the flow from b to a undo each other where both are right. Where they do not
-(occlusions, surfaces without texture), a pixel takes over trusted flow from around if what the images show
-fits it: the floor beside somebody who went is where it was. Else flow is carried on from the trusted flow
-around, hardly across edges of the image: a thing keeps its motion up to its outline, and what is behind it
-has its own. It is a diffusion that stops at edges, on a pyramid of trust-weighted means: each level starts
-from the filled coarser one, and a few sweeps do the rest (after Bornemann, Deuflhard, "The cascadic multigrid
-method for elliptic problems", 1996). The place of what is taken from one photo (single.py) is filled with
-wide means, without regard to edges: what is beside it was matched half with it.
+(occlusions, surfaces without texture), three things happen in turn:
+
+- A pixel takes over trusted flow from around, if that fits what the images show: beside somebody who went,
+  the floor is where it was.
+- Elsewhere flow is carried on from the trusted flow around, hardly across edges of the image: a thing keeps
+  its motion up to its outline, and what is behind it has its own. It is a diffusion that stops at edges, on
+  a pyramid of trust-weighted means: each level starts from the filled coarser one, and needs few sweeps
+  (after Bornemann, Deuflhard, "The cascadic multigrid method for elliptic problems", 1996).
+- The place of what is taken from one photo (single.py) is filled with wide means, whatever the edges: what
+  is beside it was matched half with it.
 """
 
 from __future__ import annotations

@@ -1,15 +1,15 @@
-"""How layers would differ if they showed the same, where they show different things (kernels/content.cl).
+"""How layers would differ if they showed the same things, where they do not (kernels/content.cl).
 
-Somebody whom one layer shows, in a place that is taken from another, is no difference of exposure: blended
-over wide bands he would leave his colours beside him, as a shade on what is behind. What the layers would
-differ by if both showed that is extrapolated from places around, where they do: from the nearest of them that
-are enough. Where there are few, as where all of a narrow overlap differs, layers differ by what they do:
-nothing else tells what is left of their exposures.
+Where one layer shows somebody, and the panorama another layer, their difference is no difference of
+exposure. The multi-band blend would spread it: his colours would be left as a shade on what is beside him.
+So the difference is replaced there by one that is extrapolated from places around where both show the same,
+from the nearest ones that suffice. Where few places tell it, as where all of a narrow overlap differs, the
+measured difference stays: nothing else tells what gains have left.
 
-Differences that are completed so need not sum to nothing by their weights, as others do.
-
-What is nearly black may be anything, at the rim of a dark lens above all, and is left as it is, unless flow
+What is nearly black may be anything, above all at the rim of a dark lens, and is left as it is, unless flow
 tells that it moved.
+
+Replaced differences, weighted as the layers are, need not sum to zero, as measured ones do.
 """
 
 from __future__ import annotations

@@ -1,11 +1,14 @@
-"""Which flow is kept: that without a search, or that with what a search found (on the host).
+"""Which flow is kept: flow without a search, or flow with what a search found (on the host).
 
-What was found has to make the images clearly more alike, since where patterns repeat much fits a little. And
-it must be no thing that moved by itself: somebody who walked would be torn from what is behind. It is none if
-it moves as what stands still does for a camera that moved (epipolar.py), or if it is a large part of what the
-images show and is consistent: what fits by chance fits in one direction. Of what is kept, a part that
-explains less than flow without a search is dropped: a chair is found, and beside it bars of a banister are
-taken for the next ones.
+What was found has to pass two tests:
+
+- The images have to be clearly more alike by it: where patterns repeat, much fits a little.
+- It must not be a thing that moved by itself: somebody who walked would be torn from what is behind. It
+  passes if it moves as still things do for a camera that moved (epipolar.py), or if it is a large part of
+  what the images show and is consistent: what fits by chance fits in one direction only.
+
+Of what is kept, each part that explains less than flow without a search is dropped: a chair is found, and
+the bars of a banister beside it are matched one bar too far.
 """
 
 from __future__ import annotations

@@ -1,12 +1,14 @@
-"""Near things that would change over too quickly, told by their flow (on the host).
+"""Near things that blending would bend, though flow matches them (on the host).
 
-A near thing shifts by more than what is behind it, and goes from its place in one photo to that in the
-other within their overlap: it is bent, by a strain (transition.py) of what it shifts by more over the
-overlap's width. Transitions go round it, but not where it is too near to a photo's border for that: there it
-looks bent, and flow is of no help. But if it ends within the overlap, one of the photos shows all of it that
-the other one does: consistency.py fills its place with the flow of what is behind, and seam.py takes it from
-that photo, whole. What crosses the overlap from one photo's border to the other's is left alone: taken from
-either, it would break at a border.
+A near thing shifts by more than what is behind it. Within the overlap it goes from its place in one photo to
+its place in the other, and is bent: by a strain (transition.py) of its additional shift over the overlap's
+width. Transitions go round near things; but where one is too near to a photo's border there is no room for
+that, and it looks bent, although its flow is right.
+
+If the thing ends within the overlap, one of the photos shows all of it that the other one does. Then it can
+be taken from that photo, whole (seam.py), and its place is filled with the flow of what is behind it
+(consistency.py). A thing that crosses the overlap from one photo's border to the other's is left alone:
+taken from either, it would break at a border.
 """
 
 from __future__ import annotations

@@ -1,18 +1,18 @@
 """Smooth gains that explain how overlapping layers differ.
 
-One field of gains per layer and channel on a coarse grid of cells, on the exposure scale of common.cl: where
-layers overlap, the corrected layers agree; from there the correction spreads through each layer, smoothly,
-and fades out. It is the minimum of
+Each layer and channel has one field of gains, on a coarse grid of cells and on the exposure scale of
+common.cl. Where layers overlap, the corrected layers agree; from there the correction spreads through each
+layer, smoothly, and fades out. The gains minimise
 
     sum_pairs c (g_a - g_b + d_ab)^2 + h |grad (g_a - g_b)|^2  +  sum_k |grad g_k|^2 + g_k^2 / fade^2
 
-with d_ab the measured difference of the aligned layers and c how much it counts: a sparse linear system,
-solved directly; in the first rounds, which only tell what to trust, for blocks of cells. Where no layers
-differ, all gains are exactly zero.
+with d_ab the measured difference of the aligned layers and c how much it counts. That is a sparse linear
+system, solved directly in rounds, which find out what to trust; the first ones are solved for blocks of
+cells. Where no layers differ, all gains are exactly zero.
 
 h is 0 but in and beside cells where what is seen tells nothing of exposure, such as somebody whom only one
-layer shows. Without it both gains would fade there, and with them their difference: a step beside him. With
-it the difference goes on from around, and fades much more slowly.
+layer shows. There, without it, both gains would fade, and with them their difference, which would leave a
+step beside him. With it the difference goes on from around, and fades much more slowly.
 """
 
 from __future__ import annotations

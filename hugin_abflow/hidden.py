@@ -1,4 +1,4 @@
-"""What of layers nobody sees (kernels/hidden.cl): it need not be sampled."""
+"""What nobody sees of the layers in a band, so that it need not be sampled (kernels/hidden.cl)."""
 
 from __future__ import annotations
 

@@ -1,16 +1,18 @@
-"""What one photo shows clipped is taken from another that does not (kernels/highlights.cl).
+"""What one photo shows clipped is taken from another one that does not (kernels/highlights.cl).
 
 Where a photo runs into white (saturation.py), a darker one beside it still has structure. The softmax knows
 nothing of that. So a layer's colour weight falls with how much it shows clipped of what the layer that clips
-least still shows of its surroundings,
+least still shows of the surroundings:
 
     s_k <- s_k exp(-strength_k * e_k),    e_k = (c_k - min_j c_j) / (1 - min_j c_j)
 
-with c_k the clipped share: of a white ceiling all photos clip most, and the darkest alone shows its specks.
-As white and what is not differ by an unknown amount, the transition is as wide as the overlap allows there
-(transition.py), and the darker layer is seen nearly up to its border, if there is nothing but white beyond.
-Where layers that clip less than k, by all that both show, reach beyond each other, white need not be shown at
-all, and the strength is twice as large; towards what layer k has to show white it falls.
+with c_k the clipped share. The minimum matters on a white ceiling: all photos clip most of it, and only the
+darkest one shows its specks.
+
+White and what is not white differ by an unknown amount. So the transition is as wide there as the overlap
+allows (transition.py), and the darker layer is seen nearly up to its border, if there is nothing but white
+beyond. Where layers that clip less than k, by all that both show, reach beyond each other, white need not be
+shown at all, and the strength is twice as large; it falls towards what layer k alone has to show white.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Places within a panorama that no photo shows: who does not look there finds them on paper."""
+"""Holes in a panorama: places within it that no photo shows. They are easily missed on a screen."""
 
 from __future__ import annotations
 

@@ -1,12 +1,13 @@
 """Flow as it passes through the view between two layers (kernels/intermediate.cl).
 
-Flow starts on a layer: at a place p, F_ab tells of what layer a shows at p, which is not what is to be seen
-there. To be seen is what passes through p on its way from where a shows it to where b shows it, having come
-as far as b's share at p: the intermediate flow of frame interpolation. The two flows that start at p tell it
-well enough most often. Where a near thing is narrower than its motion, neither does: a cable that lies 20 px
-lower in the other photo would be cut halfway. So consistent flows are followed to where they pass (forward
-splatting). Of two that meet there, the one is taken that hides the other: what is behind is seen beside it in
-a layer, and leads to behind it.
+Flow starts on a layer: F_ab at a place p tells where b shows what a shows at p. But that is not what the
+panorama shows at p. It shows what passes through p on its way from its place in a to its place in b, having
+come as far as b's share at p: the intermediate flow of frame interpolation.
+
+Most often the two flows that start at p tell it well enough. Where a near thing is narrower than its motion
+neither does: a cable that lies 20 px lower in the other photo would be cut halfway. So consistent flows are
+also followed to where they pass (forward splatting). If two of them meet there, the one is taken that hides
+the other: what is behind is seen beside the near thing in a layer, and leads to behind it.
 """
 
 from __future__ import annotations

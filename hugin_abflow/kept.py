@@ -1,4 +1,4 @@
-"""Devices that all merges of this process share: drivers keep some of the memory of one that is gone."""
+"""Devices that all merges of this process share: a driver never frees all memory of one that is gone."""
 
 from __future__ import annotations
 

@@ -1,9 +1,10 @@
-"""What is taken from one layer, whole, is moved smoothly (kernels/membrane.cl).
+"""Smooth displacements for what is taken from one layer, whole (kernels/membrane.cl).
 
-Flow has nothing to match there, and what it found would bend people, and the floor beside them. Where layers
-show different things, the displacements of the one that is taken are those of a membrane that is held where
-they agree, and along cuts, where flow has brought them together: harmonic ones, no larger than those around
-(of least slopes, as in Perez, Gangnet, Blake, "Poisson image editing", 2003).
+In such a region flow had nothing to match; what it found would bend people, and the floor beside them. Where
+layers show different things there, the displacements of the layer that is taken become those of a membrane.
+It is held where layers agree, and along cuts, where flow has brought them together; between them it is
+harmonic, so that no displacement is larger than those around (of least slopes, as in Perez, Gangnet, Blake,
+"Poisson image editing", 2003).
 """
 
 from __future__ import annotations

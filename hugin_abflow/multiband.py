@@ -1,15 +1,19 @@
 """A multi-band blend of aligned, corrected layers: what is to be added to each (kernels/multiband.cl).
 
-Burt and Adelson, "A multiresolution spline with application to image mosaics", 1983: each band of frequencies
-changes over as widely as its waves are long, so that neither steps of brightness nor doubled texture show.
-Blended are the layers' differences from a mean, to which the blend is added: the same where all cover all,
-and nothing for layers that agree, however narrow their overlaps. In that mean a layer has the less of a share
-the nearer its border is: beyond it goes on by what it differs by there, and a mean in which it ended would be
-a step. What fits on half the working grid is calculated there; of finer bands the weighted mean of the
+Each band of frequencies changes over as widely as its waves are long, so that neither steps of brightness
+nor doubled texture show (Burt and Adelson, "A multiresolution spline with application to image mosaics",
+1983).
+
+What is blended are the layers' differences from a mean, and the blend is added to that mean. Where all
+layers cover everything this is the usual blend; layers that agree are not changed at all, however narrow
+their overlaps. In the mean each layer's share fades towards its border: a mean in which a layer simply ended
+would have a step there, by the difference that it goes on with beyond.
+
+Only what fits on half the working grid is calculated here. In finer bands the weighted mean of the
 full-resolution pass is the blend, and what is added to a layer before leaves them as they are.
 
-Gains (colour.py) come before: an offset cannot restore contrast. Where layers show different things, what
-they differ by is told from beside (content.py).
+Gains (colour.py) come before: an offset cannot restore contrast. Where layers show different things their
+difference is extrapolated from beside (content.py).
 """
 
 from __future__ import annotations

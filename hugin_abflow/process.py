@@ -1,4 +1,4 @@
-"""What the commands set for their process, which is theirs alone; programs with the library keep theirs."""
+"""Settings of the whole process. Only the commands make them: a program that uses the library has its own."""
 
 from __future__ import annotations
 

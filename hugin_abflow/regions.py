@@ -1,15 +1,18 @@
 """Regions that one layer shows, whole: where they are, and which layer that is (on the host).
 
-In each connected region of cells where aligned layers differ every cell is given to one layer: the one that
-the softmax favours, with cuts between layers, and at the layers' own borders, where they show least. This is
-a labelling of least energy,
+In each connected region of cells where aligned layers differ, every cell is given to one layer: the one that
+the softmax favours, with cuts where they show least, between layers and at the layers' own borders. This is
+a labelling of least energy (labelling.py),
 
-    sum_cells (r (1 - s_k) + h e_k + q_k)  +  sum_neighbours c (t + t') / 2 [k != k']  +  sum_borders c t
+    sum_cells (r (1 - s_k) + h e_k + q_k)  +  sum_neighbours c (t + t') / 2 [k != k']  +  sum_borders c t.
 
-with r the residual of low frequencies, averaged over the cells around, t how far that of all, not averaged,
-is seen, s_k the share of the softmax, c the price of a cut (labelling.py), h that of what layer k clips of
-what another one, as bright, still shows, e_k, and q_k that of a layer that is torn there. A cut through
-somebody who is as bright as what is behind shows in t alone.
+    r   residual of low frequencies, averaged over the cells around.
+    t   how far the residual of all frequencies, not averaged, is seen: a cut through somebody who is as
+        bright as what is behind him shows in t alone.
+    s   the share of layer k in the softmax.
+    c   price of a cut.
+    e   what layer k clips of what another one, as bright, still shows; h: its price.
+    q   price of a layer that is torn there (tears.py).
 """
 
 from __future__ import annotations

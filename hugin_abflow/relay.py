@@ -1,23 +1,31 @@
 """Flow of a pair that other pairs contradict, replaced by flow by way of a third layer (kernels/relay.cl).
 
-Where a, b and c overlap, the flow from a to c equals the flow from a to b composed with that from b to c.
-Where it does not, one of the three is wrong: most often that of a small overlap, of which much is seen beyond
-it in the other layer, or in which a pattern was matched one repeat too far. It may be consistent forward and
-backward all the same. The other triangles tell which one is wrong, and so do the images: a pair is the less
-reliable the more reliable pairs contradict it, and the worse its layers fit by its flow,
+Where layers a, b and c overlap, the flow from a to c equals the flow from a to b composed with that from b
+to c. Where it does not, one of the three is wrong. Most often it is that of a small overlap, either because
+much of what it shows is seen in the other layer beyond it, or because a pattern was matched one repeat too
+far. It may lead forward and back consistently all the same.
+
+Which one is wrong is told by the other triangles, and by the images. A pair is the less reliable the more
+reliable pairs contradict it, and the worse its layers fit by its flow:
 
     r_ac = (h f_ac T_ac + A_ac) / (h f_ac T_ac + A_ac + D_ac).
 
-T is the sum of trust in its own flow, over cells of its overlap; f its mean fit; h a constant. A is the sum,
-over all other layers b, of what flow composed by way of b says for that flow, and D of what it says against
-it: the trust in both in a cell, times the fit of the two legs, times r_ab r_bc, and by how near to each other
-they lead, or how far. A fixed point solves it, from r = 1. Two kinds of pairs are mended: doubted ones, and
-those of which others know much more than their own flow is sure of. Where their flow contradicts the more
-reliable composed flows, or is not trusted, it becomes their mean; but not around control points that agree
-with it, on what moves as they do.
+    T   the sum of trust in the pair's own flow, over the cells of its overlap.
+    f   its mean fit.
+    h   a constant.
+    A   the sum, over all other layers b, of what flow composed by way of b says for the pair's flow.
+    D   the same for what it says against it.
 
-Flow of small overlaps that others show in much larger ones need not be found before (in a ring of fisheyes
-that of a third of all pairs): it is inferred from others, once these have been compared.
+What composed flow says weighs, in each cell, the trust in both legs times their fit times r_ab r_bc; it
+counts for A by how near to each other both flows lead, for D by how far. All r start at 1, and become a fixed
+point.
+
+Two kinds of pairs are mended: doubted ones, and those of which others know much more than their own flow is
+sure of. Where their flow contradicts the more reliable composed flows, or is not trusted, it becomes the
+mean of these; but not around control points that agree with it, on what moves as they do.
+
+The flow of a small overlap that others show in much larger ones is not even searched for (in a ring of
+fisheyes that is a third of all pairs): it is inferred from the others, once these have been compared.
 """
 
 from __future__ import annotations

@@ -1,14 +1,16 @@
-"""What photos show white: what they do not show any brighter (kernels/saturation.cl).
+"""The grey at which a photo is clipped (kernels/saturation.cl).
 
-A photo is clipped at full scale. If its exposure was corrected afterwards, as nona does where Hugin has found
-exposures, what is clipped becomes some grey, and nothing in the layer is brighter. That grey is no colour: it
-tells nothing of exposure, and another photo that shows more of that place is the better one. A flat lamp in a
-dark photo looks the same; but another photo shows it, compared by their exposures, no brighter.
+A photo is clipped at full scale. But if its exposure was corrected, as nona does where Hugin has found
+exposures, what is clipped becomes some grey, and nothing in the layer is brighter. That grey is no true
+colour: it tells nothing of exposure, and another photo that shows more of that place is the better one.
 
-So it is with floats, made from photos that are clipped: their full scale is not known, but is found the same
-way, of whatever is brightest.
+A flat lamp in a dark photo gives the same spike of brightest values. But another photo, compared by their
+exposures, shows the lamp no brighter, while it shows more than what was clipped.
 
-Not found is what was clipped in one channel only, or where vignetting was corrected as well.
+The same holds for floats that were made from clipped photos: their full scale is not known, and is found in
+the same way, from what is brightest.
+
+What was clipped in one channel only, or where vignetting was corrected as well, is not found.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
-"""Temporary files and folders: locked while in use, so that the next run knows what a killed one left behind.
+"""Temporary files and folders, locked while in use, so that a run knows what a killed one left behind.
 
-A lock goes with its process, however that ends. Leftovers of other computers, whose locks a shared folder
-need not show, are taken for such only after a week.
+A lock goes with its process, however that ends. A shared folder need not show the locks of other computers:
+their files are taken for leftovers only after a week.
 """
 
 from __future__ import annotations

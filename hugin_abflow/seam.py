@@ -2,15 +2,17 @@
 
 Somebody who walked, or a near thing that hides another part of the scene for each camera, leaves aligned
 layers that differ although exposure is corrected. Each region of such cells is given to one layer, or cut
-between layers where they show least (regions.py). Regions keep to themselves: elsewhere the softmax stays as
-it is, and the transition lies where the layers agree. What is clipped in one photo only is no such
-difference: it is brighter in the other by an unknown amount, and changes over best where it does so slowly.
-But if it would not be clipped there for certain, the other shows something else, such as no white van.
+between layers where the cut shows least (regions.py). Nothing changes outside the regions: there the softmax
+stays as it is, and layers agree.
 
-Where there is no flow, layers are not aligned, and each overlap is such a region, whole: on finer cells, with
-the mean square of the difference in place of r and t, since fine texture is as much in the way, and with
-narrow transitions; multiband.py blends low frequencies across them, but for those that differ because edges
-lie elsewhere.
+What is clipped in one photo only is no such difference: the other one shows it brighter by an unknown
+amount, and a slow transition suits it best. But if the other photo is so dark there that this one would
+certainly not clip, it shows something else, such as no white van.
+
+Without flow layers are not aligned, and each overlap is such a region, whole. Then cells are finer, the mean
+square of the difference takes the place of r and t, since differences of fine texture are as much in the
+way, and transitions are narrow. Low frequencies are blended across them by multiband.py, except for those
+that differ because edges lie elsewhere.
 """
 
 from __future__ import annotations

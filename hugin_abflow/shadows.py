@@ -1,9 +1,9 @@
 """Shadows that fall in one photo and not in another (on the host).
 
-Gains follow the shadow of somebody who walks by as any other exposure: it would be half as dark, with an edge
-where gains are not as quick. So where two layers differ by as much all over a place, and clearly by something
-else around it, one of them is taken, whole. Its outline shows in one layer alone: light that strays in a lens
-changes how much layers differ where both become darker.
+Gains would take the shadow of somebody who walks by for exposure: it would be half as dark, with an edge
+where gains change less quickly. So a place is taken from one layer, whole, if two layers differ by the same
+amount all over it, and clearly by something else around it. A shadow's outline shows in one layer alone;
+stray light in a lens, in contrast, changes how much layers differ where both become darker.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""What a band of the full-resolution pass reads of arrays on coarse grids."""
+"""What a band of the full-resolution pass reads of coarse grids: rows of fields, gains and offsets."""
 
 from __future__ import annotations
 

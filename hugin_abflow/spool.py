@@ -1,7 +1,7 @@
-"""Decoded rows of layers, from the first time that they are needed to the second, in a temporary file.
+"""Decoded rows of layers, kept in a temporary file from the first time that they are needed to the second.
 
-Layers are read twice, for the working canvas and for the panorama, and to decode them takes several times as
-long as to copy them. What the file can not hold is decoded again.
+Layers are read twice, for the working canvas and for the panorama, and decoding takes several times as long
+as copying. What the file cannot hold is decoded again.
 """
 
 from __future__ import annotations

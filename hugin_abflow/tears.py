@@ -1,9 +1,9 @@
-"""Where a layer's own displacements tear it (on the host).
+"""Where a layer is torn by its own displacements (on the host).
 
-Where flow finds no match, or that of something else, displacements change from cell to cell by as much as the
-cells are apart. Blended, that hardly shows: each layer weighs most where it is displaced least. But a region
-is taken from one layer whole, and if it is torn there a lamp post ends in a hook: such cells cost as much as
-a residual that the softmax does not favour (regions.py).
+Where flow finds no match, or a wrong one, displacements change from one cell to the next by as much as the
+cells are apart. In a blend that hardly shows, since each layer weighs most where it is displaced least. But
+a region is taken from one layer, whole: a lamp post that is torn there ends in a hook. So torn cells have a
+price when the layer of a region is chosen (regions.py).
 """
 
 from __future__ import annotations

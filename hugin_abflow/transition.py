@@ -1,28 +1,35 @@
 """Where, and how quickly, the geometry changes over from one layer to the next (kernels/transition.cl).
 
-Changing over bends the picture: across a transition of width t, parallax of P px stretches or squeezes it
-by P / t, its strain. The published coefficient changes over across the whole overlap, wherever near things
-are in it. These are shown between their places in the photos, as sharp and as straight as the flow is right.
-A retoucher would lead the transition around them. So the coefficients are those that minimise
+Changing over bends the picture: a transition of width t that crosses a parallax of P px stretches or
+squeezes it by P / t, its strain. The published coefficient changes over across the whole overlap, whatever
+near things are in it. These are then shown between their places in the photos, and only as sharp and
+straight as the flow is right. A retoucher would lead the transition around them. So the coefficients are
+those that minimise
 
     sum_k  integral  (P^2 + P0^2) |grad w_k|^2  +  ((2 strain)^2 + b |grad f|^2) w_k (1 - w_k),
 
-of all that sum to 1 and are 0 where layer k is not. The first term is the strain; the second, of a double
-well, is the price of each place that no photo shows as it is: more where flow f itself bends what is shown
-between its places in the photos, as along outlines of near things, and where it is wrong. Together a
-transition costs about the parallax that it meets along its length, so that it runs where there is little, and
-is pi P / (2 strain) wide, at which the strain is what is wanted, where f itself bends nothing and the overlap
-has room for it: a phase field (Modica and Mortola 1977; with this well Blowey and Elliott 1991). Near things
-that end within an overlap are left to one photo. What shows nothing, such as a sky or a wall, counts as
-without parallax: flow spreads over it from what is beside it, but nobody sees it bend. So transitions run
-there, round posts and letters. Where layers cannot be brought to one brightness there is no well, and
-transitions of layers that reach beyond each other are as wide as the overlap. Layers of one and the same mask
-share it evenly.
+of all that sum to 1 and are 0 where layer k is not.
 
-Where a layer ends shortly before the panorama's rim the strip beyond counts as if it were there (rim.py).
-Layers end hard at their borders in overlaps that are thinner than a cell, as in holes of their masks. The sum
-is minimised by relaxation on a pyramid of cells. On the coarsest the well is deepened step by step, since
-without it there is a single minimum; the finer ones start from what the coarser ones have found.
+The first term is the strain. The second, a double well, is the price of each place that no photo shows as it
+is. It is higher where flow f itself bends what is shown between its places in the photos, as along outlines
+of near things and where f is wrong. Both together are a phase field (Modica and Mortola 1977; with this well
+Blowey and Elliott 1991). A transition costs about the parallax that it meets along its length, so it runs
+where there is little. It is pi P / (2 strain) wide, at which the strain is what is wanted, if f bends
+nothing there and the overlap has room.
+
+Exceptions:
+
+- What shows nothing, such as a sky or a wall, counts as without parallax: flow spreads over it from what is
+  beside it, but nobody sees it bend. So transitions run there, round posts and letters.
+- Near things that end within an overlap are left to one photo.
+- Where layers cannot be brought to one brightness (highlights.py) there is no well, and transitions of
+  layers that reach beyond each other are as wide as the overlap.
+- Layers of one and the same mask share it evenly.
+- Where a layer ends shortly before the panorama's rim the strip beyond counts as if it were there (rim.py).
+- In overlaps that are thinner than a cell, as in holes of masks, layers end hard at their borders.
+
+The sum is minimised by relaxation on a pyramid of cells. On the coarsest the well is deepened step by step,
+since without it there is a single minimum; the finer ones start from what the coarser ones have found.
 """
 
 from __future__ import annotations

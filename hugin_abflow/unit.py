@@ -1,10 +1,10 @@
-"""Floats coded as photos are (kernels/unit.cl).
+"""Floats, coded as photos are (kernels/unit.cl).
 
-Of integers full scale is the unit; dark noise, and what slope is seen, are told by it. Floats are linear
-light of whatever scale: a room may have a hundredth, of which half is as dark as noise, so that nothing is
-matched and exposures are hardly brought together. So all layers alike are scaled until their middle is the
-grey of a photo, and coded by their roots, nearly as photos are by sRGB's curve: all that sees far sees them
-as it does photos. The full-resolution pass corrects their roots, and adds light.
+Thresholds for dark noise, and for slopes that are seen, are shares of full scale. That is the unit of
+integers, but floats are linear light of any scale: a room may have values around 0.01, which would be taken
+for noise, and nothing would be matched. So all layers are scaled alike, until the median is the grey of a
+photo, and the root is taken, which is nearly the curve of sRGB. All steps at working resolution see floats
+like that. The full-resolution pass corrects the roots, and blends light.
 """
 
 from __future__ import annotations
