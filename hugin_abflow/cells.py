@@ -4,8 +4,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -190,6 +191,18 @@ def grown(mask: Mask, by: int, wraps: bool) -> Mask:
     modes = "constant", "wrap" if wraps else "constant"
     found: Mask = scipy.ndimage.maximum_filter(mask, 2 * by + 1, mode=modes)
     return found
+
+
+def across_border(
+    function: Callable[[npt.NDArray[Any]], npt.ArrayLike], values: npt.NDArray[Any], by: int, wraps: bool
+) -> npt.NDArray[Any]:
+    """What a function of SciPy that knows no columns which wrap makes of values (height, width): where they
+    do, it gets `by` columns of the other side on each, and what it makes of these is left out.
+    """
+    if not wraps:
+        return np.asarray(function(values))
+    wider = np.pad(values, ((0, 0), (by, by)), mode="wrap")
+    return np.asarray(function(wider))[..., by : by + values.shape[1]]
 
 
 def averaged(values: npt.NDArray[np.floating], wraps: bool) -> npt.NDArray[np.floating]:

@@ -13,10 +13,9 @@ taken from either, it would break at a border.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -32,6 +31,7 @@ from hugin_abflow.cells import (
     SingleSource,
     Things,
     View,
+    across_border,
     cells_at,
     ends_within,
     grown,
@@ -157,7 +157,7 @@ def _alike(
 def _nearest(mask: Mask, wraps: bool) -> tuple[npt.NDArray[np.intp], npt.NDArray[np.intp]]:
     """Rows and columns of the cell of a mask that is nearest to each cell."""
     indices = partial(scipy.ndimage.distance_transform_edt, return_distances=False, return_indices=True)
-    row, column = _wrapped(indices, ~mask, wraps)
+    row, column = across_border(indices, ~mask, mask.shape[1], wraps)
     return row, column % mask.shape[1]
 
 
@@ -170,7 +170,7 @@ def _width(masks: tuple[Mask, Mask], wraps: bool) -> npt.NDArray[np.float64]:
         within = own | ~other
         if within.all():
             return np.full(total.shape, np.inf)
-        total += _wrapped(scipy.ndimage.distance_transform_edt, within, wraps)
+        total += across_border(scipy.ndimage.distance_transform_edt, within, within.shape[1], wraps)
     return CELL * total
 
 
@@ -179,10 +179,4 @@ def _filled(mask: Mask, wraps: bool) -> Mask:
     wider = grown(np.pad(mask, ((_CLOSED, _CLOSED), (0, 0))), _CLOSED, wraps)
     modes = "constant", "wrap" if wraps else "constant"
     closed = scipy.ndimage.minimum_filter(wider, 2 * _CLOSED + 1, mode=modes, cval=1)[_CLOSED:-_CLOSED]
-    return _wrapped(scipy.ndimage.binary_fill_holes, closed, wraps)
-
-
-def _wrapped(function: Callable[[Mask], Any], mask: Mask, wraps: bool) -> npt.NDArray[Any]:
-    """What a function of SciPy, which knows no columns that wrap, makes of a mask: (..., height, width)."""
-    columns = mask.shape[1]
-    return np.asarray(function(np.tile(mask, 3))[..., columns : 2 * columns] if wraps else function(mask))
+    return across_border(scipy.ndimage.binary_fill_holes, closed, closed.shape[1], wraps)

@@ -8,11 +8,13 @@ stray light in a lens, in contrast, changes how much layers differ where both be
 
 from __future__ import annotations
 
+from functools import partial
+
 import numpy as np
 import numpy.typing as npt
 import scipy
 
-from hugin_abflow.cells import Mask, centres, grown
+from hugin_abflow.cells import Mask, across_border, centres, grown
 from hugin_abflow.gains import Difference, Measured
 from hugin_abflow.working import Grid
 
@@ -99,12 +101,9 @@ def _even(values: npt.NDArray[np.float64], trusted: Mask, around: bool) -> Mask:
     """The trusted cells that differ little from the four beside them, of those that are trusted; around:
     whether the last column is beside the first one.
     """
-    beside, by = scipy.ndimage.generate_binary_structure(2, 1), int(around)
+    beside = scipy.ndimage.generate_binary_structure(2, 1)
+    highest = partial(scipy.ndimage.grey_dilation, footprint=beside)
     high, low = (
-        scipy.ndimage.grey_dilation(
-            np.pad(np.where(trusted, sign * values, -np.inf), ((0, 0), (by, by)), mode="wrap"),
-            footprint=beside,
-        )[:, by : by + values.shape[1]]
-        for sign in (1, -1)
+        across_border(highest, np.where(trusted, sign * values, -np.inf), 1, around) for sign in (1, -1)
     )
     return np.asarray(trusted & (high + low < _EVEN))
