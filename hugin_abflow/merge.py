@@ -26,13 +26,13 @@ from hugin_abflow.images import ImageWriter, check_target, use_threads
 from hugin_abflow.kept import in_use, kept_device
 from hugin_abflow.layer import Canvas, Layer, check_canvas, check_layers
 from hugin_abflow.metadata import describe
-from hugin_abflow.nona import open_layers
 from hugin_abflow.opencl import Device
 from hugin_abflow.pano_trafo import images_of, read_guides
 from hugin_abflow.progress import Progress, silent
 from hugin_abflow.project import Plan, read_plan, warn_of_doubts
 from hugin_abflow.settings import Settings
 from hugin_abflow.spool import spooled
+from hugin_abflow.supply import open_layers
 from hugin_abflow.targets import refuse_input, refuse_photo
 
 _log = logging.getLogger(__name__)
@@ -71,7 +71,7 @@ def merge_project(
     """Turn a Hugin project into a panorama; returns its file.
 
     output          format by its ending; default: named and typed as the project says, beside it.
-    prefix, layers, remap, keep_layers    where the layers come from, see `nona.open_layers`. Of those that
+    prefix, layers, remap, keep_layers    where the layers come from, see `supply.open_layers`. Of those that
                     nobody named one by one, a view in several exposures is shown in one, and
                     only such are made that may be (`brackets.py`).
     compression, jpeg_quality    of the file, see `images.ImageWriter`; default: the project's, if the output

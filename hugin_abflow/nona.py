@@ -1,4 +1,4 @@
-"""Layers of a project: those that are there, and what Hugin's nona makes."""
+"""Hugin's remapper, nona: run to make layers of a project's images."""
 
 from __future__ import annotations
 
@@ -8,16 +8,13 @@ import re
 import shutil
 import subprocess
 from collections import Counter, deque
-from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
-from contextlib import contextmanager
-from dataclasses import replace
+from collections.abc import Callable, Collection, Iterable, Sequence
 from pathlib import Path
-from typing import NamedTuple, get_args
+from typing import NamedTuple
 
 from hugin_abflow import programs, pto
 from hugin_abflow.errors import (
     ImageReadError,
-    LayersMismatchError,
     LayersMissingError,
     NonaFailedError,
     NonaMissingError,
@@ -25,30 +22,23 @@ from hugin_abflow.errors import (
     PhotoMissingError,
     ProgramFailedError,
     ProgramMissingError,
-    SettingsError,
 )
 from hugin_abflow.failures import check_made, failure
 from hugin_abflow.found import (
     Found,
-    Remap,
-    find,
     is_another_projects,
     layer_path,
-    layers_by_prefix,
-    named_files,
-    none_there,
 )
 from hugin_abflow.images import read_layers
 from hugin_abflow.jpeg import is_cut
-from hugin_abflow.layer import Layer, check_layers
 from hugin_abflow.programs import LAST_LINES, move_whole, started
-from hugin_abflow.progress import Progress, silent
+from hugin_abflow.progress import Progress
 from hugin_abflow.project import Plan, PlannedImage, file_key
-from hugin_abflow.scratch import is_file, is_special, work_folder
+from hugin_abflow.scratch import is_file, is_special
 from hugin_abflow.targets import named_in_unicode
 from hugin_abflow.tifftags import is_edited
 
-log = logging.getLogger("hugin_abflow.nona")
+_log = logging.getLogger(__name__)
 
 # Bytes of a project's name with which those of its layers begin while they are made: file systems take 255,
 # and numbers and endings follow.
@@ -67,115 +57,6 @@ _LOSS, _CUT = ": Read error on ", "Premature end of JPEG file"
 _DOUBTS = (_CUT, "Corrupt JPEG data")
 
 
-@contextmanager
-def open_layers(
-    plan: Plan,
-    *,
-    prefix: str | Path | None = None,
-    layers: Sequence[str | Path] | None = None,
-    remap: Remap = "auto",
-    keep_layers: bool = False,
-    images: Sequence[PlannedImage] | None = None,
-    progress: Progress = silent,
-) -> Iterator[list[Layer]]:
-    """The project's layers in the order of its images, readable inside the ``with`` block.
-
-    layers          files that are the layers, whatever their names; taken as they are.
-    prefix          layers named PREFIX0000.tif ..., as given or relative to the project's folder; taken
-                    as they are. Without both, the project's stem and Hugin's default prefix are tried.
-    remap           "never": only what is there. "always": nona makes all layers. "auto": nona makes all
-                    that are missing, and all if one cannot be read, has no alpha, is of another canvas, or is
-                    more than 2 s older than the project or its photo, and they can be made again (else
-                    old ones are used, with a warning).
-    keep_layers     layers that nona made are moved beside the project, named as Hugin does.
-    images          those of the project's of which layers are made; None, and where layers are kept: all.
-
-    Layers are made in a folder under TMPDIR that is removed in the end. Raises `LayersMissingError`,
-    `PhotoMissingError`, `NonaMissingError`, `NonaFailedError`, `LayersMismatchError`, `ImageReadError`,
-    `ProjectError` (a photo has another size), `OutputError` (layers cannot be kept), `SettingsError`
-    (`remap` unknown, or "always" together with named layers).
-    """
-    named = bool(prefix or layers)
-    _check_request(remap, named)
-    with work_folder() as folder:
-        if layers:
-            files = named_files(layers)
-        elif prefix:
-            files = layers_by_prefix(plan, prefix).in_order()
-        else:
-            needed = plan if images is None or keep_layers else replace(plan, images=tuple(images))
-            files = _find_or_make(plan, needed, folder, remap, keep_layers, progress).in_order()
-        found = [str(file) for file in files if file.parent != folder]
-        opened = [layer for file in files for layer in read_layers(file)]
-        names = {image.index: image.name for image in plan.images}
-        photos = {str(file): names[index] for index, file in _made(plan, folder).items()}
-        # what was made will go: messages name the photo
-        opened = [replace(one, photo=photos.get(str(one.file))) for one in opened]
-        called = [one.photo or str(one.file) for one in opened]
-        try:
-            check_layers(plan.canvas, opened, called)
-        except LayersMismatchError as error:
-            if not found or not _can_make(plan):
-                raise
-            without = ", without --prefix and --layers," if named else ""
-            raise LayersMismatchError(f"{error} (--remap always{without} makes all of them)") from None
-        try:
-            yield opened
-        except ImageReadError as error:  # files are opened before, but not decoded
-            if named or not any(file in str(error) for file in found) or not _can_make(plan):
-                raise
-            raise ImageReadError(f"{error} (--remap always makes all of them)") from None
-
-
-def _check_request(remap: str, named: bool) -> None:
-    if remap not in get_args(Remap):
-        raise SettingsError(f"remap is {remap!r}; choose 'auto', 'always' or 'never'")
-    if named and remap == "always":
-        raise SettingsError(
-            "layers are named and shall be made; leave out --prefix and --layers, or --remap always"
-        )
-
-
-def planned_layers(plan: Plan, remap: Remap) -> tuple[Found | None, Sequence[PlannedImage]]:
-    """What `open_layers` takes where nobody names layers, and the images of which nona makes layers first;
-    None and all images where it makes all anew. Says why.
-
-    Raises `LayersMissingError` where nothing is there and nothing may be made.
-    """
-    found = None if remap == "always" else find(plan)
-    if remap == "never":
-        if found is None:
-            raise none_there(plan)
-        _report_used(plan, found)
-        return found, []
-    if found is None:
-        return None, plan.images
-    unusable, stale = found.unusable(plan), found.stale(plan)
-    if (unusable or stale) and _can_make(plan):
-        if unusable:
-            log.warning("%s: all layers are made again", unusable)
-        elif edited := [file for file in found.in_order() if is_edited(file)]:
-            log.warning(
-                "%s was changed by another program, but %s is older than the project or its photo: layers "
-                "are made again (--remap never takes them as they are)", edited[0], stale[0],
-            )  # fmt: skip
-        else:
-            log.info("%s is older than the project or its photo: layers are made again", stale[0])
-        return None, plan.images
-    if stale and not found.broken:
-        reason = "nona is not installed" if shutil.which("nona") is None else "photos are missing"
-        log.warning("%s is older than the project or its photo; used as it is, since %s", stale[0], reason)
-    return found, found.missing(plan)
-
-
-def _report_used(plan: Plan, found: Found) -> None:
-    """Warn of what --remap never leaves as it is."""
-    for image in found.missing(plan):
-        log.warning("no layer of image %d (%s): it is left out", image.index, image.name)
-    for file in found.stale(plan)[:1]:
-        log.warning("%s is older than the project or its photo; used as it is (--remap never)", file)
-
-
 def probe() -> str | None:
     """nona's version ("2022.0.0.a0962865f932"), None where it is not installed."""
     try:
@@ -188,17 +69,21 @@ def probe() -> str | None:
     return version.group(1) if version else "unknown"
 
 
-def _can_make(plan: Plan) -> bool:
+def can_make(plan: Plan) -> bool:
+    """Whether nona is installed and all photos of a project are there."""
     return shutil.which("nona") is not None and all(is_file(image.photo) for image in plan.images)
 
 
-def _make_all(plan: Plan, folder: Path, keep: bool, progress: Progress) -> Found:
-    """Have nona make every layer."""
+def make_all(plan: Plan, folder: Path, keep: bool, progress: Progress) -> Found:
+    """Have nona make every layer of a plan in `folder`. keep: move them beside the project then.
+
+    Raises what `refuse_to_make` and a run of nona raise, `LayersMissingError` where it makes none.
+    """
     prefix = str(plan.folder / plan.layer_prefix(plan.stem))
     refuse_to_make(plan, plan.images, prefix if keep else None, anew=True)
     with progress("remap", len(_STEPS) * len(plan.images)) as advance:
         ended = _run(plan, _project_for_nona(plan, folder), plan.images, folder, [], advance)
-    made = _made(plan, folder)
+    made = made_in(plan, folder)
     if ended.code:
         raise failure(plan, plan.images, folder, ended.code, ended.lines)
     if not made:
@@ -212,24 +97,13 @@ def _make_all(plan: Plan, folder: Path, keep: bool, progress: Progress) -> Found
     return Found(prefix, _keep(prefix, made) if keep else made)
 
 
-def _find_or_make(
-    plan: Plan, needed: Plan, folder: Path, remap: Remap, keep: bool, progress: Progress
-) -> Found:
-    """Layers that nobody named: what is there, what nona makes of the images of `needed`, or both."""
-    found, missing = planned_layers(plan, remap)
-    if found is None:
-        return _make_all(needed, folder, keep, progress)
-    missing = [image for image in missing if image in needed.images]
-    if not missing:
-        return found
-    made = _make_missing(plan, missing, folder, found.prefix, keep, progress)
-    return Found(found.prefix, found.files | made, found.pages)
-
-
-def _make_missing(
+def make_missing(
     plan: Plan, missing: Sequence[PlannedImage], folder: Path, prefix: str, keep: bool, progress: Progress
 ) -> dict[int, Path]:
-    """Have nona make the layers that are not there; images that miss the crop have none."""
+    """Have nona make the layers of some images, as `make_all` does; images that miss the crop have none.
+
+    prefix      of those that are there: the names of layers that are kept begin with it, too.
+    """
     refuse_to_make(plan, missing, prefix if keep else None, anew=False)
     project, loaded = _project_for_nona(plan, folder), list[Path]()
     with progress("remap", len(_STEPS) * len(missing)) as advance:
@@ -240,7 +114,7 @@ def _make_missing(
             if ended.code and f"image with number {image.index}" not in " ".join(ended.lines):
                 _require_photo(plan, image)
                 raise failure(plan, [image], folder, ended.code, ended.lines)
-    made = _made(plan, folder)
+    made = made_in(plan, folder)
     check_made(plan, made)
     _tell_of_none(missing, made, loaded)
     return _keep(prefix, made) if keep else made
@@ -255,11 +129,11 @@ def _tell_of_none(images: Sequence[PlannedImage], made: Collection[int], loaded:
     none = [image for image in images if image.index not in made]
     for image in none:
         if loads[image.photo] <= 0:
-            log.info("image %d (%s) misses the crop: it has no layer", image.index, image.name)
+            _log.info("image %d (%s) misses the crop: it has no layer", image.index, image.name)
     if lost := [image for image in none if loads[image.photo] > 0]:
         names = ", ".join(image.name for image in lost[:_NAMED])
         more = f" and {len(lost) - _NAMED} more" if len(lost) > _NAMED else ""
-        log.warning("nona made no layer of %s%s: left out; look at their masks in Hugin", names, more)
+        _log.warning("nona made no layer of %s%s: left out; look at their masks in Hugin", names, more)
 
 
 def _require_photo(plan: Plan, image: PlannedImage) -> None:
@@ -306,7 +180,7 @@ def _run(
             for line in process.stdout:
                 if line.strip():
                     lines.append(line.strip())
-                    log.debug("nona: %s", line.strip())
+                    _log.debug("nona: %s", line.strip())
                 if line.startswith(_STEPS):
                     advance(1)
                 elif line.startswith(_LOADING):
@@ -325,7 +199,7 @@ def _run(
     for doubt in sorted(doubts):
         # libjpeg names no file, and what it says overtakes what nona does
         cut = [str(image.photo) for image in images if doubt.startswith(_CUT) and is_cut(image.photo)]
-        log.warning(
+        _log.warning(
             "%s may be damaged (%s); look at the panorama", ", ".join(cut) or "one of the photos", doubt
         )
     return _Ended(process.returncode, list(lines), loaded)
@@ -363,7 +237,7 @@ def _prefix(plan: Plan, folder: Path) -> str:
     return str(folder / plan.layer_prefix(name))
 
 
-def _made(plan: Plan, folder: Path) -> dict[int, Path]:
+def made_in(plan: Plan, folder: Path) -> dict[int, Path]:
     """The layers that nona left in the folder."""
     prefix = _prefix(plan, folder)
     paths = {image.index: layer_path(prefix, image.index, plan.layer_ending) for image in plan.images}

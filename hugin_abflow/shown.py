@@ -14,12 +14,13 @@ from hugin_abflow.brackets import to_be_made
 from hugin_abflow.encoding import DEFAULTS, ENDINGS, JPEG_QUALITY
 from hugin_abflow.found import Remap, layer_name, layers_there
 from hugin_abflow.merge import check_early, default_target, storable, target_of
-from hugin_abflow.nona import open_layers, planned_layers, refuse_to_make, remapping
+from hugin_abflow.nona import refuse_to_make, remapping
 from hugin_abflow.oneline import commented
 from hugin_abflow.outputs import BLEND, WORDS, Kind, no_option, refuse_result
 from hugin_abflow.project import Output, Plan, read_plan, warn_of_doubts
 from hugin_abflow.scratch import is_file
 from hugin_abflow.settings import Settings
+from hugin_abflow.supply import open_layers, planned_layers
 
 # In commands of a script: what stands before files in its temporary folder. No argument can hold it.
 _TEMPORARY = "\0"

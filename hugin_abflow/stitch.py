@@ -17,7 +17,6 @@ from hugin_abflow.images import read_layer
 from hugin_abflow.layer import Layer, check_layers
 from hugin_abflow.merge import OpenDevice, guides_of, merge_project, write_panorama
 from hugin_abflow.metadata import describe
-from hugin_abflow.nona import open_layers
 from hugin_abflow.outputs import BLEND, Branch, Kind, Step, refuse_result
 from hugin_abflow.pano_trafo import images_of
 from hugin_abflow.programs import move_whole, run
@@ -25,6 +24,7 @@ from hugin_abflow.progress import Progress, silent
 from hugin_abflow.project import Plan, read_plan, warn_of_doubts
 from hugin_abflow.scratch import work_folder
 from hugin_abflow.settings import Settings
+from hugin_abflow.supply import open_layers
 
 
 def stitch_project(

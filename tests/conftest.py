@@ -17,9 +17,9 @@ from hypothesis import settings
 
 from hugin_abflow.batch import pool, run, task
 from hugin_abflow.layer import Layer, full_scale
-from hugin_abflow.nona import planned_layers
 from hugin_abflow.opencl import Device
 from hugin_abflow.project import Plan
+from hugin_abflow.supply import planned_layers
 
 DTYPES = [np.uint8, np.uint16, np.float16, np.float32]
 ICC = bytes(range(256)) * 3  # carried, never interpreted

@@ -17,8 +17,8 @@ from layer_files import write_layer
 from hugin_abflow import brackets
 from hugin_abflow.layer import Layer
 from hugin_abflow.merge import merge_project
-from hugin_abflow.nona import open_layers
 from hugin_abflow.project import read_plan
+from hugin_abflow.supply import open_layers
 
 VIEWS = (0, 0, 0, 60, 60, 60, 170)  # the last one was not taken in several exposures
 CANVAS = 'f2 w802 h401 v360 E{} n"TIFF_m c:LZW r:CROP"'

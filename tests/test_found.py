@@ -15,9 +15,9 @@ from hugin_abflow import nona as program
 from hugin_abflow.errors import ImageReadError, LayersMissingError, OutputError, SettingsError
 from hugin_abflow.images import write_image
 from hugin_abflow.merge import merge_project
-from hugin_abflow.nona import open_layers
 from hugin_abflow.project import read_plan
 from hugin_abflow.settings import Settings
+from hugin_abflow.supply import open_layers
 
 pytestmark = pytest.mark.usefixtures("temporary")
 

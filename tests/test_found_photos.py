@@ -17,8 +17,8 @@ from hugin_abflow.errors import LayersMismatchError, LayersMissingError, OutputE
 from hugin_abflow.found import candidates, layers_by_prefix
 from hugin_abflow.images import write_image
 from hugin_abflow.merge import default_target
-from hugin_abflow.nona import open_layers
 from hugin_abflow.project import Plan, read_plan
+from hugin_abflow.supply import open_layers
 from hugin_abflow.tifftags import ASCII, EXIF, MAIN, RATIONAL, UNDEFINED, Value, add_directories, is_edited
 
 pytestmark = pytest.mark.usefixtures("temporary")
@@ -177,7 +177,7 @@ def test_a_pipe_is_not_replaced_by_a_layer_that_is_kept(make_project, nona, monk
     """Nor is it opened, which waits for ever."""
     plan = read_plan(make_project())
     os.mkfifo(plan.folder / "pano0001.tif")
-    monkeypatch.setattr("hugin_abflow.nona.is_edited", lambda file: file.name == "pano0001.tif")
+    monkeypatch.setattr("hugin_abflow.supply.is_edited", lambda file: file.name == "pano0001.tif")
     with (
         pytest.raises(OutputError, match=r"pano0001\.tif is a pipe or a device"),
         open_layers(plan, keep_layers=True),

@@ -26,8 +26,8 @@ from hugin_abflow.errors import (
 )
 from hugin_abflow.images import read_layers, write_image
 from hugin_abflow.layer import Box, Canvas, Layer, check_layers
-from hugin_abflow.nona import open_layers
 from hugin_abflow.project import read_plan
+from hugin_abflow.supply import open_layers
 
 pytestmark = pytest.mark.usefixtures("temporary")
 
@@ -302,7 +302,7 @@ def test_interruption_ends_nona_and_leaves_nothing(make_project, tmp_path):
     project = make_project()
     code = (
         "import sys\n"
-        "from hugin_abflow.nona import open_layers\n"
+        "from hugin_abflow.supply import open_layers\n"
         "from hugin_abflow.project import read_plan\n"
         "from hugin_abflow.signals import interruptible\n"
         "with interruptible(), open_layers(read_plan(sys.argv[1])):\n"

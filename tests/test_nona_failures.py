@@ -18,8 +18,8 @@ from hugin_abflow.errors import (
     OutputError,
     ProjectError,
 )
-from hugin_abflow.nona import open_layers
 from hugin_abflow.project import read_plan
+from hugin_abflow.supply import open_layers
 
 
 @pytest.fixture

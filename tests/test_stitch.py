@@ -20,7 +20,7 @@ from test_exif import shown
 from test_hugin import CANVAS, NAME, stacked
 from test_metadata import shot
 
-from hugin_abflow import cli, nona
+from hugin_abflow import cli, supply
 from hugin_abflow.errors import (
     ExitCode,
     LayersMismatchError,
@@ -441,5 +441,5 @@ def test_never_leaves_layers_as_they_are_for_the_panorama_as_well(
     merge_project(project, keep_layers=True)
     for file in project.parent.glob("pano000?.tif"):
         os.utime(file, (1e9, 1e9))
-    monkeypatch.setattr(nona, "_make_all", lambda *_: pytest.fail("layers are made"))
+    monkeypatch.setattr(supply, "make_all", lambda *_: pytest.fail("layers are made"))
     assert [file.name for file in stitch_project(project, remap="never")][-1] == "pano.tif"
