@@ -32,12 +32,13 @@ from hugin_abflow.colour import Correction
 from hugin_abflow.content import Unlike
 from hugin_abflow.gains import Measured
 from hugin_abflow.geometry import Pair, PairFlow
+from hugin_abflow.grid import Grid
 from hugin_abflow.highlights import Clipped, PerLayer
 from hugin_abflow.opencl import Buffer, Device
 from hugin_abflow.regions import Cells, Residuals
 from hugin_abflow.scene import Scene
 from hugin_abflow.settings import Settings
-from hugin_abflow.working import Grid, WorkingLayer
+from hugin_abflow.working import WorkingLayer
 
 # What only one layer shows first passes for exposure in part: its region grows to its size in a few rounds.
 _SEAM_ROUNDS = 2

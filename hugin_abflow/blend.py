@@ -18,12 +18,13 @@ import numpy.typing as npt
 
 from hugin_abflow import hidden, memory
 from hugin_abflow.content import Unlike
+from hugin_abflow.grid import Grid, Place
 from hugin_abflow.layer import Box, Layer
 from hugin_abflow.opencl import Buffer, Device, DeviceMemoryError
 from hugin_abflow.progress import Advance
 from hugin_abflow.settings import Settings
 from hugin_abflow.slices import Band, Coarse, Slices, Span, coarse_rows
-from hugin_abflow.working import Grid, Place, device_dtype, device_rows, pixel_options
+from hugin_abflow.working import device_dtype, device_rows, pixel_options
 
 _log = logging.getLogger(__name__)
 

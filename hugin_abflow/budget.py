@@ -9,13 +9,14 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 
-from hugin_abflow import memory, pairflow, seam, working
+from hugin_abflow import memory, pairflow, seam
 from hugin_abflow.chart import Chart
 from hugin_abflow.coefficient import Masks
 from hugin_abflow.errors import SettingsError
+from hugin_abflow.grid import Grid, working_grid
 from hugin_abflow.opencl import Device
 from hugin_abflow.settings import FlowQuality, Settings
-from hugin_abflow.working import Grid, WorkingLayer
+from hugin_abflow.working import WorkingLayer
 
 _log = logging.getLogger(__name__)
 
@@ -62,7 +63,7 @@ class Work:
         overlaps    of pairs whose flow is found, (height, width) on the grid of the layers' `masks`.
         """
         settings = replace(settings, flow_quality=quality)
-        grid = working.working_grid(full, settings)
+        grid = working_grid(full, settings)
         charts = pairflow.charts(overlaps, masks.grid, grid, settings)
         return cls(charts, grid, settings, len(masks.host), masks.shared)
 

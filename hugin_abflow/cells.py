@@ -13,8 +13,8 @@ import numpy.typing as npt
 import scipy
 
 from hugin_abflow.chart import Chart
+from hugin_abflow.grid import Border, Grid
 from hugin_abflow.pyramid import Level
-from hugin_abflow.working import Border, Grid
 
 Mask = npt.NDArray[np.bool_]
 Flows = tuple[npt.NDArray[np.float32], npt.NDArray[np.float32]]

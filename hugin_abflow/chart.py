@@ -13,10 +13,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 
+from hugin_abflow.grid import Border, Grid, on_cells
 from hugin_abflow.opencl import Device
 from hugin_abflow.projection import EQUIRECTANGULAR, Projection, directions
 from hugin_abflow.pyramid import Level
-from hugin_abflow.working import Border, Grid, WorkingLayer, on_cells
+from hugin_abflow.working import WorkingLayer
 
 # Chart pixels around the overlap, so that flow is smooth across its border.
 _MARGIN = 16

@@ -37,10 +37,10 @@ from hugin_abflow.cells import grown
 from hugin_abflow.chart import widest_gap
 from hugin_abflow.colour import Correction
 from hugin_abflow.geometry import Pair
+from hugin_abflow.grid import Grid, cells_under, connected
 from hugin_abflow.layer import Box
 from hugin_abflow.regions import Cells, Choice, Gone, Prices, parts
 from hugin_abflow.scene import Scene
-from hugin_abflow.working import Grid, cells_under, connected
 
 # l: how unlike his two images may be, against how unlike he is to what is behind him.
 _CONTRAST = 3.0

@@ -15,8 +15,9 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from hugin_abflow.grid import Grid, Place
 from hugin_abflow.opencl import Buffer, Device
-from hugin_abflow.working import Grid, Place, WorkingLayer
+from hugin_abflow.working import WorkingLayer
 
 # Distances are smooth: a mask grid of this many pixels is fine enough, and four times faster.
 _FINE_PIXELS = 600_000

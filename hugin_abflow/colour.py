@@ -25,10 +25,11 @@ import scipy
 from hugin_abflow.cells import grown
 from hugin_abflow.gains import Difference, Measured, solve
 from hugin_abflow.geometry import Pair
+from hugin_abflow.grid import Grid, on_cells
 from hugin_abflow.layer import Box
 from hugin_abflow.opencl import Buffer, Device
 from hugin_abflow.settings import Settings
-from hugin_abflow.working import CLIPPED, Grid, WorkingLayer, on_cells, shared_cells
+from hugin_abflow.working import CLIPPED, WorkingLayer, shared_cells
 
 # Working pixels per cell of the colour grid.
 _CELL = 16

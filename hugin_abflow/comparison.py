@@ -7,7 +7,7 @@ import numpy.typing as npt
 import scipy
 
 from hugin_abflow.cells import Mask, grown
-from hugin_abflow.working import Grid, connected
+from hugin_abflow.grid import Grid, connected
 
 # Of some columns of the seam grid, (height, width, 10): MEAN to SHARE. Masks are of the same cells.
 Comparison = npt.NDArray[np.float64]

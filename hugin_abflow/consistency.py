@@ -24,9 +24,9 @@ from hugin_abflow.cells import CELL, Mask, SingleSource
 from hugin_abflow.chart import Chart
 from hugin_abflow.flow import FlowParameters, adopt
 from hugin_abflow.geometry import Pair, PairFlow
+from hugin_abflow.grid import Border
 from hugin_abflow.opencl import Buffer, Device
 from hugin_abflow.pyramid import Level
-from hugin_abflow.working import Border
 
 # Brightness of pixels that do not count: EXCLUDED of kernels/common.cl.
 EXCLUDED = 1e3
@@ -152,7 +152,7 @@ def trust(
     excluded    cells that have no trust, and whose brightness does not count.
     """
     trusted = device.empty((*flow.shape[:2], 4))
-    grid = Border.of(flow, wraps)
+    grid = Border.of(flow.shape, wraps)
     mask = device.upload(np.zeros((1, 1), np.uint8) if excluded is None else excluded.astype(np.uint8))
     cells = (*mask.shape[::-1], CELL, 0)
     device.run(
@@ -164,18 +164,18 @@ def trust(
 
 def _supported(device: Device, trusted: Buffer, wraps: bool) -> Buffer:
     """Lower trust, in place, where there is little around."""
-    around, grid = trusted, Border.of(trusted, wraps)
+    around, grid = trusted, Border.of(trusted.shape, wraps)
     for _ in range(_AROUND):
         around = _coarser(device, around, wraps)
     device.run(
         "consistency", "consistency_support", grid.size,
-        around, Border.of(around, wraps), 2.0**_AROUND, _ENOUGH, trusted, grid,
+        around, Border.of(around.shape, wraps), 2.0**_AROUND, _ENOUGH, trusted, grid,
     )  # fmt: skip
     return trusted
 
 
 def _filled(device: Device, trusted: Buffer, wraps: bool, single: bool) -> Buffer:
-    grid, levels = Border.of(trusted, wraps), [trusted]
+    grid, levels = Border.of(trusted.shape, wraps), [trusted]
     while max(levels[-1].shape[:2]) > 1:
         levels.append(_coarser(device, levels[-1], wraps))
     filled = _carried(device, levels, wraps, _SWEEPS)
@@ -187,8 +187,8 @@ def _filled(device: Device, trusted: Buffer, wraps: bool, single: bool) -> Buffe
 def _coarser(device: Device, fine: Buffer, wraps: bool) -> Buffer:
     """The next level of the pyramid."""
     small = device.empty(((fine.shape[0] + 1) // 2, (fine.shape[1] + 1) // 2, 4))
-    size = Border.of(small, wraps).size
-    device.run("consistency", "consistency_push", size, fine, Border.of(fine, wraps), small, size)
+    size = Border.of(small.shape, wraps).size
+    device.run("consistency", "consistency_push", size, fine, Border.of(fine.shape, wraps), small, size)
     return small
 
 
@@ -196,11 +196,11 @@ def _carried(device: Device, levels: Sequence[Buffer], wraps: bool, sweeps: int)
     """The finest level's flow, filled coarse to fine; without sweeps by wide means of what is around."""
     filled = _flow(device, levels[-1], wraps=False)
     for level in levels[-2::-1]:
-        grid, coarse = Border.of(level, wraps), filled
+        grid, coarse = Border.of(level.shape, wraps), filled
         filled = device.empty((*level.shape[:2], 2))
         device.run(
             "consistency", "consistency_pull", grid.size,
-            level, grid, coarse, Border.of(coarse, wraps), filled,
+            level, grid, coarse, Border.of(coarse.shape, wraps), filled,
         )  # fmt: skip
         if sweeps and grid.width * grid.height >= _LEAST_PIXELS:
             calls = [(level, grid, _OWN, _EDGE, colour, _RELAXATION, filled) for colour in (0, 1)]
@@ -211,6 +211,6 @@ def _carried(device: Device, levels: Sequence[Buffer], wraps: bool, sweeps: int)
 
 def _flow(device: Device, trusted: Buffer, wraps: bool) -> Buffer:
     """The flow alone, float32 (height, width, 2), px."""
-    alone, grid = device.empty((*trusted.shape[:2], 2)), Border.of(trusted, wraps)
+    alone, grid = device.empty((*trusted.shape[:2], 2)), Border.of(trusted.shape, wraps)
     device.run("consistency", "consistency_flow", grid.size, trusted, grid, alone)
     return alone

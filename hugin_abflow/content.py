@@ -20,8 +20,8 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
+from hugin_abflow.grid import Grid, Place, any_around
 from hugin_abflow.opencl import Buffer, Device
-from hugin_abflow.working import Grid, Place, any_around
 
 # Residual, of full scale, up to which layers surely show the same.
 ALIKE = 0.06

@@ -20,8 +20,8 @@ import numpy as np
 import numpy.typing as npt
 
 from hugin_abflow import epipolar
+from hugin_abflow.grid import connected
 from hugin_abflow.search import SearchParameters
-from hugin_abflow.working import connected
 
 Mask = npt.NDArray[np.bool_]
 # Unit vectors (n, 3) in which places (n, 2) are seen: px of the finest grid, pixels' centres at .5.

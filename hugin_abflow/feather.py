@@ -7,8 +7,8 @@ from collections.abc import Sequence
 import numpy as np
 
 from hugin_abflow.coefficient import divide
+from hugin_abflow.grid import Grid, Place
 from hugin_abflow.opencl import MUCH, Buffer, Device
-from hugin_abflow.working import Grid, Place
 
 # Columns and rows to a work-group: few, that all cores have some.
 _GROUP = 16

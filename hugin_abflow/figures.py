@@ -11,7 +11,8 @@ import numpy.typing as npt
 
 from hugin_abflow.consistency import EXCLUDED, WeightedFlow
 from hugin_abflow.geometry import Pair
-from hugin_abflow.working import Grid, WorkingLayer, on_cells
+from hugin_abflow.grid import Grid, on_cells
+from hugin_abflow.working import WorkingLayer
 
 _log = logging.getLogger(__name__)
 

@@ -17,10 +17,10 @@ import numpy.typing as npt
 
 from hugin_abflow import decision, pyramid, search
 from hugin_abflow.decision import Bearings, Candidate, Refused
+from hugin_abflow.grid import Border
 from hugin_abflow.opencl import Buffer, Device
 from hugin_abflow.pyramid import Level
 from hugin_abflow.search import SearchParameters
-from hugin_abflow.working import Border
 
 
 @dataclass(frozen=True)

@@ -37,7 +37,7 @@ from hugin_abflow.cells import (
     grown,
 )
 from hugin_abflow.chart import Chart
-from hugin_abflow.working import connected
+from hugin_abflow.grid import connected
 
 # Chart pixels by which flow may differ from cell to cell within a surface.
 _ALIKE = 0.75

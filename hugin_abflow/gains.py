@@ -25,7 +25,7 @@ import numpy as np
 import numpy.typing as npt
 import scipy
 
-from hugin_abflow.working import Grid
+from hugin_abflow.grid import Grid
 
 # Rounds of (weight of the measured differences against smoothness, distance from the solution at which a cell
 # counts no longer): what is smooth is followed bit by bit.

@@ -14,9 +14,10 @@ import numpy as np
 import numpy.typing as npt
 
 from hugin_abflow.chart import Chart
+from hugin_abflow.grid import Grid
 from hugin_abflow.opencl import MUCH, Buffer, Device
 from hugin_abflow.settings import Settings
-from hugin_abflow.working import Grid, WorkingLayer
+from hugin_abflow.working import WorkingLayer
 
 # Flow longer than this share of the canvas's width is implausible; it does not sharpen the softmax further.
 _PLAUSIBLE = 0.1

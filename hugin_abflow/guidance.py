@@ -20,10 +20,10 @@ from hugin_abflow import flow
 from hugin_abflow.cells import Flows, pixels_at
 from hugin_abflow.chart import Chart
 from hugin_abflow.flow import Board, FlowParameters, Start
+from hugin_abflow.grid import Border, Grid
 from hugin_abflow.guides import Guide, Points, distances, doubts
 from hugin_abflow.opencl import Buffer, Device
 from hugin_abflow.pyramid import Level
-from hugin_abflow.working import Border, Grid
 
 _log = logging.getLogger(__name__)
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
+from hugin_abflow.grid import Place
 from hugin_abflow.opencl import Buffer, Device
-from hugin_abflow.working import Place
 
 # Pixels of a row that a work item takes: HIDDEN_CHUNK of kernels/hidden.cl.
 _CHUNK = 8

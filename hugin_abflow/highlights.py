@@ -25,9 +25,10 @@ import numpy.typing as npt
 
 from hugin_abflow.cells import Mask
 from hugin_abflow.coefficient import Masks, distance
+from hugin_abflow.grid import Grid, any_around, on_cells
 from hugin_abflow.opencl import Buffer, Device
 from hugin_abflow.settings import Settings
-from hugin_abflow.working import CLIPPED, Grid, WorkingLayer, any_around, on_cells
+from hugin_abflow.working import CLIPPED, WorkingLayer
 
 # Working pixels per cell.
 _CELL = 16

@@ -97,7 +97,7 @@ def holes(covered: npt.NDArray[np.bool_], wraps: bool) -> list[Hole]:
     if covered.all():
         return []
     # columns that wrap twice, so that what lies across the border is whole in the middle, and so is its box,
-    # which working.connected does not tell
+    # which grid.connected does not tell
     gaps = ~np.tile(covered, 2 if wraps else 1)
     gaps = scipy.ndimage.binary_erosion(gaps, np.ones((3, 3)), border_value=1)
     labels, _ = scipy.ndimage.label(gaps, np.ones((3, 3)))

@@ -17,9 +17,10 @@ from collections.abc import Sequence
 import numpy as np
 
 from hugin_abflow.geometry import PairFlow
+from hugin_abflow.grid import Grid
 from hugin_abflow.opencl import MUCH, Buffer, Device
 from hugin_abflow.settings import Settings
-from hugin_abflow.working import Grid, WorkingLayer
+from hugin_abflow.working import WorkingLayer
 
 # Rounds in which each place takes over what passes there.
 _ROUNDS = 2

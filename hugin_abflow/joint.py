@@ -36,12 +36,13 @@ from hugin_abflow import (
 from hugin_abflow.blend import NEVER, BlendLayer, Prepared
 from hugin_abflow.coefficient import Masks
 from hugin_abflow.geometry import Pair
+from hugin_abflow.grid import Grid, full_grid, working_grid
 from hugin_abflow.guides import Guide, by_pair
 from hugin_abflow.layer import Canvas, Layer
 from hugin_abflow.opencl import Device, DeviceMemoryError
 from hugin_abflow.progress import Progress
 from hugin_abflow.settings import Settings
-from hugin_abflow.working import Grid, WorkingLayer
+from hugin_abflow.working import WorkingLayer
 
 _log = logging.getLogger(__name__)
 # Of layers that take no part; abflow-enblend shows this, and of the rest warnings alone.
@@ -90,7 +91,7 @@ def prepare_in_memory(
     """`prepare`, one pair of layers at a time where the device's memory does not hold more, and on a smaller
     working canvas where it does not hold that.
     """
-    region = working.full_grid(canvas, layers).region
+    region = full_grid(canvas, layers).region
     abreast = min(pairflow.ABREAST, settings.cores) if settings.flow else 1
     with _loading_ahead(device, layers[0], settings):
         while True:
@@ -120,8 +121,8 @@ def prepare(
 
     abreast: pairs of layers whose flow is found at a time, at most; nothing else depends on it.
     """
-    full = working.full_grid(canvas, layers)
-    grid = working.working_grid(full, settings)
+    full = full_grid(canvas, layers)
+    grid = working_grid(full, settings)
     reduced = reading.read(device, layers, grid, progress, settings)
     light_unit = unit.code_floats(device, reduced)
     used, unused = _parted(device, reduced, layers, grid)

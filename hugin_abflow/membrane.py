@@ -17,8 +17,9 @@ import scipy
 
 from hugin_abflow.cells import averaged, grown, neighbours
 from hugin_abflow.coefficient import Masks
+from hugin_abflow.grid import Grid, on_cells
 from hugin_abflow.opencl import Buffer, Device
-from hugin_abflow.working import Grid, WorkingLayer, on_cells
+from hugin_abflow.working import WorkingLayer
 
 # Cells along a cut in which layers stay as flow has brought them together.
 _HELD = 2

@@ -39,7 +39,7 @@ from hugin_abflow.cells import (
 )
 from hugin_abflow.chart import Chart
 from hugin_abflow.decision import Refused
-from hugin_abflow.working import connected
+from hugin_abflow.grid import connected
 
 # By how much flow has to miss parallax, in chart pixels at the canvas's centre.
 _APART = 3.0

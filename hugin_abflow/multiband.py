@@ -29,8 +29,9 @@ from hugin_abflow import content
 from hugin_abflow.colour import NEGLIGIBLE, Correction
 from hugin_abflow.content import Unlike
 from hugin_abflow.feather import feathers
+from hugin_abflow.grid import Grid, Place
 from hugin_abflow.opencl import MUCH, Buffer, Device
-from hugin_abflow.working import Grid, Place, WorkingLayer
+from hugin_abflow.working import WorkingLayer
 
 # The shorter side is halved down to this many pixels: the lowest frequencies change over along all of it.
 _LEAST_SIDE = 4

@@ -25,12 +25,13 @@ from hugin_abflow.chart import Chart
 from hugin_abflow.consistency import WeightedFlow
 from hugin_abflow.decision import Refused
 from hugin_abflow.geometry import Pair, PairFlow
+from hugin_abflow.grid import Grid
 from hugin_abflow.guides import Guide
 from hugin_abflow.opencl import Buffer, Device
 from hugin_abflow.progress import Advance, Progress
 from hugin_abflow.pyramid import Level
 from hugin_abflow.settings import Settings
-from hugin_abflow.working import Grid, WorkingLayer
+from hugin_abflow.working import WorkingLayer
 
 _log = logging.getLogger(__name__)
 

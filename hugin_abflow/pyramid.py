@@ -12,8 +12,8 @@ from typing import TypeVar
 
 import numpy as np
 
+from hugin_abflow.grid import Border
 from hugin_abflow.opencl import Buffer, Device
-from hugin_abflow.working import Border
 
 _Value = TypeVar("_Value")
 
@@ -29,7 +29,7 @@ class Level:
     @property
     def grid(self) -> Border:
         """The grid as the kernels take it."""
-        return Border.of(self.image, self.wraps)
+        return Border.of(self.image.shape, self.wraps)
 
 
 def reduce(device: Device, level: Level) -> Level:

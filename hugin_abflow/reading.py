@@ -8,11 +8,12 @@ from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 
 from hugin_abflow import memory, working
+from hugin_abflow.grid import Grid
 from hugin_abflow.layer import Layer
 from hugin_abflow.opencl import Device
 from hugin_abflow.progress import Progress
 from hugin_abflow.settings import Settings
-from hugin_abflow.working import Grid, Reduction, WorkingLayer
+from hugin_abflow.working import Reduction, WorkingLayer
 
 # Parts, for each core, where cores are more than layers: so that all are done at a time.
 _PARTS = 4

@@ -27,8 +27,8 @@ import numpy.typing as npt
 import scipy
 
 from hugin_abflow.cells import grown, neighbours
+from hugin_abflow.grid import Grid, connected
 from hugin_abflow.labelling import Graph, Labels, energy, least
-from hugin_abflow.working import Grid, connected
 
 # Residual of low frequencies, of full scale, by which a cell is strong: enough of these make a region, which
 # is taken from one layer. Cells in which that of all frequencies is as much are outskirts.

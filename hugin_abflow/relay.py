@@ -40,8 +40,8 @@ import numpy.typing as npt
 from hugin_abflow.chart import Chart
 from hugin_abflow.consistency import WeightedFlow
 from hugin_abflow.geometry import Pair
+from hugin_abflow.grid import Grid
 from hugin_abflow.opencl import Buffer, Device
-from hugin_abflow.working import Grid
 
 # Chart pixels in the side of a cell, in the middle of which flows are compared.
 _CELL = 8

@@ -20,8 +20,9 @@ import numpy.typing as npt
 
 from hugin_abflow.cells import Mask
 from hugin_abflow.coefficient import Masks
+from hugin_abflow.grid import Grid, any_around
 from hugin_abflow.opencl import Buffer, Device
-from hugin_abflow.working import Grid, WorkingLayer, any_around
+from hugin_abflow.working import WorkingLayer
 
 # How thick a strip is at most, of the panorama's smaller side. Where it is thicker, borders that cross have
 # left room for a transition.

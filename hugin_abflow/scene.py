@@ -7,8 +7,9 @@ from dataclasses import dataclass
 
 from hugin_abflow.coefficient import Masks
 from hugin_abflow.geometry import Pair
+from hugin_abflow.grid import Grid
 from hugin_abflow.opencl import Buffer, Device
-from hugin_abflow.working import Grid, WorkingLayer
+from hugin_abflow.working import WorkingLayer
 
 
 @dataclass(frozen=True)

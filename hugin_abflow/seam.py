@@ -31,11 +31,12 @@ from hugin_abflow.colour import Correction, clipping
 from hugin_abflow.comparison import MEAN, SHARE, SQUARE, Comparison
 from hugin_abflow.content import ALIKE, Unlike
 from hugin_abflow.geometry import Pair
+from hugin_abflow.grid import Grid, any_around, on_cells
 from hugin_abflow.layer import Box
 from hugin_abflow.opencl import Buffer
 from hugin_abflow.regions import Cells, Choice, Gone, Prices, Residuals, completed, find, seen
 from hugin_abflow.scene import Scene
-from hugin_abflow.working import Grid, any_around, on_cells, shared_cells
+from hugin_abflow.working import shared_cells
 
 # Working pixels per cell of the seam grid.
 _CELL = 8

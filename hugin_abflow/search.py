@@ -14,9 +14,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from hugin_abflow.grid import Border
 from hugin_abflow.opencl import Buffer, Device
 from hugin_abflow.pyramid import on_level
-from hugin_abflow.working import Border
 
 # SEARCH_MARGIN of kernels/search.cl.
 _MARGIN = 16

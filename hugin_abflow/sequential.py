@@ -15,6 +15,7 @@ import numpy.typing as npt
 
 from hugin_abflow import coefficient, geometry, joint, working
 from hugin_abflow.blend import Prepared
+from hugin_abflow.grid import full_grid, working_grid
 from hugin_abflow.guides import Guide
 from hugin_abflow.layer import Canvas, Layer
 from hugin_abflow.opencl import Device
@@ -51,7 +52,7 @@ def merge(
 
 def _order(device: Device, layers: Sequence[Layer], canvas: Canvas, settings: Settings) -> list[int]:
     """Indices of the layers by overlap."""
-    grid = working.working_grid(working.full_grid(canvas, layers), settings)
+    grid = working_grid(full_grid(canvas, layers), settings)
     reduced = [working.reduce_layer(device, layer, grid, lambda rows: None) for layer in layers]
     masks = coefficient.masks(device, reduced, grid).host.reshape(len(layers), -1).astype(np.float32)
     shared = masks @ masks.T
@@ -87,7 +88,7 @@ def _merge_two(
 
     inside, index   numbers of the layers in the mosaic, and of the other, as guides have them.
     """
-    region = working.full_grid(canvas, [mosaic, layer]).region
+    region = full_grid(canvas, [mosaic, layer]).region
     whole = replace(canvas, crop=region)
     between = _between(guides, inside, index)
     prepared = joint.prepare_in_memory(device, [mosaic, layer], whole, settings, silent, between)

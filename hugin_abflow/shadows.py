@@ -16,7 +16,7 @@ import scipy
 
 from hugin_abflow.cells import Mask, across_border, centres, grown
 from hugin_abflow.gains import Difference, Measured
-from hugin_abflow.working import Grid
+from hugin_abflow.grid import Grid
 
 # Weight of a cell, 0..1, from which on it counts. (One that an outline cuts may weigh more, but is not even.)
 _TRUSTED = 0.3

@@ -14,8 +14,8 @@ from hugin_abflow import foreground, movers
 from hugin_abflow.cells import Flows, Mask, Places, SingleSource, View
 from hugin_abflow.chart import Chart
 from hugin_abflow.decision import Refused
+from hugin_abflow.grid import Grid
 from hugin_abflow.settings import Settings
-from hugin_abflow.working import Grid
 
 
 def find(

@@ -10,9 +10,9 @@ from functools import cached_property
 import numpy as np
 import numpy.typing as npt
 
+from hugin_abflow.grid import Grid, Place
 from hugin_abflow.layer import Box
 from hugin_abflow.opencl import Buffer, Device
-from hugin_abflow.working import Grid, Place
 
 Span = tuple[int, int]
 Coarse = tuple[Place, Buffer]  # place on a coarse grid; float32 (height, width, 4)

@@ -14,8 +14,9 @@ import numpy as np
 import numpy.typing as npt
 
 from hugin_abflow import membrane
+from hugin_abflow.grid import Grid, any_around
 from hugin_abflow.opencl import Buffer, Device
-from hugin_abflow.working import Grid, WorkingLayer, any_around
+from hugin_abflow.working import WorkingLayer
 
 # By how much displacements differ from a cell to the next, beside their distance, from which on a layer is
 # torn between them: surfaces seen from aside are compressed, or stretched, by up to a third or so.

@@ -44,11 +44,12 @@ import scipy
 from hugin_abflow.cells import Mask
 from hugin_abflow.coefficient import Masks, divide
 from hugin_abflow.geometry import PairFlow
+from hugin_abflow.grid import Grid, Place, cells_under, on_cells
 from hugin_abflow.layer import Box
 from hugin_abflow.opencl import Buffer, Device
 from hugin_abflow.rim import Rim
 from hugin_abflow.settings import Settings
-from hugin_abflow.working import Grid, Place, WorkingLayer, cells_under, on_cells
+from hugin_abflow.working import WorkingLayer
 
 # Working pixels per cell of the grids on which transitions are found, from the coarsest to the finest.
 _CELLS = (32, 16, 8, 4)

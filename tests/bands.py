@@ -10,10 +10,10 @@ from scipy import ndimage
 
 from hugin_abflow import blend, geometry, working
 from hugin_abflow.blend import BlendLayer, Prepared
+from hugin_abflow.grid import Grid
 from hugin_abflow.layer import Box, Layer, full_scale
 from hugin_abflow.opencl import Device
 from hugin_abflow.settings import Settings
-from hugin_abflow.working import Grid
 
 
 def stored_pixels(seed: int, width: int, height: int, dtype: type, channels: int, share: float) -> np.ndarray:

@@ -7,9 +7,10 @@ import math
 import numpy as np
 
 from hugin_abflow.chart import Chart, pair_chart
+from hugin_abflow.grid import Grid
 from hugin_abflow.layer import Box, Layer
 from hugin_abflow.opencl import Buffer, Device
-from hugin_abflow.working import Grid, WorkingLayer
+from hugin_abflow.working import WorkingLayer
 
 WIDTH, HEIGHT = 77, 53
 

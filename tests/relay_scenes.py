@@ -12,8 +12,8 @@ from reference import common
 from hugin_abflow import relay
 from hugin_abflow.chart import Chart, pair_chart
 from hugin_abflow.consistency import WeightedFlow
+from hugin_abflow.grid import Grid
 from hugin_abflow.opencl import Device
-from hugin_abflow.working import Grid
 
 
 class Scene:

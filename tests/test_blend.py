@@ -15,9 +15,9 @@ from scipy import ndimage
 from tolerances import DECISIONS, POSITION, assert_close
 
 from hugin_abflow import blend, working
+from hugin_abflow.grid import Grid
 from hugin_abflow.layer import Box, Layer, full_scale
 from hugin_abflow.opencl import Device
-from hugin_abflow.working import Grid
 
 STORED = [(dtype, channels) for dtype in (np.uint8, np.uint16, np.float32) for channels in (1, 3)]
 GRIDS = {"plane": plane(), "cylinder": plane(wraps=True), "sphere": sphere(), "odd sphere": sphere(77, 39)}

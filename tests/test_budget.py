@@ -13,9 +13,9 @@ from pictures import merged, noise, one_device
 from hugin_abflow import budget, quality, seam
 from hugin_abflow.budget import Work
 from hugin_abflow.errors import SettingsError
+from hugin_abflow.grid import Border
 from hugin_abflow.layer import Canvas, Layer
 from hugin_abflow.settings import Settings
-from hugin_abflow.working import Border
 
 CANVAS = Canvas.plane(301, 151)
 CELLS = SimpleNamespace(width=100, height=80)

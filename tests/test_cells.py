@@ -13,8 +13,8 @@ from scipy import ndimage
 
 from hugin_abflow.cells import CELL, CellFlow, SingleSource, View, ends_within
 from hugin_abflow.chart import pair_chart
+from hugin_abflow.grid import Grid
 from hugin_abflow.layer import Box
-from hugin_abflow.working import Grid
 
 
 def check_on_canvas(grid: Grid, at: int) -> None:

@@ -16,8 +16,8 @@ from tolerances import DECISIONS, POSITION, TRIGONOMETRY, assert_close
 
 from hugin_abflow import chart
 from hugin_abflow.chart import Chart, pair_chart
+from hugin_abflow.grid import Grid
 from hugin_abflow.opencl import Device
-from hugin_abflow.working import Grid
 
 FLOOR = 0.05
 

@@ -16,11 +16,11 @@ from tolerances import POSITION, assert_close
 from hugin_abflow import clones
 from hugin_abflow.clones import Clone
 from hugin_abflow.geometry import Pair
+from hugin_abflow.grid import Grid
 from hugin_abflow.layer import Canvas
 from hugin_abflow.opencl import Device
 from hugin_abflow.regions import Choice, Residuals
 from hugin_abflow.scene import Scene
-from hugin_abflow.working import Grid
 
 HEIGHT, WIDTH = 24, 60
 GRID = {"plane": plane(480, 192), "cylinder": plane(480, 192, wraps=True), "sphere": sphere(480, 240)}

@@ -14,8 +14,8 @@ from tolerances import POSITION, SUM, TRIGONOMETRY, assert_close
 
 from hugin_abflow import coefficient
 from hugin_abflow.coefficient import Masks
+from hugin_abflow.grid import Grid
 from hugin_abflow.opencl import Buffer, Device
-from hugin_abflow.working import Grid
 
 NAMES = list(GRIDS)
 

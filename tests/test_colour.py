@@ -14,9 +14,10 @@ from hugin_abflow import colour
 from hugin_abflow.chart import pair_chart
 from hugin_abflow.gains import Difference, Measured
 from hugin_abflow.geometry import PairFlow
+from hugin_abflow.grid import Grid, on_cells
 from hugin_abflow.opencl import Device
 from hugin_abflow.settings import Settings
-from hugin_abflow.working import Grid, WorkingLayer, on_cells
+from hugin_abflow.working import WorkingLayer
 
 PART, OF_PART = (1, 1, 5, 2), np.s_[1:3, 1:6]
 CLIPPED, NEVER, SPREAD = ((0.93, 0.9, 0.95, 1.0), (0.9, 0.95, 0.92, 1.0)), ((1e30,) * 4,) * 2, 0.15

@@ -17,9 +17,9 @@ from hugin_abflow.cells import CELL, SingleSource
 from hugin_abflow.chart import Chart
 from hugin_abflow.flow import FlowParameters
 from hugin_abflow.geometry import PairFlow
+from hugin_abflow.grid import Grid
 from hugin_abflow.opencl import Device
 from hugin_abflow.pyramid import Level
-from hugin_abflow.working import Grid
 
 SIZES = [(77, 53), (64, 31), (5, 3), (1, 7), (1, 1)]
 WRAPS = [False, True]

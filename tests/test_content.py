@@ -15,9 +15,9 @@ from tolerances import SUM, assert_close
 
 from hugin_abflow import content, seam
 from hugin_abflow.content import Unlike
+from hugin_abflow.grid import Grid
 from hugin_abflow.layer import Canvas, Layer
 from hugin_abflow.opencl import Device
-from hugin_abflow.working import Grid
 
 __all__ = ["one_device"]
 

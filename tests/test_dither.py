@@ -10,9 +10,9 @@ from reference import blend as twin
 from reference import common
 from scipy import ndimage
 
+from hugin_abflow.grid import Grid
 from hugin_abflow.layer import Box
 from hugin_abflow.opencl import Device
-from hugin_abflow.working import Grid
 
 
 def test_twin_of_threshold_rounds_without_bias() -> None:

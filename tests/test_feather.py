@@ -16,9 +16,9 @@ from reference.common import on_box
 from tolerances import SUM, assert_close
 
 from hugin_abflow.feather import feathers
+from hugin_abflow.grid import Grid, Place
 from hugin_abflow.kept import kept_device
 from hugin_abflow.opencl import Device
-from hugin_abflow.working import Grid, Place
 
 __all__ = ["one_device"]
 

@@ -14,10 +14,10 @@ from tolerances import DECISIONS, SUM, TRIGONOMETRY, assert_close
 
 from hugin_abflow import pyramid, search
 from hugin_abflow.flow import Board
+from hugin_abflow.grid import Border
 from hugin_abflow.opencl import Device
 from hugin_abflow.pyramid import Level
 from hugin_abflow.settings import MOST_WORKING_PIXELS
-from hugin_abflow.working import Border
 
 GRIDS = {"plane": Border(77, 53, 0), "cylinder": Border(78, 53, 1), "odd cylinder": Border(77, 53, 1)}
 

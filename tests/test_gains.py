@@ -11,7 +11,7 @@ from grids import plane, sphere
 
 from hugin_abflow import gains
 from hugin_abflow.gains import Difference, Measured
-from hugin_abflow.working import Grid
+from hugin_abflow.grid import Grid
 
 STRICT = pytest.mark.parametrize("strict", [False, True], ids=["normal", "strict"])
 

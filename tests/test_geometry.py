@@ -17,10 +17,10 @@ from tolerances import POSITION, SUM, TRIGONOMETRY, assert_close
 from hugin_abflow import geometry
 from hugin_abflow.chart import Chart, pair_chart
 from hugin_abflow.geometry import PairFlow
+from hugin_abflow.grid import Grid
 from hugin_abflow.layer import Box, Canvas
 from hugin_abflow.opencl import Device
 from hugin_abflow.settings import Settings
-from hugin_abflow.working import Grid
 
 NAMES = list(GRIDS)
 

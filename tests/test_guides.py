@@ -12,6 +12,7 @@ from test_flow_truth import scene
 
 from hugin_abflow import flow, geometry, guidance, joint, reading
 from hugin_abflow.chart import pair_chart
+from hugin_abflow.grid import full_grid, working_grid
 from hugin_abflow.guidance import GuidanceParameters, on_chart
 from hugin_abflow.guides import Guide, by_pair, doubts
 from hugin_abflow.layer import Canvas, Layer
@@ -19,7 +20,6 @@ from hugin_abflow.merge import merge_layers
 from hugin_abflow.opencl import Device
 from hugin_abflow.progress import silent
 from hugin_abflow.settings import Settings
-from hugin_abflow.working import full_grid, working_grid
 
 pytestmark = pytest.mark.usefixtures(one_device.__name__)
 

@@ -15,9 +15,9 @@ from tolerances import DECISIONS, POSITION, SUM, assert_close
 from hugin_abflow import geometry, intermediate
 from hugin_abflow.chart import Chart, pair_chart
 from hugin_abflow.geometry import PairFlow
+from hugin_abflow.grid import Grid
 from hugin_abflow.opencl import Device
 from hugin_abflow.settings import Settings
-from hugin_abflow.working import Grid
 
 WIDTH, HEIGHT = 61, 43
 WAY, AROUND = np.array([7.25, -3.5]), np.array([-2.5, 0.75])

@@ -14,10 +14,10 @@ from scipy import ndimage
 from tolerances import SUM, assert_close
 
 from hugin_abflow import coefficient, geometry, joint, membrane, working
+from hugin_abflow.grid import Grid
 from hugin_abflow.opencl import Device
 from hugin_abflow.progress import silent
 from hugin_abflow.settings import Settings
-from hugin_abflow.working import Grid
 
 # The kernels
 

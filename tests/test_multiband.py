@@ -13,8 +13,8 @@ from reference.common import Array
 from tolerances import DECISIONS, SUM, TRIGONOMETRY, assert_close
 
 from hugin_abflow import multiband
+from hugin_abflow.grid import Grid
 from hugin_abflow.opencl import Device
-from hugin_abflow.working import Grid
 
 PARTS = ["all", "border", "inside"]
 

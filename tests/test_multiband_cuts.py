@@ -17,9 +17,9 @@ from tolerances import SUM, assert_close
 from hugin_abflow import multiband
 from hugin_abflow.colour import Correction
 from hugin_abflow.content import Unlike
+from hugin_abflow.grid import Grid
 from hugin_abflow.layer import Canvas
 from hugin_abflow.opencl import Device
-from hugin_abflow.working import Grid
 
 shared_device = pytest.mark.usefixtures(one_device.__name__)
 

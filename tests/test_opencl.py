@@ -7,8 +7,8 @@ import pyopencl as cl
 import pytest
 
 from hugin_abflow import flow, spare
+from hugin_abflow.grid import Border
 from hugin_abflow.opencl import Device
-from hugin_abflow.working import Border
 
 
 def test_the_largest_group_of_a_kernel_can_be_started(device: Device) -> None:

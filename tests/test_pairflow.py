@@ -26,13 +26,13 @@ from hugin_abflow import (
     single,
 )
 from hugin_abflow.cells import SingleSource
+from hugin_abflow.grid import Grid, full_grid
 from hugin_abflow.guides import Guide
 from hugin_abflow.layer import Canvas, Layer
 from hugin_abflow.merge import merge_layers
 from hugin_abflow.opencl import Device, DeviceMemoryError
 from hugin_abflow.progress import silent
 from hugin_abflow.settings import FlowQuality, Settings
-from hugin_abflow.working import Grid, full_grid
 
 CANVAS = Canvas.plane(301, 151)
 

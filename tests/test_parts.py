@@ -16,11 +16,11 @@ from hugin_abflow import colour, seam
 from hugin_abflow.coefficient import Masks, Overlaps
 from hugin_abflow.gains import Difference, Measured, solve
 from hugin_abflow.geometry import Pair
+from hugin_abflow.grid import cells_under
 from hugin_abflow.layer import Box
 from hugin_abflow.opencl import Device
 from hugin_abflow.scene import Scene
 from hugin_abflow.settings import Settings
-from hugin_abflow.working import cells_under
 
 SPANS = st.tuples(st.integers(0, 40), st.integers(0, 40))
 

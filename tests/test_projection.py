@@ -11,11 +11,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from hugin_abflow.chart import pair_chart
+from hugin_abflow.grid import full_grid
 from hugin_abflow.layer import Box, Canvas, Layer
 from hugin_abflow.pano_trafo import map_places
 from hugin_abflow.project import read_plan
 from hugin_abflow.projection import EQUIRECTANGULAR, Projection
-from hugin_abflow.working import full_grid
 
 PROJECTIONS = {
     "rectilinear": 'f0 w501 h403 v110 n"TIFF_m"',

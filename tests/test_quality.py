@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
-from hugin_abflow import flow, joint, quality, working
+from hugin_abflow import flow, joint, quality
+from hugin_abflow.grid import full_grid, working_grid
 from hugin_abflow.layer import Canvas, Layer
 from hugin_abflow.opencl import Device, DeviceMemoryError
 from hugin_abflow.progress import silent
@@ -33,11 +34,11 @@ def test_normal_is_what_the_solver_does_by_itself() -> None:
 
 
 def test_quality_chooses_the_working_canvas() -> None:
-    full = working.full_grid(LARGE, layers(LARGE))
+    full = full_grid(LARGE, layers(LARGE))
     sizes = []
     for name in QUALITIES:
         settings = Settings(flow_quality=name)
-        grid = working.working_grid(full, settings)
+        grid = working_grid(full, settings)
         sizes.append(grid.width * grid.height)
         assert 0.98 * settings.working_limit < sizes[-1] < 1.02 * settings.working_limit
     fast, normal, best = sizes

@@ -15,11 +15,12 @@ from pictures import noise
 
 from hugin_abflow import reading, working
 from hugin_abflow.errors import ImageReadError
+from hugin_abflow.grid import Grid, full_grid
 from hugin_abflow.layer import Canvas, Layer
 from hugin_abflow.opencl import Device
 from hugin_abflow.progress import Advance, silent
 from hugin_abflow.settings import Settings
-from hugin_abflow.working import Grid, WorkingLayer
+from hugin_abflow.working import WorkingLayer
 
 CANVAS = Canvas.plane(123, 301)
 
@@ -31,7 +32,7 @@ def stripped(seed: int, left: int = 0, width: int = 77) -> Layer:
 
 
 def grid_of(layers: list[Layer]) -> Grid:
-    return working.full_grid(CANVAS, layers).resized(41, 97)
+    return full_grid(CANVAS, layers).resized(41, 97)
 
 
 def rows_at_a_time(monkeypatch: pytest.MonkeyPatch, rows: int) -> None:

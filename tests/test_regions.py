@@ -12,8 +12,8 @@ from hypothesis import given
 from labels import CUT, alike, energies, label, many, problems
 
 from hugin_abflow import labelling, regions, seam
+from hugin_abflow.grid import Grid
 from hugin_abflow.regions import Choice, Residuals
-from hugin_abflow.working import Grid
 
 WRAPS = [False, True]
 

@@ -18,13 +18,13 @@ from scipy import ndimage
 from hugin_abflow import consistency, flow, guidance, quality, relay
 from hugin_abflow.figures import parallax
 from hugin_abflow.geometry import Pair, PairFlow
+from hugin_abflow.grid import Grid
 from hugin_abflow.guides import Guide
 from hugin_abflow.layer import Canvas, Layer
 from hugin_abflow.merge import merge_layers
 from hugin_abflow.opencl import Device
 from hugin_abflow.pyramid import Level
 from hugin_abflow.settings import Settings
-from hugin_abflow.working import Grid
 
 Spans = Sequence[tuple[int, int]]
 

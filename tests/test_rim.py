@@ -17,10 +17,10 @@ from hugin_abflow.blend import Prepared
 from hugin_abflow.chart import pair_chart
 from hugin_abflow.coefficient import Masks
 from hugin_abflow.geometry import PairFlow
+from hugin_abflow.grid import Grid
 from hugin_abflow.opencl import Device
 from hugin_abflow.rim import Rim
 from hugin_abflow.settings import Settings
-from hugin_abflow.working import Grid
 
 # Of 300 x 200 px strips are thin up to 4 px.
 WIDTH, HEIGHT = 300, 200

@@ -17,10 +17,10 @@ from tolerances import POSITION, SUM, assert_close
 from hugin_abflow import seam
 from hugin_abflow.cells import averaged, centres
 from hugin_abflow.geometry import Pair
+from hugin_abflow.grid import Grid, on_cells
 from hugin_abflow.opencl import Device
 from hugin_abflow.regions import Residuals, seen
 from hugin_abflow.scene import Scene
-from hugin_abflow.working import Grid, on_cells
 
 WRAPS = [False, True]
 

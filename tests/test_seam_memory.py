@@ -14,10 +14,10 @@ from grids import plane
 from hugin_abflow import coefficient, seam
 from hugin_abflow.colour import Correction
 from hugin_abflow.geometry import Pair
+from hugin_abflow.grid import on_cells
 from hugin_abflow.opencl import Device
 from hugin_abflow.regions import Residuals
 from hugin_abflow.scene import Scene
-from hugin_abflow.working import on_cells
 
 COLUMNS, ROWS = 12, 8
 SIDE, STEP = 72, 48  # px of layers

@@ -15,9 +15,9 @@ from scipy import ndimage
 from tolerances import DECISIONS, SUM, TRIGONOMETRY, assert_close
 
 from hugin_abflow import search
+from hugin_abflow.grid import Border
 from hugin_abflow.opencl import Buffer, Device
 from hugin_abflow.search import SearchParameters
-from hugin_abflow.working import Border
 
 GRIDS = {"plane": Border(37, 23, 0), "cylinder": Border(38, 23, 1), "odd cylinder": Border(37, 23, 1)}
 REACH = (4, 3)

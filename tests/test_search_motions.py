@@ -11,10 +11,10 @@ from scipy import ndimage
 
 from hugin_abflow import flow, quality, search
 from hugin_abflow.flow import FlowParameters
+from hugin_abflow.grid import Border
 from hugin_abflow.opencl import Buffer, Device
 from hugin_abflow.pyramid import Level
 from hugin_abflow.settings import LargeMotion
-from hugin_abflow.working import Border
 
 
 def texture(seed: int, width: int, height: int) -> np.ndarray:

@@ -10,8 +10,8 @@ from scipy import ndimage
 
 from hugin_abflow import shadows
 from hugin_abflow.gains import Difference, Measured
+from hugin_abflow.grid import Grid
 from hugin_abflow.layer import Canvas
-from hugin_abflow.working import Grid
 
 COLUMNS, ROWS = 40, 21  # cells of the colour grid
 PLACE = np.s_[6:14, 12:22]

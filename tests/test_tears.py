@@ -11,9 +11,9 @@ from grids import on_device, plane, sphere
 from pictures import merged, one_device
 
 from hugin_abflow import tears
+from hugin_abflow.grid import Grid
 from hugin_abflow.opencl import Device
 from hugin_abflow.regions import Choice, Residuals
-from hugin_abflow.working import Grid
 
 COLUMNS, ROWS, SIZE = 12, 7, 8  # cells, and working pixels of each
 

@@ -17,10 +17,11 @@ from hugin_abflow import highlights, transition
 from hugin_abflow.chart import pair_chart
 from hugin_abflow.coefficient import Masks
 from hugin_abflow.geometry import PairFlow
+from hugin_abflow.grid import Grid
 from hugin_abflow.opencl import Buffer, Device
 from hugin_abflow.settings import Settings
 from hugin_abflow.transition import Shares
-from hugin_abflow.working import Grid, WorkingLayer
+from hugin_abflow.working import WorkingLayer
 
 BOX = (9, 1, 60, 37)
 STRAIN = Settings().transition_strain

@@ -15,6 +15,7 @@ from hugin_abflow import joint, multiband, unit, working
 from hugin_abflow.blend import BlendLayer, Prepared
 from hugin_abflow.colour import Correction
 from hugin_abflow.errors import CommandLineError, LayersMismatchError, LayersMissingError, SameOutputError
+from hugin_abflow.grid import Grid, Place
 from hugin_abflow.guides import Guide
 from hugin_abflow.images import ImageWriter, check_target, read_layer
 from hugin_abflow.layer import Box, Canvas, Layer, full_scale
@@ -23,7 +24,6 @@ from hugin_abflow.progress import Progress, silent
 from hugin_abflow.project import file_key
 from hugin_abflow.settings import Settings
 from hugin_abflow.targets import refuse_input, refuse_photo
-from hugin_abflow.working import Grid, Place
 
 _OPTION = "--save-masks"
 _WHITE = np.uint16(65535)
