@@ -59,7 +59,7 @@ def _devices(context: click.Context) -> str:
     )
 
 
-_file, _new_file, _new_image = OldFile(), NewFile(), NewFile(image=True)
+_file, _new_file, _new_image = OldFile(), NewFile(replaced=True), NewFile(image=True)
 _layers = partial(click.option, cls=Option, group="Layers")
 _blending = partial(click.option, cls=Option, group="Blending", show_default=True)
 _switch = partial(_blending, type=click.Choice(["auto", "off"]), default="auto")
@@ -236,7 +236,7 @@ _question = partial(_information, is_flag=True, is_eager=True, expose_value=Fals
     help=f"Take options from FILE. [default: {NAME} beside each project, or above it up to a named folder]",
 )
 @_batch("--print-config", is_flag=True, help=f"Print all options as they would be in {NAME}, and exit.")
-@_batch("--log", metavar="FILE", type=_new_file, help="Add all messages, with the time, to the end of FILE.")
+@_batch("--log", metavar="FILE", type=NewFile(), help="Add all messages, with the time, to the end of FILE.")
 @_resources(
     "--max-memory",
     metavar="SIZE",

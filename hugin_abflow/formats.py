@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from contextlib import suppress
 from pathlib import Path
 
@@ -25,6 +26,8 @@ _LONGEST = 16
 _RAW = frozenset(
     {".arw", ".cr2", ".cr3", ".dng", ".nef", ".nrw", ".orf", ".pef", ".raf", ".raw", ".rw2", ".srw"}
 )  # fmt: skip
+# A line of a project that no other text has: what Hugin and PTGui write first, a p- or i-line.
+_OF_PROJECTS = re.compile(rb"(?im)^(?:\xef\xbb\xbf)?(?:# (?:hugin|ptgui) project file|[pio] [fwh]\d)")
 _READ_BY_HUGIN = frozenset({"JPEG", "PNG", "TIFF", "OpenEXR"})
 
 
@@ -36,6 +39,11 @@ def picture_format(data: bytes) -> str | None:
 def holds_text(data: bytes) -> bool:
     """Whether a file that begins so may be a text: pictures, camera raws and videos have a NUL soon."""
     return b"\0" not in data
+
+
+def holds_project(data: bytes) -> bool:
+    """Whether a file that begins so may be a project, whatever its name."""
+    return _OF_PROJECTS.search(data) is not None
 
 
 def foreign_format(photo: Path) -> str | None:

@@ -13,11 +13,11 @@ import click
 from hugin_abflow import memory
 from hugin_abflow.encoding import COMPRESSIONS, ENDINGS
 from hugin_abflow.errors import SettingsError
-from hugin_abflow.formats import holds_text, picture_format
+from hugin_abflow.formats import holds_project, holds_text, picture_format
 from hugin_abflow.scratch import is_special
 from hugin_abflow.settings import MOST_MEMORY, Settings
 
-# Enough of a file's beginning to tell a text from a picture.
+# Enough of a file's beginning to tell a text from a picture, and a project from other texts.
 _BEGINNING = 4096
 
 # Where a context keeps the arguments as they were given.
@@ -116,15 +116,19 @@ class OldFile(click.Path):
 
 class NewFile(click.Path):
     """A file to be written: no project and, unless `image`, no photo, as where its own name was forgotten
-    before ``*.pto``. A photo is also told by what it holds: camera raws and hard links have other names.
+    before ``*.pto``. Both are also told by what they hold: camera raws, hard links and Hugin's temporary
+    projects have other names.
+
+    replaced        what is there goes, and has to be of the kind that is written, JSON: notes, sidecars of
+                    photos and settings are texts, too. Else it grows.
     """
 
-    def __init__(self, image: bool = False) -> None:
+    def __init__(self, image: bool = False, replaced: bool = False) -> None:
         super().__init__()
-        self.image = image
+        self.image, self.replaced = image, replaced
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Path:
-        """Its path; ends with click's message for none, or a project or a photo, also behind a link."""
+        """Its path; ends with click's message for none, or what is somebody's, also behind a link."""
         _refuse_no_name(self, value, param, ctx)
         path = Path(os.fsdecode(super().convert(value, param, ctx)))
         for name in (str(path).lower(), os.path.realpath(path).lower()):
@@ -132,19 +136,28 @@ class NewFile(click.Path):
                 self.fail(f"{value} is a project, which is never written to; name another file", param, ctx)
             if name.endswith(tuple(ENDINGS)) and not self.image:
                 self.fail(f"{value} is an image by its name; name another file", param, ctx)
-        if not self.image and not _may_be_text(path):
+        data = b"" if self.image else _beginning(path)
+        if not holds_text(data) or picture_format(data):
             self.fail(f"{value} is there, and may be a photo: it is no text; name another file", param, ctx)
+        if holds_project(data):
+            self.fail(f"{value} holds a project, which is never written to; name another file", param, ctx)
+        if self.replaced and data.strip() and not data.lstrip().startswith(b"{"):
+            self.fail(
+                f"{value} is there, and would be replaced, but is no JSON: it is somebody's; name another "
+                "file, or remove it",
+                param,
+                ctx,
+            )
         return path
 
 
-def _may_be_text(path: Path) -> bool:
-    """Whether a file may be a text, such as one of ours from before; so may what cannot be looked into."""
+def _beginning(path: Path) -> bytes:
+    """What a file begins with; nothing of one that cannot be looked into."""
     with suppress(OSError):  # writing will tell what is the matter
         if not is_special(path):  # who opens a pipe waits until somebody writes
             with path.open("rb") as file:
-                data = file.read(_BEGINNING)
-            return holds_text(data) and picture_format(data) is None
-    return True
+                return file.read(_BEGINNING)
+    return b""
 
 
 class Command(click.Command):

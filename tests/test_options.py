@@ -26,6 +26,29 @@ def test_no_photo_is_written_to_whatever_its_name(tmp_path: Path, photo: bytes) 
         assert NewFile(image=True).convert(str(tmp_path / name), None, None).read_bytes() == photo
 
 
+def test_no_project_is_written_to_whatever_its_name(tmp_path: Path) -> None:
+    """Hugin's temporary ones have no ending; hard links and backups may have any."""
+    (tmp_path / "project").write_text('p f2 w90 h30 v130\ni w48 h36 f0 v60 n"a.jpg"\n')
+    (tmp_path / "windows.bak").write_bytes(b"\xef\xbb\xbf# Hugin project file\r\n")
+    for name in ("project", "windows.bak"):
+        for kind in (NewFile(), NewFile(replaced=True)):
+            with pytest.raises(click.BadParameter, match=f"{name} holds a project, which is never"):
+                kind.convert(str(tmp_path / name), None, None)
+
+
+def test_what_is_replaced_was_written_by_us(tmp_path: Path) -> None:
+    """Or may have been; a text to the end of which something is added loses nothing."""
+    for name, text in (("photo.xmp", "<x:xmpmeta"), ("abflow.toml", "jobs = 2"), ("notes", "p 1")):
+        file = tmp_path / name
+        file.write_text(text)
+        with pytest.raises(click.BadParameter, match=f"{name} is there, and would be replaced, but is no JS"):
+            NewFile(replaced=True).convert(str(file), None, None)
+        assert NewFile().convert(str(file), None, None) == file
+    for text in ("", "\n", '{\n  "schema": 1', '{"traceEvents": []}'):
+        file.write_text(text)
+        assert NewFile(replaced=True).convert(str(file), None, None) == file
+
+
 def test_a_name_that_no_file_can_have_is_refused() -> None:
     """On a command line it cannot be; in abflow.toml it may."""
     for kind in (NewFile(), OldFile()):

@@ -80,10 +80,10 @@ def test_what_the_run_could_not_write_is_refused_where_it_is_only_shown(
 @pytest.mark.parametrize("option", ["--log", "--report", "--profile"])
 def test_what_is_only_shown_writes_nothing(tmp_path: Path, option: str) -> None:
     project = write_project(tmp_path / "a.pto")
-    (tmp_path / "there").write_text("before")
+    (tmp_path / "there").write_text("{}")
     for name in ("new", "there", os.devnull):
         assert cli.main(["--dry-run", str(project), option, str(tmp_path / name)]) == 0
-    assert (tmp_path / "there").read_text() == "before" and not (tmp_path / "new").exists()
+    assert (tmp_path / "there").read_text() == "{}" and not (tmp_path / "new").exists()
 
 
 @pytest.mark.skipif(sys.platform == "win32" or os.geteuid() == 0, reason="nothing is closed to this user")
