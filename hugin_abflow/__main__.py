@@ -5,7 +5,7 @@ import os
 import sys
 from importlib import import_module
 
-from hugin_abflow.signals import interruptible
+from hugin_abflow.signals import deferred, interruptible
 
 
 def main() -> int:
@@ -28,7 +28,7 @@ def _run(program: str, module: str) -> int:
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     gc.disable()  # what is loaded stays: there is nothing to be found, now or later
     try:
-        with interruptible():
+        with interruptible(), deferred():  # what is written in C++ does not survive it in the middle
             command = import_module(module).main
     except KeyboardInterrupt:
         print(f"{program}: interrupted", file=sys.stderr)

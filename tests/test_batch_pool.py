@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import logging
+import multiprocessing
 import os
+import signal
 from collections.abc import Iterator
 from itertools import groupby
+from multiprocessing.context import SpawnProcess
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +24,7 @@ from hugin_abflow.batch.task import perform as perform_alone
 from hugin_abflow.errors import ExitCode
 from hugin_abflow.opencl import Device
 from hugin_abflow.settings import Settings
+from hugin_abflow.signals import interruptible
 
 posix = pytest.mark.skipif(os.name == "nt", reason="the stand-in for nona is a shell script")
 
@@ -139,6 +143,27 @@ def test_memory_is_shared_among_no_more_than_there_are(
     assert "too little" not in capsys.readouterr().err
     assert cli.main([*projects, "--force", "--max-memory", "30M", "--jobs", "2"]) == ExitCode.ALL_FAILED
     assert "--max-memory 30.0 MiB, for each of 2 --jobs 15.0 MiB, is too" in capsys.readouterr().err
+
+
+@posix
+def test_ctrl_c_while_a_process_starts_is_neither_lost_nor_its_end(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A shell sends it to both; the process tidies up, and is not left alone."""
+    start = SpawnProcess.start
+    codes: list[int | None] = []
+
+    def interrupted(process: SpawnProcess) -> None:
+        start(process)
+        os.kill(process.pid or 0, signal.SIGINT)
+        signal.raise_signal(signal.SIGINT)
+        process.join(0.5)
+        codes.append(process.exitcode)
+
+    monkeypatch.setattr(SpawnProcess, "start", interrupted)
+    with pytest.raises(KeyboardInterrupt), interruptible():
+        perform(tasks_in(tmp_path, "a", "b"), 2)
+    assert codes == [None] and not multiprocessing.active_children()
 
 
 def test_pool_can_be_used_again(tmp_path: Path) -> None:

@@ -7,13 +7,14 @@ encoded. Processes, not threads: a crash costs one attempt at one project.
 from __future__ import annotations
 
 import multiprocessing
+import os
 import signal
-import threading
 import time
 from collections import deque
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from datetime import UTC, datetime
+from multiprocessing import resource_tracker
 from multiprocessing.connection import wait
 from multiprocessing.context import SpawnProcess
 from types import TracebackType
@@ -24,6 +25,7 @@ from hugin_abflow.batch.record import Record
 from hugin_abflow.batch.task import Listener, Task, perform, settings_of
 from hugin_abflow.batch.worker import GO, GRACE, work
 from hugin_abflow.errors import ExitCode
+from hugin_abflow.signals import deferred
 
 # A project is tried again once if its process dies or its device fails: both may be another project's fault.
 ATTEMPTS = 2
@@ -220,7 +222,8 @@ class Pool:
         for worker in self._workers:
             if worker.task is None:
                 return worker
-        self._workers.append(_Worker(self._level, self._jobs))
+        with deferred():  # one that is half started, or that nobody knows, could not be told to end
+            self._workers.append(_Worker(self._level, self._jobs))
         return self._workers[-1]
 
 
@@ -246,12 +249,15 @@ class Alone:
 
 @contextmanager
 def _deaf() -> Iterator[None]:
-    """Let processes that are started meanwhile ignore Ctrl-C, of which the pool tells them."""
-    if threading.current_thread() is not threading.main_thread():
-        yield  # only the main thread may set handlers
+    """Let processes that are started meanwhile not get Ctrl-C, of which the pool tells them: they inherit
+    that it is held back. Were it ignored instead, one that comes meanwhile would be lost.
+    """
+    if os.name == "nt":
+        yield  # where nothing of that kind is inherited
         return
-    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    resource_tracker.ensure_running()  # the start of which would end what follows
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT])
     try:
         yield
     finally:
-        signal.signal(signal.SIGINT, before)
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
