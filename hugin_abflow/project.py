@@ -13,7 +13,7 @@ from hugin_abflow.errors import ProjectError
 from hugin_abflow.exif import is_photo
 from hugin_abflow.layer import Box, Canvas
 from hugin_abflow.projection import EQUIRECTANGULAR
-from hugin_abflow.scratch import is_file
+from hugin_abflow.scratch import is_file, is_pipe
 
 _log = logging.getLogger(__name__)
 
@@ -138,9 +138,14 @@ def read_plan(path: Path | str) -> Plan:
     """Read a project and decide what it asks for.
 
     Raises `pto.PtoError` for a file that is no project, `ProjectError` for one that makes no panorama:
-    no active image, an empty crop.
+    no active image, an empty crop; and for a pipe.
     """
     file = Path(path).absolute()
+    if is_pipe(file):
+        raise ProjectError(
+            f"{path} is a pipe, which can be read but once, and a project is read several times, by nona as "
+            "well; save it as a file, beside its photos"
+        )
     project = pto.load(file)
     names = [image.filename for image in project.images]
     photos = tuple(locate_photo(file.parent, name) for name in names)

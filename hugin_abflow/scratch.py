@@ -59,6 +59,14 @@ def is_special(path: Path) -> bool:
     return not stat.S_ISREG(mode) or _leads_to_open_file(path)
 
 
+def is_pipe(path: Path) -> bool:
+    """Whether it is a pipe, as a shell's ``<(...)`` is; false where it must not be looked at."""
+    try:
+        return stat.S_ISFIFO(path.stat().st_mode)
+    except (OSError, ValueError):  # ValueError: a NUL in the name
+        return False
+
+
 def open_to_add(path: Path, buffering: int = -1) -> TextIO:
     """A file to the end of which text is added. Where it is our stdout or stderr, their own place in it moves
     along: what is printed next comes behind. Raises OSError.

@@ -85,7 +85,15 @@ def unwritable(path: Path, replaced: bool) -> str | None:
         written = final if final.exists() and not replaced else final.parent
     except OSError as error:
         return error.strerror
-    return None if os.access(written, os.W_OK) else os.strerror(errno.EACCES)
+    if os.access(written, os.W_OK):
+        return None
+    # access(2) knows the reason, but Python does not tell it
+    return os.strerror(errno.EROFS if _is_read_only(written) else errno.EACCES)
+
+
+def _is_read_only(path: Path) -> bool:
+    """Whether its file system is; false where that is not known."""
+    return sys.platform != "win32" and bool(os.statvfs(path).f_flag & os.ST_RDONLY)
 
 
 def may_grow(path: Path, more: int) -> bool:

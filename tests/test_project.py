@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 import subprocess
 from pathlib import Path
@@ -261,6 +262,14 @@ def test_what_is_no_project(tmp_path):
         read_plan(tmp_path / "a.pto")
     with pytest.raises(ProjectError, match=r"none\.pto"):
         read_plan(tmp_path / "none.pto")
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="needs named pipes")
+def test_a_pipe_is_told_without_waiting_for_it(tmp_path):
+    """A shell's <(...) is one; its second reader found nothing."""
+    os.mkfifo(tmp_path / "pipe")
+    with pytest.raises(ProjectError, match=r"pipe is a pipe, which can be read but once.*; save it as"):
+        read_plan(tmp_path / "pipe")
 
 
 def test_all_real_projects_have_a_plan():

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import sys
 from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 from shoots import write_project
@@ -94,3 +96,12 @@ def test_what_is_closed_is_told_without_writing(tmp_path: Path) -> None:
     tmp_path.chmod(0o555)
     assert unwritable(file, replaced=True) and unwritable(tmp_path / "new", replaced=False)
     tmp_path.chmod(0o755)
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="tells it in other ways")
+def test_a_read_only_disk_is_told_from_permissions(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As the run itself does: other permissions help nothing there."""
+    monkeypatch.setattr(os, "access", lambda path, mode: False)
+    assert unwritable(tmp_path / "new", replaced=True) == os.strerror(errno.EACCES)
+    monkeypatch.setattr(os, "statvfs", lambda path: SimpleNamespace(f_flag=os.ST_RDONLY | os.ST_NOSUID))
+    assert unwritable(tmp_path / "new", replaced=True) == os.strerror(errno.EROFS)
