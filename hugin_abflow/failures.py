@@ -6,6 +6,8 @@ import re
 from collections.abc import Sequence
 from pathlib import Path
 
+import numpy as np
+
 from hugin_abflow import pto
 from hugin_abflow.errors import (
     AbflowError,
@@ -21,8 +23,39 @@ from hugin_abflow.programs import ending, last_lines
 from hugin_abflow.project import Plan, PlannedImage
 from hugin_abflow.targets import named_in_unicode
 
+# What libpng, libjpeg and OpenEXR say of a photo that they cannot decode to its end.
+_UNDECODED = re.compile(r"error in (?:png|jpeg)_\w+\(\)|Error reading pixel data")
 # What it says of photos of two depths, or of grey ones beside coloured ones.
 _DIFFERENT = re.compile("uses [A-Z0-9]+ valued pixel, while|has [0-9] channels?, while")
+
+# What libtiff says, but for warnings, of missing pixels in a photo, which nona remaps as if it were
+# whole.
+_LOSS = re.compile(
+    r": Read error on |: Sample out of range"
+    r"|^(?:\w+Decode\w*|JPEGLib|TIFFReadScanline|TIFFRead\w+Strip|TIFFFillStrip): (?!Warning)"
+)
+# Of these, what tells of sound photos, and what is wrong with them. Rows of channels that lie one after the
+# other (Photoshop's "per channel") nona asks for as channels, of which there are none.
+_MISREAD = {
+    ": Sample out of range": "has its channels one after the other (planar), which Hugin misreads; save it "
+    "with interleaved channels",
+    "downsampled JPEG": "is compressed as JPEG in a way that Hugin misreads; save it with another "
+    "compression, such as LZW",
+}
+
+
+def loss(photo: Path, line: str) -> ImageReadError | None:
+    """What to raise where nona says this while it loads a photo; None where nothing is lost."""
+    if not _LOSS.search(line):
+        return None
+    for mark, why in _MISREAD.items():
+        if mark in line:
+            return ImageReadError(f"{photo} {why}, under the same name")
+    return _damaged(photo, line.strip())
+
+
+def _damaged(photo: Path, said: str) -> ImageReadError:
+    return ImageReadError(f"{photo} is damaged ({said}); copy it from the camera again")
 
 
 def failure(
@@ -45,6 +78,9 @@ def failure(
                 return ImageReadError(
                     f"{image.photo} is no image that can be read; copy it from the camera again"
                 )
+    loads = [line.removeprefix("loading ") for line in lines if line.startswith("loading ")]
+    if loads and (line := next(filter(_UNDECODED.search, lines), None)):
+        return _damaged(plan.folder / loads[-1], line)
     if "unexpectedly changed dimensions" in said:
         project = pto.load(plan.file)
         for image in images:
@@ -68,25 +104,38 @@ def failure(
 
 def check_made(plan: Plan, made: dict[int, Path]) -> None:
     """Raise `LayersMismatchError` if nona made layers for another canvas than the project's, and
-    `ImageReadError` if of photos whose samples it keeps, though no layer can have such.
+    `ImageReadError` if of photos whose samples it keeps, though no layer can have such, or takes for others.
 
     made    its layers by images; all are of one kind, and made for one canvas.
     """
     for index, path in list(made.items())[:1]:
+        (photo,) = (image.photo for image in plan.images if image.index == index)
         try:
             layer = read_layers(path)[0]
         except ImageReadError as error:
             if image_size(path) is None:
                 raise
             # the layer will go, and has what its photo has
-            (photo,) = (image.photo for image in plan.images if image.index == index)
             raise ImageReadError(
                 f"{str(error).replace(str(path), str(photo))}; convert the photos of the project to one of "
                 "these, such as 16 bit, under the same names"
             ) from None
+        if layer.dtype == np.uint16 and _has_half_floats(photo):
+            raise ImageReadError(
+                f"{photo} has 16 bit floats, which Hugin takes for whole numbers: far too dark; convert the "
+                "photos of the project to 16 bit whole numbers or 32 bit floats, under the same names"
+            )
         if made_for := other_canvas(layer, plan.canvas):
             raise LayersMismatchError(
                 f"{plan.file}: the canvas is {plan.canvas.width}x{plan.canvas.height}, of which Hugin makes "
                 f"{made_for}, since this projection shows no more; open the project in Hugin, which corrects "
                 "that, and save it"
             )
+
+
+def _has_half_floats(photo: Path) -> bool:
+    """Whether a photo has; false where it cannot be opened here."""
+    try:
+        return read_layers(photo)[0].dtype == np.float16
+    except ImageReadError:
+        return False

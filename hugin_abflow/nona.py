@@ -23,7 +23,7 @@ from hugin_abflow.errors import (
     ProgramFailedError,
     ProgramMissingError,
 )
-from hugin_abflow.failures import check_made, failure
+from hugin_abflow.failures import check_made, failure, loss
 from hugin_abflow.found import (
     Found,
     is_another_projects,
@@ -51,9 +51,9 @@ _OTHERWISE = "or name layers that exist with --prefix or --layers"
 
 _STEPS = ("remapping ", "saving ")  # what nona -v says at the end of a photo's loading and remapping
 _LOADING = "loading "  # and at its beginning
-# What libtiff and libjpeg say of a photo that nona remaps as if it were whole: pixels are missing; or may
-# be missing: some cameras leave out no more than the mark of the end.
-_LOSS, _CUT = ": Read error on ", "Premature end of JPEG file"
+# What libjpeg says of a photo of which pixels may be missing, as which nona remaps it: some cameras leave out
+# no more than the mark of the end.
+_CUT = "Premature end of JPEG file"
 _DOUBTS = (_CUT, "Corrupt JPEG data")
 
 
@@ -185,11 +185,8 @@ def _run(
                     advance(1)
                 elif line.startswith(_LOADING):
                     loaded.append(plan.folder / line.removeprefix(_LOADING).strip())
-                elif _LOSS in line:
-                    photo = loaded[-1] if loaded else plan.file
-                    raise ImageReadError(
-                        f"{photo} is damaged ({line.strip()}); copy it from the camera again"
-                    )
+                elif lost := loss(loaded[-1] if loaded else plan.file, line):
+                    raise lost
                 elif any(mark in line for mark in _DOUBTS):
                     doubts.add(line.strip())
     except ProgramMissingError as error:  # it is there, but not its interpreter

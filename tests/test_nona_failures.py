@@ -18,6 +18,7 @@ from hugin_abflow.errors import (
     OutputError,
     ProjectError,
 )
+from hugin_abflow.images import write_image
 from hugin_abflow.project import read_plan
 from hugin_abflow.supply import open_layers
 
@@ -68,6 +69,60 @@ def test_photos_of_samples_that_no_layer_has(make_project, nona, dtype, keep):
     with pytest.raises(ImageReadError, match=said), open_layers(plan, keep_layers=keep):
         pass
     assert names_in(plan.folder) == before
+
+
+def test_photos_that_nona_misreads(make_project, nona):
+    """It ends with success, and layers of noise, or far too dark ones."""
+    plan = read_plan(make_project(yaws=(0, 60)))
+    for number, photo in enumerate(plan.photos):
+        pixels = photo_pixels(number).transpose(2, 0, 1)
+        tifffile.imwrite(photo, pixels, photometric="rgb", planarconfig="separate")
+    said = rf"^{plan.photos[0]} has its channels one after the other \(planar\), .*; save it with interleaved"
+    with pytest.raises(ImageReadError, match=said), open_layers(plan):
+        pass
+    for number, photo in enumerate(plan.photos):
+        pixels = photo_pixels(number)
+        encoded = {"compression": "jpeg", "compressionargs": {"level": 90}}
+        tifffile.imwrite(photo, pixels, photometric="ycbcr", subsampling=(2, 2), **encoded)
+    said = rf"^{plan.photos[0]} is compressed as JPEG in a way .*; save it with another compression"
+    with pytest.raises(ImageReadError, match=said), open_layers(plan):
+        pass
+    for number, photo in enumerate(plan.photos):
+        tifffile.imwrite(photo, (photo_pixels(number) / 255).astype(np.float16), photometric="rgb")
+    said = rf"^{plan.photos[0]} has 16 bit floats, .*; convert the photos of the project to 16 bit whole"
+    with pytest.raises(ImageReadError, match=said), open_layers(plan):
+        pass
+
+
+@pytest.mark.parametrize("compression", ["lzw", "zlib", "lzma", "zstd"])
+def test_photos_whose_compressed_pixels_are_damaged(make_project, nona, compression):
+    """As by a copy that was broken off, where the rest is zeros: nona leaves black, or noise."""
+    plan = read_plan(make_project(yaws=(0, 60)))
+    for number, photo in enumerate(plan.photos):
+        rgb = photo_pixels(number)
+        tifffile.imwrite(photo, rgb, photometric="rgb", compression=compression, rowsperstrip=16)
+    with open_layers(plan):
+        pass
+    data = plan.photos[1].read_bytes()
+    half = len(data) // 2
+    plan.photos[1].write_bytes(data[:half] + bytes(len(data) - half))
+    with pytest.raises(ImageReadError, match=rf"^{plan.photos[1]} is damaged \(.*Decode"), open_layers(plan):
+        pass
+
+
+@pytest.mark.parametrize("ending", ["png", "jpg", "exr"])
+def test_photos_that_nona_cannot_decode(make_project, nona, ending):
+    """What it says at the end is about the photo, not about the folder that it writes into."""
+    plan = read_plan(make_project(yaws=(0, 60), photo=f"photo{{}}.{ending}"))
+    for number, photo in enumerate(plan.photos):
+        opaque = np.dstack([photo_pixels(number), np.full((151, 203), 255, np.uint8)])
+        write_image(photo, opaque if ending != "exr" else (opaque / 255).astype(np.float32))
+    data = bytearray(plan.photos[1].read_bytes())
+    half = len(data) // 2
+    data[half : half + 400] = bytes(byte ^ 0x15 for byte in data[half : half + 400])
+    plan.photos[1].write_bytes(data)
+    with pytest.raises(ImageReadError, match=rf"^{plan.photos[1]} is damaged \("), open_layers(plan):
+        pass
 
 
 def test_a_project_with_a_name_as_long_as_file_systems_take(make_project, nona):
