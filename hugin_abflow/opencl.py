@@ -153,7 +153,7 @@ class Device:
     def __init__(self, wanted: str | None = None, threads: int = 0) -> None:
         with signals.held():  # the driver starts its threads, from which PoCL starts its linker
             chosen = choose(wanted, threads)
-            pocl.name_processor(chosen.version, chosen.int_ptr)
+            pocl.name_processor(chosen.version, chosen.driver_version, chosen.int_ptr)
             self.device = limited(chosen, threads)
             self.context = cl.Context([self.device])
             self._timing, self._lanes = trace.is_recording(), list[Lane]()

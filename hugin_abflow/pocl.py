@@ -6,6 +6,10 @@ So does PoCL 3.0 of PyPI, with LLVM 14, on AMD's Zen 5. Or it says what came bef
 has no AVX-512, while PoCL loads its functions for AVX-512. They pass long vectors in another way, and the
 compiler does not end. Either device is given the name of another processor.
 
+**Code that is slow.** What PoCL 3.0 compiles for AVX-512 takes a third longer on Intel's processors than what
+it compiles for AVX2, for which these are named as well. Its functions stay those for AVX-512: kernels hand
+them no vector that is longer than AVX2's.
+
 **A home that cannot be written**, as in containers, and of services. PoCL keeps what it compiled there, and
 offers no device if it cannot; pyopencl fails as well. On a full disk, or one that no program may be run from,
 it ends the process. They are given a folder among temporary files. POCL_CACHE_DIR is passed over where it
@@ -38,9 +42,12 @@ _log = logging.getLogger(__name__)
 # What LLVM calls processors that it may not know; programs for these use no AVX-512.
 _GUESSES = ("generic", "znver1", "znver2", "znver3")
 
+# Whose code for AVX-512 is slow, as CL_DRIVER_VERSION begins, and on whose processors. Others: not measured.
+_SLOW = "3.0"
+_SLOW_ON = "GenuineIntel"
+
 # PoCL's libraries of functions, and the processors for which they are compiled: which one is loaded depends
-# on the first feature alone, in the words of /proc/cpuinfo; programs may expect the others as well. If they
-# were compiled for less than the library, they would pass long vectors in another way.
+# on the first feature alone, in the words of /proc/cpuinfo; programs may expect the others as well.
 _PROCESSORS: tuple[tuple[str, str, Set[str]], ...] = (
     ("avx512f", "skylake-avx512", {"avx512bw", "avx512cd", "avx512dq", "avx512vl", "adx", "clflushopt"}),
     ("avx2", "haswell", {"sse4_2", "popcnt", "fma", "f16c", "bmi1", "bmi2", "abm", "movbe"}),
@@ -179,35 +186,45 @@ def _make_private(folder: Path) -> bool:
     return False
 
 
-def name_processor(version: str, record: int) -> None:
-    """Have PoCL compile for a processor that its compiler knows, where it does not know this one.
+def name_processor(version: str, driver: str, record: int) -> None:
+    """Have PoCL compile for a processor that its compiler knows, and makes quick code for.
 
     version     what the device says of itself (CL_DEVICE_VERSION); PoCL's ends with the processor's name.
+    driver      which version of PoCL it is (CL_DRIVER_VERSION).
     record      the address of its `cl_device_id`; parts of it (sub-devices) have to be made afterwards.
 
     Nothing happens on other systems than Linux on x86-64, on processors that can do less than AVX2, where the
     name will do, or if the record is not as expected: that programs do not build is told there.
     """
-    guess = version.rpartition("-")[2]
-    if "pocl" not in version.lower() or guess not in _GUESSES:
-        return
-    if sys.platform != "linux" or platform.machine() != "x86_64":
+    own = version.rpartition("-gnu-")[2]
+    if "pocl" not in version.lower() or sys.platform != "linux" or platform.machine() != "x86_64":
         return
     try:
-        features = _features()
-        if guess != "generic" and "avx512f" not in features:  # the name will do
-            return
-        name = _like(features)
-        if name and _rename(record, guess, name):
-            _log.debug("PoCL does not know this processor; it compiles for %s", name)
+        maker, features = _processor()
+        slow = driver.startswith(_SLOW) and maker == _SLOW_ON
+        name = _better(own, features, slow)
+        if name and _rename(record, own, name):
+            _log.debug("PoCL takes this processor for %s; it compiles for %s", own, name)
     except OSError as error:
-        _log.debug("PoCL does not know this processor, and cannot be told: %s", error)
+        _log.debug("PoCL takes this processor for %s, and cannot be told otherwise: %s", own, error)
 
 
-def _features() -> Set[str]:
-    """What this processor can do, in the words of /proc/cpuinfo."""
+def _processor() -> tuple[str, Set[str]]:
+    """Who made this processor, and what it can do, in the words of /proc/cpuinfo."""
     lines = Path("/proc/cpuinfo").read_text("utf-8").splitlines()
-    return next((set(line.partition(":")[2].split()) for line in lines if line.startswith("flags")), set())
+    told = {name.strip(): value.strip() for name, _, value in (line.partition(":") for line in lines)}
+    return told.get("vendor_id", ""), set(told.get("flags", "").split())
+
+
+def _better(own: str, features: Set[str], slow: bool) -> str | None:
+    """What to call a processor with these features, which PoCL calls `own`; None if that is to stay.
+
+    slow: code for AVX-512 is, so that it is taken for one that is like it otherwise.
+    """
+    if slow and "avx512f" in features and (name := _like(features - {"avx512f"})):
+        return name
+    unknown = own in _GUESSES if "avx512f" in features else own == _GUESSES[0]
+    return _like(features) if unknown else None
 
 
 def _like(features: Set[str]) -> str | None:

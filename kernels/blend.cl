@@ -142,7 +142,7 @@ static inline blend_samples blend_thresholds(int x, int y) {
 static inline blend_samples blend_round(blend_samples v, blend_samples thresholds, blend_marks dithered) {
     v = v < 0.0f ? 0.0f : v > WHITE ? WHITE : v;
     const blend_samples nearest = (v + 8388608.0f) - 8388608.0f, off = v - nearest; /* 2^23 leaves no bits below 1 */
-    const blend_samples below = BLEND_FLOATS(PIXEL_VECTOR(convert_int, BLEND_SAMPLES)(v));
+    const blend_samples below = BLEND_FLOATS(PIXEL_VECTOR(convert_, PIXEL_VECTOR(int, BLEND_SAMPLES))(v));
     const blend_samples spread = v - below > thresholds ? below + 1.0f : below;
     return dithered ? (off <= 2e-7f * WHITE && off >= -2e-7f * WHITE ? nearest : spread) : nearest;
 }

@@ -11,6 +11,19 @@
 #endif
 #endif
 
+/* PoCL's compiler converts 16 numbers itself: its functions would take them in another way than a kernel hands them on
+   that is compiled for shorter vectors (pocl.py), and each would be a call. */
+#ifdef POCL_DEVICE_ADDRESS_BITS
+#undef convert_float16
+#undef convert_int16
+#undef convert_uchar16
+#undef convert_ushort16
+#define convert_float16(v) __builtin_convertvector(v, float16)
+#define convert_int16(v) __builtin_convertvector(v, int16)
+#define convert_uchar16(v) __builtin_convertvector(v, uchar16)
+#define convert_ushort16(v) __builtin_convertvector(v, ushort16)
+#endif
+
 #if PIXELS == 4
 #define BLEND_SAMPLES 16
 #define BLEND_EACH(v) (v).s0000111122223333 /* what is known of pixels, for each of their samples */
@@ -70,9 +83,9 @@ typedef PIXEL_VECTOR(int, BLEND_SAMPLES) blend_marks;
 typedef PIXEL_VECTOR(PIXEL, BLEND_TWO) blend_two;
 typedef PIXEL_VECTOR(PIXEL, BLEND_FOUR) blend_four;
 typedef PIXEL_VECTOR(PIXEL, BLEND_STORED) blend_pixels;
-#define BLEND_REALS PIXEL_VECTOR(convert_float, PIXELS)
-#define BLEND_INTS PIXEL_VECTOR(convert_int, PIXELS)
-#define BLEND_FLOATS PIXEL_VECTOR(convert_float, BLEND_SAMPLES)
+#define BLEND_REALS PIXEL_VECTOR(convert_, PIXEL_VECTOR(float, PIXELS))
+#define BLEND_INTS PIXEL_VECTOR(convert_, PIXEL_VECTOR(int, PIXELS))
+#define BLEND_FLOATS PIXEL_VECTOR(convert_, PIXEL_VECTOR(float, BLEND_SAMPLES))
 #define BLEND_EXPONENTIAL PIXEL_VECTOR(exponential, BLEND_SAMPLES)
 #define BLEND_RAISE PIXEL_VECTOR(exposure_raise, BLEND_SAMPLES)
 
@@ -116,7 +129,7 @@ static inline blend_samples blend_colours(blend_pixels p) {
 #if SAMPLES > 2
     return BLEND_FLOATS(p);
 #else
-    return PIXEL_VECTOR(convert_float, BLEND_STORED)(p).BLEND_SPREAD;
+    return PIXEL_VECTOR(convert_, PIXEL_VECTOR(float, BLEND_STORED))(p).BLEND_SPREAD;
 #endif
 }
 

@@ -379,7 +379,7 @@ def _device() -> cl.Device:
         raise RuntimeError("no OpenCL device; install one, such as PoCL (pip install 'pyopencl[pocl]')")
     cpus = [device for device in devices if device.type & cl.device_type.CPU]
     device = (cpus or devices)[0]
-    pocl.name_processor(device.version, device.int_ptr)
+    pocl.name_processor(device.version, device.driver_version, device.int_ptr)
     return device
 
 

@@ -179,3 +179,46 @@ def test_a_part_is_in_front_of_its_file_alone() -> None:
 
 def test_a_kernel_is_built_once(device: Device) -> None:
     assert device.kernel("pyramid", "pyramid_reduce") is device.kernel("pyramid", "pyramid_reduce")
+
+
+# Of a number, by its type's letter.
+_BYTES = {
+    **dict.fromkeys((b"c", b"h"), 1),
+    **dict.fromkeys((b"s", b"t"), 2),
+    **dict.fromkeys((b"i", b"j", b"f"), 4),
+    **dict.fromkeys((b"l", b"m", b"d"), 8),
+}
+
+_BUILDING_RUN = """
+import sys
+from hugin_abflow.opencl import Device
+
+device = Device(threads=1)
+for options in sys.argv[1:]:
+    for module in ("seam", "working", "blend"):  # with the first come all that know of no pixels
+        device.build(module, options if module != "seam" else "")
+"""
+
+
+@pytest.mark.parametrize("kind", ["uchar", "ushort", "float"])
+def test_functions_of_the_library_get_no_long_vector(kind: str, device: Device, tmp_path: Path) -> None:
+    """Of more than 32 bytes: those for AVX-512 take them in another way than what is compiled for AVX2."""
+    if "PoCL" not in device.device.version:
+        pytest.skip("the device is none of PoCL's")
+    whole = "INTEGER=0" if kind == "float" else "INTEGER=1"
+    options = [
+        f"-DPIXEL={kind} -DSAMPLES={samples} -DWHITE=255.0f -D{whole} -DPIXELS=4 -DBLOCK=64"
+        for samples in (2, 4)
+    ]
+    subprocess.run(
+        [sys.executable, "-c", _BUILDING_RUN, *options],
+        timeout=120,
+        env=os.environ | {"POCL_CACHE_DIR": str(tmp_path), "PYOPENCL_NO_CACHE": "1"},
+        check=True,
+    )
+    programs = b"".join(path.read_bytes() for path in tmp_path.rglob("program.bc"))
+    # as C++ writes names: Dv, the length, and the type of its numbers
+    taken = {(int(length), of) for length, of in re.findall(rb"_Z\w*?Dv(\d+)_([a-z])", programs)}
+    assert (4, b"f") in taken  # short ones it does get
+    assert all(length * _BYTES[of] <= 32 for length, of in taken)
+    assert not re.search(rb"convert_(float|u?int)16|convert_(double|u?long)8", programs)  # nor returns one

@@ -52,10 +52,10 @@ def record_of(processor: bytes) -> Record:
 
 @only_here
 def test_the_name_alone_is_changed(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(pocl, "_features", lambda: AVX2)
+    monkeypatch.setattr(pocl, "_processor", lambda: ("AuthenticAMD", AVX2))
     record = record_of(b"generic")
     before = bytes(record)
-    pocl.name_processor(version_of("generic"), ctypes.addressof(record))
+    pocl.name_processor(version_of("generic"), "3.0-rc2", ctypes.addressof(record))
     assert record.processor == b"haswell"
     field = Record.processor
     after = bytearray(bytes(record))
@@ -70,17 +70,38 @@ def test_a_name_without_avx512_goes_where_there_is_avx512(
     guess: str, features: set[str], named: str | None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """PoCL loads its functions for AVX-512 there, as on Zen 4, which its compiler takes for Zen 3."""
-    monkeypatch.setattr(pocl, "_features", lambda: features)
+    monkeypatch.setattr(pocl, "_processor", lambda: ("AuthenticAMD", features))
     record = record_of(guess.encode())
-    pocl.name_processor(version_of(guess), ctypes.addressof(record))
+    pocl.name_processor(version_of(guess), "3.0-rc2", ctypes.addressof(record))
     assert record.processor == (named or guess).encode()
+
+
+@only_here
+@pytest.mark.parametrize(
+    "maker, driver, features, named",
+    [
+        ("GenuineIntel", "3.0-rc2", AVX512, "haswell"),
+        ("GenuineIntel", "3.0", AVX512 - {"movbe"}, None),
+        ("GenuineIntel", "3.0", AVX2, None),  # it makes none for AVX-512
+        ("GenuineIntel", "6.0", AVX512, None),
+        ("AuthenticAMD", "3.0-rc2", AVX512, None),
+    ],
+)
+@pytest.mark.parametrize("own", ["rocketlake", "skylake-avx512"])
+def test_slow_code_for_avx512_is_not_made(
+    own: str, maker: str, driver: str, features: set[str], named: str | None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(pocl, "_processor", lambda: (maker, features))
+    record = record_of(own.encode())
+    pocl.name_processor(version_of(own), driver, ctypes.addressof(record))
+    assert record.processor == (named or own).encode()
 
 
 @only_here
 def test_a_name_stays() -> None:
     for processor in (b"znver3", b"generic-rv64"):
         record = record_of(processor)
-        pocl.name_processor(version_of("generic"), ctypes.addressof(record))
+        pocl.name_processor(version_of("generic"), "3.0-rc2", ctypes.addressof(record))
         assert record.processor == processor
 
 
@@ -96,13 +117,13 @@ def test_a_name_stays() -> None:
 )
 def test_other_devices_are_left_alone(version: str) -> None:
     record = record_of(b"generic")
-    pocl.name_processor(version, ctypes.addressof(record))
+    pocl.name_processor(version, "3.0-rc2", ctypes.addressof(record))
     assert record.processor == b"generic"
 
 
 @only_here
 def test_what_cannot_be_read_is_no_error() -> None:
-    pocl.name_processor(version_of("generic"), 8)
+    pocl.name_processor(version_of("generic"), "3.0-rc2", 8)
 
 
 def test_processors_are_taken_for_what_their_library_is_compiled_for() -> None:
@@ -128,7 +149,7 @@ from hugin_abflow.opencl import Device, choose
 
 chosen = choose(None)
 assert pocl._rename(chosen.int_ptr, sys.argv[1], sys.argv[3])
-pocl.name_processor(sys.argv[2], chosen.int_ptr)
+pocl.name_processor(sys.argv[2], "3.0-rc2", chosen.int_ptr)
 print(sorted(Device(threads=1).build("blend", sys.argv[4])))
 """
 
@@ -140,7 +161,7 @@ def test_a_processor_with_another_name_builds(guess: str, device: Device, tmp_pa
     version = device.device.version
     if "PoCL" not in version or "-gnu-" not in version:
         pytest.skip("the device is none of PoCL's")  # only those are named
-    features = pocl._features()
+    _, features = pocl._processor()
     if pocl._like(features) is None or (guess != "generic" and "avx512f" not in features):
         # programs would be built for what it cannot do
         pytest.skip("this processor can do less than those that PoCL may be told of")
