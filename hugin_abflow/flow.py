@@ -209,9 +209,9 @@ def search_room(reach: float, grid: Border, parameters: FlowParameters) -> int:
     return search.most_room(reach, count, grid, how, finest=parameters.decide_on)
 
 
-def finest_features(device: Device, image: Level, parameters: FlowParameters) -> Buffer:
-    """What the solver sees of an image on its finest level: float32 (1, height, width, 4), see flow.cl."""
-    return _features(device, [(image, pyramid.reduce(device, image))], parameters)
+def finest_features(device: Device, images: Sequence[Level], parameters: FlowParameters) -> Buffer:
+    """What the solver sees of images on its finest level: float32 (images, height, width, 4), see flow.cl."""
+    return _features(device, [(image, pyramid.reduce(device, image)) for image in images], parameters)
 
 
 def adopt(
@@ -224,7 +224,7 @@ def adopt(
     trust 0..1, and something that stays.
     """
     how, grid = parameters.search, images[0].grid
-    features = (finest_features(device, image, parameters) for image in images)
+    features = (finest_features(device, [image], parameters) for image in images)
     a, b = (search.descriptor(device, one, grid, how) for one in features)
     return [
         search.adopt(device, here, there, its, grid, how)
@@ -271,7 +271,7 @@ def _decide(
     """Of flows without and with what was searched, those that are left after a level, in the end one; and
     what was refused.
     """
-    plain, found = (Candidate(one.get(), _misfit(device, features, one, grid, parameters)) for one in flows)
+    plain, found = (Candidate(one.get(), misfit(device, features, one, grid, parameters)) for one in flows)
     how, last_level, wraps = parameters.search, parameters.decide_on, bool(grid.wraps)
 
     def textured() -> decision.Mask:
@@ -290,15 +290,15 @@ def _decide(
     return [device.upload(np.where(worse[..., None], plain.flows, found.flows))], ()
 
 
-def _misfit(
+def misfit(
     device: Device, features: Buffer, flows: Buffer, grid: Border, parameters: FlowParameters
 ) -> npt.NDArray[np.float32]:
-    """What flows both ways leave unexplained, (2, height, width), where both images show something; else
-    -1.
+    """What flows both ways, (2, height, width, 2) px, leave unexplained, (2, height, width), where both
+    images show something; else -1. features: of both.
     """
-    misfit = device.empty((2, grid.height, grid.width))
-    device.run("flow", "flow_misfit", (*grid.size, 2), features, flows, grid, parameters.misfit, misfit)
-    return misfit.get()
+    result = device.empty((2, grid.height, grid.width))
+    device.run("flow", "flow_misfit", (*grid.size, 2), features, flows, grid, parameters.misfit, result)
+    return result.get()
 
 
 def _unstacked(device: Device, stacked: Buffer) -> list[Buffer]:
@@ -410,7 +410,7 @@ def refine(
     """
     how = parameters.search
     how = replace(how, steps=(how.refined_steps,), patience=how.refined_patience)
-    features = _features(device, [(image, pyramid.reduce(device, image)) for image in (a, b)], parameters)
+    features = finest_features(device, (a, b), parameters)
     start = _expand(device, _stacked(device, (forward, backward)), a.grid)
     chosen = _choose(device, features, start, a.grid, 0, 0, replace(parameters, search=how))
     flows = _unstacked(device, _refine(device, features, chosen, a.grid, 0, parameters, (None, None)))

@@ -160,7 +160,7 @@ def _rivals(
         level, (springs[0].start(level), springs[1].start(level)), (springs[0].pull, springs[1].pull)
     )
     new = flow.pair_flow(device, *images, solver, start)
-    features = [flow.finest_features(device, image, solver) for image in images]
+    features = [flow.finest_features(device, [image], solver) for image in images]
     return [_Rivals.of(device, features[i], features[1 - i], images[i].grid, old[i], new[i]) for i in (0, 1)]
 
 

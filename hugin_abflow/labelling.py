@@ -130,11 +130,11 @@ def _expand(graph: Graph, labels: Labels, label: int, free: npt.NDArray[np.bool_
     must = graph.possible[label, nodes] & ~graph.possible[labels[nodes], nodes]
     own = np.where(must, 0, take[nodes])
     result = labels.copy()
-    result[nodes[_taking(number[first[both]], number[second[both]], edge, own, must)]] = label
+    result[nodes[taking(number[first[both]], number[second[both]], edge, own, must)]] = label
     return result
 
 
-def _taking(
+def taking(
     first: npt.NDArray[np.intp],
     second: npt.NDArray[np.intp],
     edge: npt.NDArray[np.float64],

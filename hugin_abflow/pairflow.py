@@ -18,7 +18,7 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from hugin_abflow import chart, consistency, figures, flow, guidance, quality, relay, single
+from hugin_abflow import chart, consistency, figures, flow, guidance, quality, relay, repeats, single
 from hugin_abflow.abreast import side_by_side
 from hugin_abflow.cells import SingleSource, View
 from hugin_abflow.chart import Chart
@@ -228,7 +228,8 @@ class _Solver:
         bearings = its_chart.projection.bearings if its_chart.projection else None
         furthest = reach(its_chart, self.grid, settings)
         solved = flow.solve(device, *images, parameters, reach=furthest, bearings=bearings)
-        flows, held = self._led(job, images, (solved.forward, solved.backward), guides)
+        flows = repeats.mend(device, images, (solved.forward, solved.backward), parameters)
+        flows, held = self._led(job, images, flows, guides)
         from_one = self._single(its_chart, images, flows, guides, solved.refused)
         if job.finest is not its_chart:
             images = self._images(pair, job.finest)
