@@ -100,9 +100,7 @@ def test_of_what_is_found_a_part_that_fits_worse_is_dropped(device: Device) -> N
     the wall wrong."""
     (a, in_a), (b, in_b) = (board(120, (90, 80), shift) for shift in (0, 12))
     images = [on_device(device, image, np.ones(a.shape)) for image in (a, b)]
-    features = device.empty((2, *a.shape, 4))
-    for way, image in enumerate(images):
-        features.copy(way * a.size, flow.finest_features(device, image, FlowParameters()), 0, a.size)
+    features = flow.finest_features(device, images, FlowParameters())
     y, x = np.mgrid[0:217, 0:371]
     patch = (np.abs(x - 320) < 15) & (np.abs(y - 100) < 20)
     plain, found = np.zeros((2, 2, *a.shape, 2), np.float32)
