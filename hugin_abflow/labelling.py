@@ -18,6 +18,8 @@ import scipy
 
 # Nodes of a graph that is solved at once.
 _LARGE = 10_000
+# Rounds in which nodes are left out of a graph whose label is certain.
+_ROUNDS = 10
 # Nodes on each side of a cut of blocks that it may be moved to.
 _BAND = 16
 # Capacity of a price of 1: capacities are integers, and prices are around 1.
@@ -147,17 +149,56 @@ def taking(
     own         (nodes,): price of taking it over that of keeping.
     must        (nodes,): it has to be taken, whatever that costs.
     """
-    count = own.size
     unit = min(_UNIT, _MOST / max(np.abs(own).max(), edge.max(initial=0), 1))
+    capacity = np.maximum(np.rint(edge * unit), 0)
+    takes, is_open, own, linked = _settled(
+        first, second, capacity, np.where(must, -_MUST, np.rint(own * unit))
+    )
+    if not is_open.any():
+        return takes
+    own, number = own[is_open], np.cumsum(is_open) - 1
+    count = own.size
     source, sink, each = count, count + 1, np.arange(count)
-    starts = np.concatenate([first, np.full(count, source), each])
-    ends = np.concatenate([second, each, np.full(count, sink)])
-    capacities = np.concatenate([edge * unit, np.maximum(own * unit, 0), np.where(must, _MUST, -own * unit)])
-    whole = np.maximum(np.rint(capacities), 0).astype(np.int32)
+    starts = np.concatenate([number[first[linked]], np.full(count, source), each])
+    ends = np.concatenate([number[second[linked]], each, np.full(count, sink)])
+    capacities = np.concatenate([capacity[linked], np.maximum(own, 0), np.maximum(-own, 0)])
+    whole = np.minimum(capacities, _MUST).astype(np.int32)
     network = scipy.sparse.csr_array((whole, (starts, ends)), shape=(count + 2, count + 2))
     left = network - scipy.sparse.csgraph.maximum_flow(network, source, sink).flow
     left.eliminate_zeros()
     keeps = scipy.sparse.csgraph.breadth_first_order(left, source, return_predecessors=False)
-    takes = np.ones(count + 2, bool)
-    takes[keeps] = False
-    return takes[:count]
+    open_takes = np.ones(count + 2, bool)
+    open_takes[keeps] = False
+    takes[is_open] = open_takes[:count]
+    return takes
+
+
+def _settled(
+    first: npt.NDArray[np.intp],
+    second: npt.NDArray[np.intp],
+    edge: npt.NDArray[np.float64],
+    own: npt.NDArray[np.float64],
+) -> tuple[npt.NDArray[np.bool_], npt.NDArray[np.bool_], npt.NDArray[np.float64], npt.NDArray[np.bool_]]:
+    """What does not need a cut: nodes that keep their label, or take the other one, whatever others do. They
+    are left out, and what remains is the same problem.
+
+    edge, own   as for `taking`, whole numbers.
+
+    Returns which nodes take it, (nodes,); which are open; for these the price, with that of links to nodes
+    that are not; and which links are between two of these, (links,).
+    """
+    count, own = own.size, own.copy()
+    takes, is_open, linked = np.zeros(count, bool), np.ones(count, bool), edge > 0
+    for _ in range(_ROUNDS):
+        start, end, price = first[linked], second[linked], edge[linked]
+        # more than is saved if all that follow it take it too; less than is lost if none before it does
+        keep = is_open & (own > _summed(start, price, count))
+        take = is_open & (own + _summed(end, price, count) <= 0)
+        if not (keep | take).any():
+            break
+        takes |= take
+        is_open &= ~(keep | take)
+        own += _summed(end[keep[start]], price[keep[start]], count)
+        own -= _summed(start[take[end]], price[take[end]], count)
+        linked[linked] = is_open[start] & is_open[end]
+    return takes, is_open, own, linked

@@ -9,8 +9,9 @@ seen through bars, and how much would be torn beside.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import cache
 from typing import TypeVar
 
 import numpy as np
@@ -52,7 +53,10 @@ def mend(
     if images[0].wraps or min(height, width) < 2 * CELL:
         return flows
     features = flow.finest_features(device, images, parameters)
-    shown = fusion.structure(features.get())
+
+    @cache
+    def shown() -> Structure:
+        return fusion.structure(features.get())
 
     def candidate(both: Values) -> Candidate:
         return Candidate(both, flow.misfit(device, features, device.upload(both), images[0].grid, parameters))
@@ -72,7 +76,7 @@ def mend(
         tried.add(carried.key)
         there, back = carried.flows(found.flows)
         other = candidate(solved(_LEVEL, _coarser(there), _coarser(back)))
-        taken = fusion.fused(shown, found, other, carried.may)
+        taken = fusion.fused(shown(), found, other, carried.may)
         if taken.any():
             changed |= taken
             found = candidate(_where(taken, other.flows, found.flows))
@@ -157,15 +161,15 @@ def _pixels(cells: Values, height: int, width: int) -> Values:
     return np.stack([weights[0] @ cells[..., k] @ weights[1].T for k in (0, 1)], -1)
 
 
-def _carried(shown: Structure, found: Candidate) -> Iterator[_Carried]:
+def _carried(shown: Callable[[], Structure], found: Candidate) -> Iterator[_Carried]:
     """The flow of parts of the first image, carried on into those torn from them, the most torn first."""
     flows, trusted, part = _parts(found)
-    if not trusted.any():
+    if np.unique(part[trusted]).size < 2:  # as in most pairs: nothing else needs to be known of them
         return
     nearest = scipy.ndimage.distance_transform_edt(~trusted, return_distances=False, return_indices=True)
     flows, part = flows[tuple(nearest)], part[tuple(nearest)]
     torn: dict[tuple[int, int], float] = {}
-    for crossing, axis in ((shown.down[0], 0), (shown.right[0], 1)):
+    for crossing, axis in ((shown().down[0], 0), (shown().right[0], 1)):
         one, other = _beside(part, axis)
         apart = one != other
         lost = (crossing * fusion.jump(*_beside(flows, axis)))[apart]

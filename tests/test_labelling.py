@@ -127,3 +127,31 @@ def test_cuts_are_moved_within_the_band(monkeypatch: pytest.MonkeyPatch) -> None
     found = least(graph)
     assert np.array_equal(found, graph.columns > 18)  # blocks are cut between odd and even columns
     assert (found != start).mean() > 0.05
+
+
+@settings(max_examples=200)
+@given(st.integers(1, 8), st.integers(0, 24), st.integers(0, 2**32 - 1))
+def test_takes_all_that_may_take_a_label(nodes: int, links: int, seed: int) -> None:
+    """Links have a direction, as in fusion.py; of equally good sets the one with all nodes of the others."""
+    rng = np.random.default_rng(seed)
+    first, second = rng.integers(0, nodes, (2, links))
+    edge, own = rng.integers(0, 6, links).astype(float), rng.integers(-7, 8, nodes).astype(float)
+    must = rng.random(nodes) < 0.1
+    sets = (np.arange(2**nodes)[:, None] >> np.arange(nodes)) & 1 == 1
+    sets = sets[(sets | ~must).all(1)]
+    price = (sets * own).sum(1) + (edge * (~sets[:, first] & sets[:, second])).sum(1)
+    expected = sets[price == price.min()].any(0)
+    assert np.array_equal(labelling.taking(first, second, edge, own, must), expected)
+
+
+def test_most_labels_are_certain_without_a_cut() -> None:
+    """Prices differ by more than links cost but beside a border, as where textures differ."""
+    side = 60
+    graph = grid_graph(side, side, 2, np.random.default_rng(5))
+    own = np.where(graph.columns < side // 2, 9.0, -9.0)
+    own[np.abs(graph.columns - side // 2) < 3] = 0.1
+    takes, is_open, _, linked = labelling._settled(graph.first, graph.second, graph.cut, own)
+    assert np.count_nonzero(is_open) < 6 * side
+    assert np.count_nonzero(linked) < 12 * side
+    assert not takes[graph.columns < side // 2 - 3].any()
+    assert takes[graph.columns >= side // 2 + 3].all()
