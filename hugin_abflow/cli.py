@@ -95,8 +95,8 @@ _question = partial(_information, is_flag=True, is_eager=True, expose_value=Fals
 @_result(
     "--no-metadata/--metadata",
     is_flag=True,
-    help="Write no camera, date and place of the first photo, and nothing that tells viewers of 360-degree "
-    "panoramas how to show it.",
+    help="Write no camera, date, place, title, authors, rights and keywords of the first photo, and nothing "
+    "that tells viewers of 360-degree panoramas how to show it.",
 )
 @_layers(
     "--prefix",

@@ -1,4 +1,4 @@
-"""EXIF and XMP in image files: read from photos, put into panoramas.
+"""EXIF, XMP and IPTC in image files: read from photos, and EXIF and XMP put into panoramas.
 
 Both are put into a file that is whole otherwise, by writing at its end (TIFF) or by moving what follows
 (JPEG, PNG); no pixel is decoded, and no other program is needed. Formats: CIPA DC-008 (Exif 2.32), Adobe's
@@ -24,10 +24,14 @@ from hugin_abflow.tifftags import ASCII, EXIF, GPS, MAIN, SHORT, UNDEFINED, Dire
 _log = logging.getLogger(__name__)
 
 SOFTWARE = 305
-XMP_TAG = 700  # of TIFF
+XMP_TAG, _IPTC_TAG, _PHOTOSHOP_TAG = 700, 33723, 34377  # of TIFF
 _EXPOSURE_TIME = 33434
 _PNG = b"\x89PNG\r\n\x1a\n"
 _EXIF_MARK, _XMP_MARK = b"Exif\0\0", b"http://ns.adobe.com/xap/1.0/\0"  # of JPEG's APP1
+_PHOTOSHOP_MARK = b"Photoshop 3.0\0"  # of JPEG's APP13
+_XMP_KEY = b"XML:com.adobe.xmp\0"  # of PNG's iTXt
+_IPTC = 0x0404  # among Photoshop's blocks
+_MOST_XMP = 8 << 20  # bytes that are read of it: with an editor's brushes it is long
 _LONGEST = 65533  # bytes of a JPEG segment
 _BLOCK = 16 << 20  # bytes that are moved at a time
 _NOT_IN_TIFF = (40962, 40963)  # PixelXDimension, PixelYDimension
@@ -74,6 +78,14 @@ class Metadata:
                     pairs = zip(parts[::2], parts[1::2], strict=True)
                     found[names[tag]] = tuple(top / (bottom or 1) for top, bottom in pairs)
         return found
+
+
+@dataclass(frozen=True)
+class Packets:
+    """What a photo has beside EXIF: an XMP packet, and an IPTC-IIM block; empty: none."""
+
+    xmp: bytes = b""
+    iptc: bytes = b""
 
 
 def text(content: str) -> Value:
@@ -128,6 +140,23 @@ def read_exif(path: Path) -> dict[int, dict[int, Value]]:
         return {}
 
 
+def read_packets(path: Path) -> Packets:
+    """XMP and IPTC of a JPEG, TIFF or PNG file; none where there are none, or none that can be read."""
+    try:
+        with path.open("rb") as file:
+            mark = file.read(8)
+            if mark[:2] == jpeg.START:
+                return _packets_of_jpeg(file)
+            if mark == _PNG:
+                return Packets(_xmp_of_png(file))
+            file.seek(0)
+            tags = tifftags.read_long(file, (XMP_TAG, _IPTC_TAG, _PHOTOSHOP_TAG), _MOST_XMP)
+            iptc = tags.get(_IPTC_TAG) or _iptc_of_photoshop(tags.get(_PHOTOSHOP_TAG, b""))
+            return Packets(tags.get(XMP_TAG, b""), iptc)
+    except (OSError, struct.error, OverflowError, ValueError, IndexError, zlib.error):
+        return Packets()
+
+
 def software(found: Directories) -> str:
     """The program that has saved a file, as its tags say; empty where they do not."""
     return text_of(found.get(MAIN, {}).get(SOFTWARE, text("")))
@@ -172,6 +201,47 @@ def _find_in_png(file: BinaryIO, wanted: bytes = b"eXIf") -> bytes:
         if kind == wanted:
             return file.read(length)
         file.seek(length + 4, SEEK_CUR)
+    return b""
+
+
+def _packets_of_jpeg(file: BinaryIO) -> Packets:
+    """Without the parts of XMP that do not fit into its segment: thumbnails, and an editor's brushes."""
+    xmp, photoshop = b"", b""
+    for kind, content in jpeg.segments(file):
+        if kind == jpeg.APP1 and content.startswith(_XMP_MARK):
+            xmp = xmp or content[len(_XMP_MARK) :]
+        elif kind == jpeg.APP13 and content.startswith(_PHOTOSHOP_MARK):
+            photoshop += content[len(_PHOTOSHOP_MARK) :]  # one block may go on in the next segment
+    return Packets(xmp, _iptc_of_photoshop(photoshop))
+
+
+def _iptc_of_photoshop(blocks: bytes) -> bytes:
+    """The IPTC block among those that Photoshop writes one behind the other."""
+    at = 0
+    while blocks[at : at + 4] == b"8BIM" and at + 12 <= len(blocks):
+        (number,) = struct.unpack_from(">H", blocks, at + 4)
+        start = at + 6 + (blocks[at + 6] + 2 & ~1)  # behind a name, with its length of even size
+        (length,) = struct.unpack_from(">I", blocks, start)
+        if number == _IPTC:
+            return blocks[start + 4 : start + 4 + length]
+        at = start + 4 + (length + 1 & ~1)
+    return b""
+
+
+def _xmp_of_png(file: BinaryIO) -> bytes:
+    """Before or behind the pixels."""
+    file.seek(len(_PNG))
+    while head := file.read(8):
+        length, kind = struct.unpack(">I4s", head)
+        if kind == b"iTXt" and length <= _MOST_XMP:
+            content = file.read(length)
+            if content.startswith(_XMP_KEY):
+                is_packed = content[len(_XMP_KEY)]
+                packet = content[len(_XMP_KEY) + 2 :].split(b"\0", 2)[2]  # behind languages
+                return zlib.decompressobj().decompress(packet, _MOST_XMP) if is_packed else packet
+            file.seek(4, SEEK_CUR)
+        else:
+            file.seek(length + 4, SEEK_CUR)
     return b""
 
 

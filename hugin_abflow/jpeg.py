@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import BinaryIO
 
 START = b"\xff\xd8"  # of a file
-APP0, APP1 = 0xE0, 0xE1
+APP0, APP1, APP13 = 0xE0, 0xE1, 0xED
 _SCAN, _END = 0xDA, 0xD9
 # Any mark but restarts, which lie within what is coded.
 _MARK = re.compile(rb"\xff([^\x00\xff\xd0-\xd7])", re.DOTALL)

@@ -1,15 +1,26 @@
-"""What a panorama's file says of it: camera, date and place of its first photo, and what viewers need."""
+"""What a panorama's file says of it: camera, date, place, title of its first photo, and what viewers need."""
 
 from __future__ import annotations
 
 import logging
 import math
+import re
 from collections.abc import Callable
 from importlib import metadata as packages
 from pathlib import Path
 
-from hugin_abflow import pto
-from hugin_abflow.exif import SOFTWARE, Metadata, comment, comment_of, is_ours, read_exif, software, text
+from hugin_abflow import caption, pto
+from hugin_abflow.exif import (
+    SOFTWARE,
+    Metadata,
+    comment,
+    comment_of,
+    is_ours,
+    read_exif,
+    read_packets,
+    software,
+    text,
+)
 from hugin_abflow.layer import Canvas
 from hugin_abflow.oneline import one_line
 from hugin_abflow.project import Plan
@@ -47,6 +58,22 @@ _COPIED = {
         *(42034, 42035, 42036, 42037),  # LensSpecification, LensMake, LensModel, LensSerialNumber
     ),
 }
+# What stands for it in XMP, where a program has left no EXIF; IPTC has become XMP by then.
+_IN_XMP: dict[int, dict[int, tuple[tuple[str, str], ...]]] = {
+    MAIN: {
+        270: ((caption.TIFF, "ImageDescription"), (caption.DC, "description")),
+        271: ((caption.TIFF, "Make"),),
+        272: ((caption.TIFF, "Model"),),
+        315: ((caption.TIFF, "Artist"), (caption.DC, "creator")),
+        33432: ((caption.TIFF, "Copyright"), (caption.DC, "rights")),
+    },
+    EXIF: {
+        36867: ((caption.EXIF, "DateTimeOriginal"), (caption.PHOTOSHOP, "DateCreated")),
+        36868: ((caption.EXIF, "DateTimeDigitized"), (caption.XMP, "CreateDate")),
+    },
+}
+_DATES = (36867, 36868)
+_DATE = re.compile(r"(\d{4})-(\d\d)-(\d\d)T(\d\d:\d\d)(:\d\d)?")
 
 # Vertical field of view, in degrees, from the horizontal one and height / width; by the p-line's f.
 _VERTICAL: dict[int, Callable[[float, float], float]] = {
@@ -62,12 +89,14 @@ _XMP = """\
 <?xpacket begin="\ufeff" id="W5M0MpCehiHzreSzNTczkc9d"?>
 <x:xmpmeta xmlns:x="adobe:ns:meta/">
  <rdf:RDF xmlns:rdf="http://www.w3.org/1999/02/22-rdf-syntax-ns#">
-  <rdf:Description rdf:about="" xmlns:GPano="http://ns.google.com/photos/1.0/panorama/">
 {}
-  </rdf:Description>
  </rdf:RDF>
 </x:xmpmeta>
 <?xpacket end="w"?>"""
+_GPANO = """\
+  <rdf:Description rdf:about="" xmlns:GPano="http://ns.google.com/photos/1.0/panorama/">
+{}
+  </rdf:Description>"""
 
 
 def version() -> str:
@@ -81,20 +110,26 @@ def version() -> str:
 def describe(plan: Plan) -> Metadata:
     """The metadata of a project's panorama, as Hugin has exiftool write them, but for what is said above.
 
-    EXIF of the first active photo, Software, and a UserComment that goes on from the photo's; GPano (Google's
-    Photo Sphere XMP) where the panorama is equirectangular. A photo that is not there or tells nothing leaves
+    EXIF of the first active photo, Software, and a UserComment that goes on from the photo's; what people say
+    of it in XMP and IPTC, which Hugin loses (see `caption`); GPano (Google's Photo Sphere XMP) where the
+    panorama is equirectangular. A photo that is not there or tells nothing leaves
     only what the project tells. Raises `pto.PtoError` as `pto.load` does.
     """
     photo = plan.images[0].photo
-    found = read_exif(photo)
+    found = read_exif(photo) if is_file(photo) else {}
+    said_in_xmp = caption.read_caption(photo, read_packets(photo)) if is_file(photo) else {}
     if not found and is_file(photo):
         _log.info("%s: no EXIF to copy into the panorama", photo)
     chosen = {
         directory: {tag: found[directory][tag] for tag in tags if tag in found.get(directory, {})}
         for directory, tags in _COPIED.items()
     }
+    for directory, tags in _IN_XMP.items():
+        told = {tag: _from_xmp(said_in_xmp, tag, names) for tag, names in tags.items()}
+        chosen[directory] = {tag: text(said) for tag, said in told.items() if said} | chosen[directory]
     chosen[MAIN][SOFTWARE] = text(f"{PROGRAM} {version()}")
     said = comment_of(found.get(EXIF, {}).get(_USER_COMMENT))
+    said = said or caption.plain(said_in_xmp.get(f"{{{caption.EXIF}}}UserComment"))
     chosen[EXIF][_USER_COMMENT] = comment("\n".join([said] * bool(said) + summary(plan)))
     chosen[MAIN] |= _RESOLUTION
     chosen[EXIF] |= _VERSIONS | {
@@ -102,7 +137,21 @@ def describe(plan: Plan) -> Metadata:
         for tag, size in zip(_SIZE, (plan.canvas.crop.width, plan.canvas.crop.height), strict=True)
     }
     chosen[GPS] = dict(found.get(GPS, {}))
-    return Metadata(chosen, gpano(plan.canvas, len(plan.images)))
+    copied = caption.packed(caption.to_copy(said_in_xmp, place=not chosen[GPS]))
+    parts = [part for part in (gpano(plan.canvas, len(plan.images)), copied) if part]
+    return Metadata(chosen, _XMP.format("\n".join(parts)).encode() if parts else b"")
+
+
+def _from_xmp(said: caption.Properties, tag: int, names: tuple[tuple[str, str], ...]) -> str:
+    """What EXIF's tag would hold, by the first name of XMP's that tells it; empty if none does."""
+    for namespace, name in names:
+        content = caption.plain(said.get(f"{{{namespace}}}{name}"))
+        if tag in _DATES:
+            date = _DATE.match(content)
+            content = f"{date[1]}:{date[2]}:{date[3]} {date[4]}{date[5] or ':00'}" if date else ""
+        if content:
+            return content
+    return ""
 
 
 def saved_by(path: Path) -> str:
@@ -125,8 +174,8 @@ def summary(plan: Plan) -> list[str]:
     return [f"Projection: {name} ({number})", f"FOV: {view}", f"Ev: {panorama.exposure:.2f}"]
 
 
-def gpano(canvas: Canvas, photos: int) -> bytes:
-    """The XMP packet that makes viewers show the canvas's crop as (a part of) a sphere; empty if it is none.
+def gpano(canvas: Canvas, photos: int) -> str:
+    """What in XMP makes viewers show the canvas's crop as (a part of) a sphere; empty if it is none.
 
     photos      that it was made of.
 
@@ -134,7 +183,7 @@ def gpano(canvas: Canvas, photos: int) -> bytes:
     lies in its middle. The view begins straight ahead if that is shown, else in the middle of what is shown.
     """
     if not canvas.spherical or canvas.hfov <= 0:
-        return b""
+        return ""
     scale, crop = canvas.width / canvas.hfov, canvas.crop  # px per degree
     width, height = round(360 * scale), round(180 * scale)
     left = crop.left + (width - canvas.width) // 2
@@ -144,7 +193,7 @@ def gpano(canvas: Canvas, photos: int) -> bytes:
             "the panorama reaches beyond the poles: viewers cannot be told to show it as a sphere; "
             "crop it in Hugin"
         )
-        return b""
+        return ""
     heading = _first_view(left, left + crop.width, width / 2) / scale
     pitch = -_first_view(top, top + crop.height, height / 2) / scale
     values = {
@@ -163,7 +212,7 @@ def gpano(canvas: Canvas, photos: int) -> bytes:
         "InitialViewRollDegrees": 0,
     }
     lines = (f"   <GPano:{name}>{value}</GPano:{name}>" for name, value in values.items())
-    return _XMP.format("\n".join(lines)).encode()
+    return _GPANO.format("\n".join(lines))
 
 
 def _first_view(low: int, high: int, ahead: float) -> float:

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import io
 import struct
-from collections.abc import Iterator, Mapping
+from collections.abc import Container, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import BinaryIO
@@ -139,6 +139,17 @@ def read_directories(file: BinaryIO) -> dict[int, dict[int, Value]]:
     return found
 
 
+def read_long(file: BinaryIO, tags: Container[int], most: int) -> dict[int, bytes]:
+    """What some tags of the first page hold, of up to `most` bytes, as it is in the file.
+
+    Raises `struct.error` for what is no TIFF.
+    """
+    layout, start = _read_header(file)
+    entries = _entries(file, layout, start)[0]
+    found = {tag: _content(file, layout, entry, most) for tag, entry in entries.items() if tag in tags}
+    return {tag: data for tag, data in found.items() if data}
+
+
 def add_directories(path: Path, added: Directories) -> None:
     """Put tags into the first page, in place of those of the same numbers; EXIF's and GPS's are replaced."""
     with path.open("r+b") as file:
@@ -253,19 +264,26 @@ def _values(file: BinaryIO, layout: _Layout, start: int) -> dict[int, Value]:
     """The values of one directory, but for very long ones."""
     values: dict[int, Value] = {}
     for tag, entry in _entries(file, layout, start)[0].items():
-        _, kind, count = struct.unpack_from(layout.head, entry)
-        length = count * _SIZES.get(kind, 0)
-        if not 0 < length <= _LONGEST:
-            continue
-        data = entry[-layout.inline :][:length]
-        if length > layout.inline:
-            file.seek(struct.unpack(layout.offset, entry[-layout.inline :])[0])
-            data = file.read(length)
-        if len(data) == length:
+        data = _content(file, layout, entry, _LONGEST)
+        if data:
+            _, kind, _ = struct.unpack_from(layout.head, entry)
             if layout.order == ">":
                 data = np.frombuffer(data, f">u{_SWAPPED[kind]}").byteswap().tobytes()
             values[tag] = Value(kind, data)
     return values
+
+
+def _content(file: BinaryIO, layout: _Layout, entry: bytes, most: int) -> bytes:
+    """What an entry holds, as it is in the file; empty if that is longer than `most`, or cut."""
+    _, kind, count = struct.unpack_from(layout.head, entry)
+    length = count * _SIZES.get(kind, 0)
+    if not 0 < length <= most:
+        return b""
+    data = entry[-layout.inline :][:length]
+    if length > layout.inline:
+        file.seek(struct.unpack(layout.offset, entry[-layout.inline :])[0])
+        data = file.read(length)
+    return data if len(data) == length else b""
 
 
 def _numbers(file: BinaryIO, layout: _Layout, start: int) -> dict[int, float]:

@@ -61,7 +61,7 @@ def shot(exiftool: str, project: Path, photo: str = "photo 0.tif") -> Path:
 
 def values(canvas: Canvas, photos: int = 3) -> dict[str, str]:
     """What the XMP packet says."""
-    packet = gpano(canvas, photos)
+    packet = f'<x xmlns:rdf="urn:rdf">{gpano(canvas, photos)}</x>'
     return {
         e.tag.removeprefix(GPANO): e.text for e in ElementTree.fromstring(packet).iter() if GPANO in e.tag
     }
@@ -117,9 +117,9 @@ def test_parts_of_a_sphere(
 
 
 def test_what_is_no_sphere_or_reaches_beyond_its_poles(caplog: pytest.LogCaptureFixture) -> None:
-    assert gpano(Canvas.plane(800, 400, wraps=True), 1) == b"" and not caplog.text
-    assert gpano(Canvas.sphere(800, 500), 1) == b"" and "beyond the poles" in caplog.text
-    assert gpano(replace(Canvas.sphere(800, 500), crop=Box(0, 50, 800, 450)), 1) != b""
+    assert gpano(Canvas.plane(800, 400, wraps=True), 1) == "" and not caplog.text
+    assert gpano(Canvas.sphere(800, 500), 1) == "" and "beyond the poles" in caplog.text
+    assert gpano(replace(Canvas.sphere(800, 500), crop=Box(0, 50, 800, 450)), 1) != ""
 
 
 def test_summary_of_a_projection_whose_height_we_do_not_know(make_project: ProjectMaker) -> None:
