@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import os
+import unicodedata
 from collections.abc import Hashable, Iterable
 from dataclasses import dataclass
 from pathlib import Path, PureWindowsPath
@@ -183,7 +184,8 @@ def locate_photo(folder: Path, name: str) -> Path:
     """Where a photo is: relative to the project's folder unless absolute, as in Hugin.
 
     What is not there is also looked for with Windows' separators and, as Hugin's GUI does for moved
-    projects, under its bare name beside the project. If nothing exists: where Hugin expects it.
+    projects, under its bare name beside the project; then at these places under a name that Windows or macOS
+    takes for the same (see `_alike`). If nothing exists: where Hugin expects it.
     """
     expected = folder / name
     windows = PureWindowsPath(name)
@@ -192,7 +194,36 @@ def locate_photo(folder: Path, name: str) -> Path:
     for candidate in (expected, moved, bare):
         if is_file(candidate):
             return candidate
+    for candidate in dict.fromkeys((expected, moved, bare)):
+        alike = _alike(candidate)
+        if alike and is_file(alike):
+            return alike
     return expected
+
+
+def _alike(path: Path) -> Path | None:
+    """What differs from a path by case, or by how accents are coded, alone; none if several do, or nothing.
+
+    Projects come from where such names are one, and photos from cards, whose names some systems show in
+    small letters.
+    """
+    found = Path(path.anchor)
+    for part in path.parts[1:] if path.anchor else path.parts:
+        if os.path.lexists(found / part):
+            found /= part
+            continue
+        try:
+            others = [name for name in os.listdir(found) if _folded(name) == _folded(part)]  # noqa: PTH208
+        except (OSError, ValueError):
+            return None
+        if len(others) != 1:
+            return None
+        found /= others[0]
+    return found
+
+
+def _folded(name: str) -> str:
+    return unicodedata.normalize("NFC", name).casefold()
 
 
 def _canvas(file: Path, panorama: pto.Panorama) -> Canvas:

@@ -106,9 +106,14 @@ def _script(
     becomes of files that are there: of `results`, which are made, and of those that are left.
     """
     crop, canvas = plan.canvas.crop, plan.canvas
+    moved = [image for image in plan.images if image.photo != plan.folder / image.name]
     said = [
         f"{plan.file.name}: {len(plan.images)} photos, {plan.projection}, "
         f"{crop.width} x {crop.height} of {canvas.width} x {canvas.height}",
+        *(
+            f"{image.name} is {image.photo}, which nona does not find alone: save the project anew in Hugin"
+            for image in moved
+        ),
         *(f"{file.name} is there, and replaced" for file in results if is_file(file)),
         *(f"{file.name} is left as it is (--force: made anew)" for file in leave),
     ]

@@ -226,3 +226,13 @@ def test_nona_is_missed_where_layers_have_to_be_made(
     for run in (stitch_project, show_project):
         with pytest.raises(NonaMissingError, match=r"nona is not in PATH; .* or name layers"):
             run(project, remap="always")
+
+
+def test_photos_that_nona_does_not_find_are_named(make_project: ProjectMaker, nona: str) -> None:
+    """The run finds them: the project may come from Windows."""
+    project = make_project(panorama=CANVAS, stem="pano")
+    assert not [line for line in show_project(project) if "nona does not find" in line]
+    found = (project.parent / "photo 1.tif").rename(project.parent / "PHOTO 1.tif")
+    (line,) = [line for line in show_project(project) if "nona does not find" in line]
+    assert line.startswith(f"# photo 1.tif is {found}, which ")
+    assert stitch_project(project)
