@@ -185,7 +185,8 @@ def locate_photo(folder: Path, name: str) -> Path:
 
     What is not there is also looked for with Windows' separators and, as Hugin's GUI does for moved
     projects, under its bare name beside the project; then at these places under a name that Windows or macOS
-    takes for the same (see `_alike`). If nothing exists: where Hugin expects it.
+    takes for the same (see `_alike`). If nothing exists: where Hugin expects it, beside the project if that
+    is a place on Windows.
     """
     expected = folder / name
     windows = PureWindowsPath(name)
@@ -198,7 +199,7 @@ def locate_photo(folder: Path, name: str) -> Path:
         alike = _alike(candidate)
         if alike and is_file(alike):
             return alike
-    return expected
+    return bare if windows.drive and not Path(name).is_absolute() else expected
 
 
 def _alike(path: Path) -> Path | None:

@@ -246,6 +246,9 @@ def test_photos_are_found_where_hugin_looks(tmp_path):
     assert locate_photo(tmp_path, "/home/me/a.jpg") == tmp_path / "a.jpg"
     assert locate_photo(tmp_path, "/home/me/none.jpg") == Path("/home/me/none.jpg")
     assert locate_photo(tmp_path, "none.jpg") == tmp_path / "none.jpg"
+    assert locate_photo(tmp_path, r"..\none.jpg").name == r"..\none.jpg"
+    if os.name != "nt":  # to be put there
+        assert locate_photo(tmp_path, r"C:\Users\me\none.jpg") == tmp_path / "none.jpg"
 
 
 def test_photos_whose_names_another_system_takes_for_the_same(tmp_path):

@@ -128,7 +128,10 @@ def asked(row: Workflow, make_project: ProjectMaker, exiftool: str) -> Path:
         project.write_text(
             f"{project.read_text()}#hugin_enblendOptions --parameter=abflow-project={project}\n"
         )
-    return shot(exiftool, project, row.project.get("photo", "photo {}.tif").format(0))
+    photo = row.project.get("photo", "photo {}.tif").format(0)
+    title = [exiftool, "-q", "-overwrite_original", "-XMP-dc:Title=quay", str(project.parent / photo)]
+    subprocess.run(title, check=True)
+    return shot(exiftool, project, photo)
 
 
 def run(row: Workflow, hugin: Hugin, project: Path) -> tuple[Path, list[Path]]:
@@ -186,6 +189,9 @@ def test_workflow(name: str, hugin: Hugin, exiftool: str, make_project: ProjectM
         assert shown.count(f" {tag} ") <= 1, tag
     tags = metadata(exiftool, panorama)
     assert tags.get("Model") == ("Box" if row.camera else None)
+    # Hugin copies none, our sequences do
+    titled = (row.knows or row.command.startswith("sequence")) and panorama.suffix != ".exr"
+    assert tags.get("Title") == ("quay" if titled else None)
     if row.gpano is None:
         assert "ProjectionType" not in tags
     else:
