@@ -157,7 +157,10 @@ def _depth(target: Path, layer: Layer, wanted: npt.DTypeLike | None) -> np.dtype
     # unless somebody asks for samples, fewer bits are what the type of file is chosen for
     narrowed = wanted is not None and depth.itemsize > most.itemsize
     if narrowed or (kind == "openexr" and depth.kind != "f"):
-        _log.warning("%s: %s holds no %s samples; they are written as %s", target, name, depth, most)
+        coded = (
+            "" if depth.kind == "f" else ", as the photos code them: EXR is shown as if it were linear light"
+        )
+        _log.warning("%s: %s holds no %s samples; they are written as %s%s", target, name, depth, most, coded)
         return most
     return depth
 

@@ -149,7 +149,7 @@ def read_plan(path: Path | str) -> Plan:
         )
     project = pto.load(file)
     names = [image.filename for image in project.images]
-    photos = tuple(locate_photo(file.parent, name) for name in names)
+    photos = tuple(_photo_of(file, name) for name in names)
     images = tuple(
         PlannedImage(image.index, image.filename, photo)
         for image, photo in zip(project.images, photos, strict=True)
@@ -178,6 +178,15 @@ def warn_of_doubts(plan: Plan) -> None:
     others = len(plan.doubts) - _DOUBTS_SHOWN
     if others > 0:
         _log.warning("%s: %d more such lines are left out", plan.file, others)
+
+
+def _photo_of(file: Path, name: str) -> Path:
+    """Where a photo of a project is: as `locate_photo` has it, also beside the file that a link leads to."""
+    photo = locate_photo(file.parent, name)
+    if file.is_symlink() and not is_file(photo):
+        other = locate_photo(Path(os.path.realpath(file)).parent, name)
+        return other if is_file(other) else photo
+    return photo
 
 
 def locate_photo(folder: Path, name: str) -> Path:

@@ -270,6 +270,22 @@ def test_photos_whose_names_another_system_takes_for_the_same(tmp_path):
     assert locate_photo(folder, "a\0.jpg") == folder / "a\0.jpg"
 
 
+def test_photos_lie_beside_the_project_that_a_link_leads_to(make_project, tmp_path):
+    project = make_project(stem="pano")
+    (tmp_path / "links").mkdir()
+    link = tmp_path / "links" / "linked.pto"
+    try:
+        link.symlink_to(project)
+    except OSError:
+        pytest.skip("this system does not let us make links")
+    assert read_plan(link).photos == read_plan(project).photos
+    nearer = link.with_name("photo 1.tif")
+    nearer.touch()
+    assert read_plan(link).photos[1] == nearer  # there Hugin finds it
+    (project.parent / "photo 0.tif").unlink()
+    assert read_plan(link).photos[0] == link.with_name("photo 0.tif")
+
+
 def test_a_backslash_may_be_part_of_a_name(tmp_path):
     try:
         (tmp_path / "a\\b.jpg").touch()
