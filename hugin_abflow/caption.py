@@ -132,10 +132,13 @@ def _is_wanted(name: str) -> bool:
 
 def _of_xmp(packet: bytes) -> Properties:
     """The properties of a packet. Raises `ElementTree.ParseError` and others for what is none."""
-    if b"<!DOCTYPE" in packet or b"<!ENTITY" in packet:
+    content = packet.strip(b"\0 \r\n\t")
+    if b"\0" in content:  # nor would the next line find anything in UTF-16
+        raise ValueError("it is not in UTF-8")
+    if b"<!DOCTYPE" in content or b"<!ENTITY" in content:
         raise ValueError("it defines entities, which XMP does not have")
     found: Properties = {}
-    for description in ElementTree.fromstring(packet.strip(b"\0 \r\n\t")).iter(f"{_RDF}Description"):
+    for description in ElementTree.fromstring(content).iter(f"{_RDF}Description"):
         if f"{_RDF}about" not in description.keys() and "about" not in description.keys():  # noqa: SIM118
             continue  # a value within a property
         for name, value in description.items():  # the short form of simple properties

@@ -165,6 +165,7 @@ def test_short_form_and_packed_text_of_png(exiftool: str, tmp_path: Path) -> Non
         b"no XML",
         b"<a>",
         b'<!DOCTYPE a [<!ENTITY b "c">]>' + packet("<dc:title>&b;</dc:title>"),
+        packet("<dc:title>x</dc:title>").decode().encode("utf-16"),
         packet("<dc:title>" + "<dc:a>" * 100_000 + "</dc:a>" * 100_000 + "</dc:title>"),
     ],
 )
