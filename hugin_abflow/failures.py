@@ -16,15 +16,20 @@ from hugin_abflow.errors import (
     NonaFailedError,
     ProjectError,
 )
+from hugin_abflow.exif import read_exif
 from hugin_abflow.formats import foreign_format
 from hugin_abflow.images import image_size, read_layers
 from hugin_abflow.layer import other_canvas
 from hugin_abflow.programs import ending, last_lines
 from hugin_abflow.project import Plan, PlannedImage
 from hugin_abflow.targets import named_in_unicode
+from hugin_abflow.tifftags import MAIN
 
 # What libpng, libjpeg and OpenEXR say of a photo that they cannot decode to its end.
 _UNDECODED = re.compile(r"error in (?:png|jpeg)_\w+\(\)|Error reading pixel data")
+# What it says of a TIFF that it does not begin to read, before it says which it loads.
+_REFUSED = re.compile(r"^\s*TIFFDecoder: (.+)", re.MULTILINE)
+_TILE_WIDTH = 322
 # What it says of photos of two depths, or of grey ones beside coloured ones.
 _DIFFERENT = re.compile("uses [A-Z0-9]+ valued pixel, while|has [0-9] channels?, while")
 
@@ -32,7 +37,7 @@ _DIFFERENT = re.compile("uses [A-Z0-9]+ valued pixel, while|has [0-9] channels?,
 # whole.
 _LOSS = re.compile(
     r": Read error on |: Sample out of range"
-    r"|^(?:\w+Decode\w*|JPEGLib|TIFFReadScanline|TIFFRead\w+Strip|TIFFFillStrip): (?!Warning)"
+    r"|^(?:\w+Decode(?!r)\w*|JPEGLib|TIFFReadScanline|TIFFRead\w+Strip|TIFFFillStrip): (?!Warning)"
 )
 # Of these, what tells of sound photos, and what is wrong with them. Rows of channels that lie one after the
 # other (Photoshop's "per channel") nona asks for as channels, of which there are none.
@@ -78,6 +83,18 @@ def failure(
                 return ImageReadError(
                     f"{image.photo} is no image that can be read; copy it from the camera again"
                 )
+    if refused := _REFUSED.search(said):
+        if "tiled" in refused[1]:
+            for image in images:
+                if _TILE_WIDTH in read_exif(image.photo).get(MAIN, {}):
+                    return ImageReadError(
+                        f"{image.photo} is a TIFF in tiles, which Hugin does not read; save the project's "
+                        "photos without tiles, under the same names"
+                    )
+        return ImageReadError(
+            f"{plan.file} has a photo in TIFF of a kind that Hugin does not read ({refused[1].strip()}); "
+            "save its photos as plain TIFF of 8 or 16 bit, under the same names"
+        )
     loads = [line.removeprefix("loading ") for line in lines if line.startswith("loading ")]
     if loads and (line := next(filter(_UNDECODED.search, lines), None)):
         return _damaged(plan.folder / loads[-1], line)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import struct
 from dataclasses import replace
 
 import numpy as np
@@ -69,6 +70,21 @@ def test_photos_of_samples_that_no_layer_has(make_project, nona, dtype, keep):
     with pytest.raises(ImageReadError, match=said), open_layers(plan, keep_layers=keep):
         pass
     assert names_in(plan.folder) == before
+
+
+def test_tiff_that_nona_does_not_begin_to_read(make_project, nona):
+    """The photo is to blame, not the project, and is not damaged."""
+    plan = read_plan(make_project(yaws=(0, 60)))
+    tifffile.imwrite(plan.photos[1], photo_pixels(1), photometric="rgb", tile=(64, 64))
+    with pytest.raises(ImageReadError, match=f"^{plan.photos[1]} is a TIFF in tiles"), open_layers(plan):
+        pass
+    for photo in plan.photos:
+        tifffile.imwrite(photo, photo_pixels(1)[..., 0], photometric="minisblack")
+        bits = struct.pack("<HHIH", 258, 3, 1, 8), struct.pack("<HHIH", 258, 3, 1, 4)
+        photo.write_bytes(photo.read_bytes().replace(*bits))
+    said = f"^{plan.file} has a photo in TIFF of a kind that Hugin does not read"
+    with pytest.raises(ImageReadError, match=said), open_layers(plan):
+        pass
 
 
 def test_photos_that_nona_misreads(make_project, nona):
