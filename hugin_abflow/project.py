@@ -181,9 +181,12 @@ def warn_of_doubts(plan: Plan) -> None:
 
 
 def _photo_of(file: Path, name: str) -> Path:
-    """Where a photo of a project is: as `locate_photo` has it, also beside the file that a link leads to."""
+    """Where a photo of a project is: as `locate_photo` has it, also beside the file that a link leads to.
+
+    /dev/stdin is a link as well, but panoramas do not belong beside it.
+    """
     photo = locate_photo(file.parent, name)
-    if file.is_symlink() and not is_file(photo):
+    if file.suffix.lower() == ".pto" and file.is_symlink() and not is_file(photo):
         other = locate_photo(Path(os.path.realpath(file)).parent, name)
         return other if is_file(other) else photo
     return photo

@@ -279,6 +279,9 @@ def test_photos_lie_beside_the_project_that_a_link_leads_to(make_project, tmp_pa
     except OSError:
         pytest.skip("this system does not let us make links")
     assert read_plan(link).photos == read_plan(project).photos
+    unnamed = link.with_suffix("")  # as /dev/stdin is
+    unnamed.symlink_to(project)
+    assert read_plan(unnamed).photos[0] == link.with_name("photo 0.tif")
     nearer = link.with_name("photo 1.tif")
     nearer.touch()
     assert read_plan(link).photos[1] == nearer  # there Hugin finds it
