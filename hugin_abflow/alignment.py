@@ -18,6 +18,7 @@ from hugin_abflow import (
     coefficient,
     colour,
     geometry,
+    ghosts,
     highlights,
     intermediate,
     membrane,
@@ -210,10 +211,20 @@ def _cut_regions(
     reaches = _reaches(scene)
     regions = _find_regions(scene, gains, strict, single, settings)
     if regions.whole is None:
+        _sharpen(scene, regions)
         return Aligned(scene.fields, reaches, (early or gains.final(None)).result(), None, None)
     final = gains.final(regions.whole)
     unlike = _cut(scene, regions, regions.whole, single, clipped, extra, reaches, settings)
+    _sharpen(scene, regions)
     return Aligned(scene.fields, reaches, final.result(), regions.whole, unlike)
+
+
+def _sharpen(scene: Scene, regions: _Regions) -> None:
+    """Have layers change over quickly where they differ in fine detail, beside what is taken whole."""
+    device, layers, fields, grid = scene.device, scene.layers, scene.fields, scene.grid
+    if regions.residual.fine is not None:
+        fine, cells = regions.residual.fine, seam.seam_grid(grid)
+        ghosts.sharpen(device, layers, fields, fine, regions.whole, grid, cells)
 
 
 def _reaches(scene: Scene) -> list[list[float]]:

@@ -92,6 +92,8 @@ class Residuals:
     smooth_rms  of all frequencies, averaged as r is, for the outskirts of regions. None: t.
     unrelated   where any two show things that have nothing in common, though they may be as bright: trousers
                 and paving; but also what one shows less sharp. None: nowhere.
+    fine        of fine detail: t without the mean difference of the cell, of cells of which enough tells.
+                None: not measured.
     """
 
     mean: npt.NDArray[np.float64]
@@ -99,6 +101,7 @@ class Residuals:
     measured: Cells | None = None
     smooth_rms: npt.NDArray[np.float64] | None = None
     unrelated: Cells | None = None
+    fine: npt.NDArray[np.float64] | None = None
 
 
 @dataclass(frozen=True)

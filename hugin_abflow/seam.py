@@ -67,6 +67,8 @@ _DARKER = 0.05
 _CERTAINLY_DARKER = 0.1
 # More than anything is: where their exposures are not known well enough.
 _NEVER = 1e6
+# The share of a cell, neither clipped nor beyond borders, from which on it tells of fine detail.
+_TELLS = 0.75
 # What is left of a layer's weight where it yields: a pixel that no other layer can fill stays opaque.
 _TRACE = 1e-12
 # Bytes that `cut` takes for each cell of each layer: share, cover, and where it is torn; and more where
@@ -109,7 +111,7 @@ def residuals(
     single      cells that are to be taken from one layer in any case, whatever explains them.
     """
     cells = seam_grid(scene.grid)
-    mean, square, smooth_square = (np.zeros(cells.shape) for _ in range(3))
+    mean, square, smooth_square, fine = (np.zeros(cells.shape) for _ in range(4))
     measured, unrelated = (np.zeros(cells.shape, bool) for _ in range(2))
     limits = [clipping(layer) for layer in scene.layers]
     for its, found in _differences(scene, correction, cells, limits, known):
@@ -121,8 +123,10 @@ def residuals(
         square[its] = np.maximum(square[its], other * found[SQUARE])
         smooth_square[its] = np.maximum(smooth_square[its], other * smooth[SQUARE])
         measured[its] |= found[SHARE] > 0
+        varies = found[SQUARE] - np.square(np.abs(found[MEAN]).max(-1))
+        fine[its] = np.maximum(fine[its], np.where(found[SHARE] > _TELLS, varies, 0))
         unrelated[its] |= other & comparison.unrelated(smooth, cells)
-    return Residuals(mean, np.sqrt(square), measured, np.sqrt(smooth_square), unrelated)
+    return Residuals(mean, np.sqrt(square), measured, np.sqrt(smooth_square), unrelated, np.sqrt(fine))
 
 
 def clipping_prices(
