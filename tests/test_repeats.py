@@ -77,6 +77,18 @@ def test_what_is_not_torn_or_wraps_stays(device: Device) -> None:
     assert mended(device, levels(device, *bars, wraps=True), matched(TORN)) is None
 
 
+def test_structure_is_measured_only_where_flow_has_parts(
+    device: Device, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    measured, measure = [], fusion.structure
+    monkeypatch.setattr(fusion, "structure", lambda features: measured.append(1) or measure(features))
+    images = levels(device, railing(0), railing(SHIFT))
+    mended(device, images, matched(SHIFT))
+    assert not measured
+    mended(device, images, matched(TORN))
+    assert len(measured) == 1
+
+
 def test_what_moves_otherwise_and_does_not_repeat_stays(device: Device) -> None:
     """The lower half is of something near: flow jumps at its outline, and what is beside that is torn by no
     flow of the images."""
