@@ -33,15 +33,19 @@ _TILE_WIDTH = 322
 # What it says of photos of two depths, or of grey ones beside coloured ones.
 _DIFFERENT = re.compile("uses [A-Z0-9]+ valued pixel, while|has [0-9] channels?, while")
 
-# What libtiff says, but for warnings, of missing pixels in a photo, which nona remaps as if it were
-# whole.
+# What libtiff says, other than warnings, of pixels that it cannot give. nona remaps the photo as if it had
+# them, and ends with success.
 _LOSS = re.compile(
+    r"scanline decoding is not implemented|compression support is not configured|"
     r": Read error on |: Sample out of range"
     r"|^(?:\w+Decode(?!r)\w*|JPEGLib|TIFFReadScanline|TIFFRead\w+Strip|TIFFFillStrip): (?!Warning)"
 )
-# Of these, what tells of sound photos, and what is wrong with them. Rows of channels that lie one after the
-# other (Photoshop's "per channel") nona asks for as channels, of which there are none.
+# Where one of these is in such a line the photo is not damaged: what is the matter instead. (A planar photo,
+# Photoshop's "per channel", stores all of red, then all of green; nona asks for a channel that no row has.)
+_UNKNOWN = "is compressed in a way that Hugin does not know; save it with another compression, such as LZW"
 _MISREAD = {
+    "scanline decoding is not implemented": _UNKNOWN,
+    "compression support is not configured": _UNKNOWN,
     ": Sample out of range": "has its channels one after the other (planar), which Hugin misreads; save it "
     "with interleaved channels",
     "downsampled JPEG": "is compressed as JPEG in a way that Hugin misreads; save it with another "
@@ -120,38 +124,44 @@ def failure(
 
 
 def check_made(plan: Plan, made: dict[int, Path]) -> None:
-    """Raise `LayersMismatchError` if nona made layers for another canvas than the project's, and
-    `ImageReadError` if of photos whose samples it keeps, though no layer can have such, or takes for others.
+    """Look at layers that nona made with success, and may be of no use all the same.
 
-    made    its layers by images; all are of one kind, and made for one canvas.
+    made    layers by images; all have samples of one kind, and were made for one canvas.
+
+    Raises `LayersMismatchError` if that is another canvas than the project's; `ImageReadError` if samples are
+    of a kind that no layer may have (nona keeps that of photos), or nona took floats for whole numbers.
     """
-    for index, path in list(made.items())[:1]:
-        (photo,) = (image.photo for image in plan.images if image.index == index)
-        try:
-            layer = read_layers(path)[0]
-        except ImageReadError as error:
-            if image_size(path) is None:
-                raise
-            # the layer will go, and has what its photo has
-            raise ImageReadError(
-                f"{str(error).replace(str(path), str(photo))}; convert the photos of the project to one of "
-                "these, such as 16 bit, under the same names"
-            ) from None
-        if layer.dtype == np.uint16 and _has_half_floats(photo):
-            raise ImageReadError(
-                f"{photo} has 16 bit floats, which Hugin takes for whole numbers: far too dark; convert the "
-                "photos of the project to 16 bit whole numbers or 32 bit floats, under the same names"
-            )
-        if made_for := other_canvas(layer, plan.canvas):
-            raise LayersMismatchError(
-                f"{plan.file}: the canvas is {plan.canvas.width}x{plan.canvas.height}, of which Hugin makes "
-                f"{made_for}, since this projection shows no more; open the project in Hugin, which corrects "
-                "that, and save it"
-            )
+    if not made:
+        return
+    photos = {image.index: image.photo for image in plan.images}
+    index, path = next(iter(made.items()))
+    try:
+        layer = read_layers(path)[0]
+    except ImageReadError as error:
+        if image_size(path) is None:
+            raise
+        # the layer will go, and has what its photo has
+        raise ImageReadError(
+            f"{str(error).replace(str(path), str(photos[index]))}; convert the photos of the project to one "
+            "of these, such as 16 bit, under the same names"
+        ) from None
+    if layer.dtype == np.uint16:
+        for photo in (photos[index] for index in made):
+            if _has_half_floats(photo):
+                raise ImageReadError(
+                    f"{photo} has 16 bit floats, which Hugin takes for whole numbers: far too dark; convert "
+                    "the photos of the project to 16 bit whole numbers or 32 bit floats, under the same names"
+                )
+    if made_for := other_canvas(layer, plan.canvas):
+        raise LayersMismatchError(
+            f"{plan.file}: the canvas is {plan.canvas.width}x{plan.canvas.height}, of which Hugin makes "
+            f"{made_for}, since this projection shows no more; open the project in Hugin, which corrects "
+            "that, and save it"
+        )
 
 
 def _has_half_floats(photo: Path) -> bool:
-    """Whether a photo has; false where it cannot be opened here."""
+    """Whether the samples of a photo are 16 bit floats; false where it cannot be opened here."""
     try:
         return read_layers(photo)[0].dtype == np.float16
     except ImageReadError:

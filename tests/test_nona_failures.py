@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import struct
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -19,6 +20,7 @@ from hugin_abflow.errors import (
     OutputError,
     ProjectError,
 )
+from hugin_abflow.failures import loss
 from hugin_abflow.images import write_image
 from hugin_abflow.project import read_plan
 from hugin_abflow.supply import open_layers
@@ -104,10 +106,29 @@ def test_photos_that_nona_misreads(make_project, nona):
     with pytest.raises(ImageReadError, match=said), open_layers(plan):
         pass
     for number, photo in enumerate(plan.photos):
-        tifffile.imwrite(photo, (photo_pixels(number) / 255).astype(np.float16), photometric="rgb")
-    said = rf"^{plan.photos[0]} has 16 bit floats, .*; convert the photos of the project to 16 bit whole"
+        kind = (257 * photo_pixels(number).astype(np.uint16), (photo_pixels(number) / 255).astype(np.float16))
+        tifffile.imwrite(photo, kind[number], photometric="rgb")  # beside one that is read as it is
+    said = rf"^{plan.photos[1]} has 16 bit floats, .*; convert the photos of the project to 16 bit whole"
     with pytest.raises(ImageReadError, match=said), open_layers(plan):
         pass
+
+
+def test_photos_whose_compression_nona_does_not_know(make_project, nona):
+    """It ends with success as well: such as JPEG 2000 in TIFF, or JPEG XL."""
+    plan = read_plan(make_project(yaws=(0, 60)))
+    for number, photo in enumerate(plan.photos):
+        tifffile.imwrite(photo, photo_pixels(number), photometric="rgb")
+    none, jpeg_xl = (struct.pack("<HHIH", 259, 3, 1, scheme) for scheme in (1, 50002))
+    plan.photos[1].write_bytes(plan.photos[1].read_bytes().replace(none, jpeg_xl))
+    said = rf"^{plan.photos[1]} is compressed in a way that Hugin does not know; .* LZW, under the same name$"
+    with pytest.raises(ImageReadError, match=said), open_layers(plan):
+        pass
+
+
+def test_a_codec_that_nona_was_built_without_is_no_damage():
+    """As Zstandard's on some systems: libtiff names the file first."""
+    said = str(loss(Path("a.tif"), "a.tif: ZSTD compression support is not configured"))
+    assert said.startswith("a.tif is compressed in a way that Hugin does not know")
 
 
 @pytest.mark.parametrize("compression", ["lzw", "zlib", "lzma", "zstd"])
