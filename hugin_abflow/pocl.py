@@ -7,8 +7,8 @@ has no AVX-512, while PoCL loads its functions for AVX-512. They pass long vecto
 compiler does not end. Either device is given the name of another processor.
 
 **Code that is slow.** What PoCL 3.0 compiles for AVX-512 takes a third longer on Intel's processors than what
-it compiles for AVX2, for which these are named as well. Its functions stay those for AVX-512: kernels hand
-them no vector that is longer than AVX2's.
+it compiles for AVX2. So their devices are given the name of a processor with AVX2. PoCL still loads its
+functions for AVX-512; that is harmless, since kernels hand them no vector that is longer than AVX2's.
 
 **A home that cannot be written**, as in containers, and of services. PoCL keeps what it compiled there, and
 offers no device if it cannot; pyopencl fails as well. On a full disk, or one that no program may be run from,
@@ -28,6 +28,7 @@ import ctypes
 import logging
 import os
 import platform
+import re
 import stat
 import struct
 import sys
@@ -39,15 +40,20 @@ from pathlib import Path
 
 _log = logging.getLogger(__name__)
 
+# The processor's name in a version of PoCL's, behind LLVM's name of the system: "...-pc-linux-gnu-znver3". On
+# openSUSE that is "-linux-" alone, on Alpine "-linux-musl-".
+_NAME = re.compile(r"-linux(?:-(?:gnu|musl)\w*)?-(.+)$")
+
 # What LLVM calls processors that it may not know; programs for these use no AVX-512.
 _GUESSES = ("generic", "znver1", "znver2", "znver3")
 
-# Whose code for AVX-512 is slow, as CL_DRIVER_VERSION begins, and on whose processors. Others: not measured.
+# Code for AVX-512 is slow if CL_DRIVER_VERSION begins so, on processors of this maker. AMD's lose by AVX2;
+# others were not measured.
 _SLOW = "3.0"
 _SLOW_ON = "GenuineIntel"
 
-# PoCL's libraries of functions, and the processors for which they are compiled: which one is loaded depends
-# on the first feature alone, in the words of /proc/cpuinfo; programs may expect the others as well.
+# PoCL's libraries of functions. Of each: the feature, as /proc/cpuinfo calls it, by which alone PoCL chooses
+# it; the processor for which it was compiled; and what else programs for that processor may use.
 _PROCESSORS: tuple[tuple[str, str, Set[str]], ...] = (
     ("avx512f", "skylake-avx512", {"avx512bw", "avx512cd", "avx512dq", "avx512vl", "adx", "clflushopt"}),
     ("avx2", "haswell", {"sse4_2", "popcnt", "fma", "f16c", "bmi1", "bmi2", "abm", "movbe"}),
@@ -196,9 +202,12 @@ def name_processor(version: str, driver: str, record: int) -> None:
     Nothing happens on other systems than Linux on x86-64, on processors that can do less than AVX2, where the
     name will do, or if the record is not as expected: that programs do not build is told there.
     """
-    own = version.rpartition("-gnu-")[2]
-    if "pocl" not in version.lower() or sys.platform != "linux" or platform.machine() != "x86_64":
+    named = _NAME.search(version)
+    if not named or "pocl" not in version.lower():
         return
+    if sys.platform != "linux" or platform.machine() != "x86_64":
+        return
+    own = named[1]
     try:
         maker, features = _processor()
         slow = driver.startswith(_SLOW) and maker == _SLOW_ON
@@ -219,7 +228,7 @@ def _processor() -> tuple[str, Set[str]]:
 def _better(own: str, features: Set[str], slow: bool) -> str | None:
     """What to call a processor with these features, which PoCL calls `own`; None if that is to stay.
 
-    slow: code for AVX-512 is, so that it is taken for one that is like it otherwise.
+    slow: whether code for AVX-512 is slow; then it is called as one that has all but that.
     """
     if slow and "avx512f" in features and (name := _like(features - {"avx512f"})):
         return name
@@ -228,7 +237,7 @@ def _better(own: str, features: Set[str], slow: bool) -> str | None:
 
 
 def _like(features: Set[str]) -> str | None:
-    """A processor that can do no more than one with these features, and for which PoCL has its functions."""
+    """A processor for which PoCL's functions are compiled, and which has no other features than these."""
     for decisive, name, others in _PROCESSORS:
         if decisive in features:
             return name if others <= features else None

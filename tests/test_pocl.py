@@ -25,9 +25,9 @@ AVX2 = {"sse2", "sse4_2", "popcnt", "avx", "avx2", "fma", "f16c", "bmi1", "bmi2"
 AVX512 = AVX2 | {"avx512f", "avx512bw", "avx512cd", "avx512dq", "avx512vl", "adx", "clflushopt"}
 
 
-def version_of(processor: str) -> str:
+def version_of(processor: str, system: str = "unknown-linux-gnu") -> str:
     """What PoCL says of a device whose processor it calls so."""
-    return f"OpenCL 3.0 PoCL HSTR: pthread-x86_64-unknown-linux-gnu-{processor}"
+    return f"OpenCL 3.0 PoCL HSTR: pthread-x86_64-{system}-{processor}"
 
 
 class Record(ctypes.Structure):
@@ -98,6 +98,18 @@ def test_slow_code_for_avx512_is_not_made(
 
 
 @only_here
+@pytest.mark.parametrize("system", ["pc-linux-gnu", "suse-linux", "alpine-linux-musl"])
+@pytest.mark.parametrize("own", ["generic", "skylake-avx512"])
+def test_the_name_is_found_whatever_the_system_is_called(
+    own: str, system: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(pocl, "_processor", lambda: ("GenuineIntel", AVX512))
+    record = record_of(own.encode())
+    pocl.name_processor(version_of(own, system), "3.0-rc2", ctypes.addressof(record))
+    assert record.processor == b"haswell"
+
+
+@only_here
 def test_a_name_stays() -> None:
     for processor in (b"znver3", b"generic-rv64"):
         record = record_of(processor)
@@ -112,10 +124,11 @@ def test_a_name_stays() -> None:
         version_of("haswell"),
         version_of("znver4"),
         "OpenCL 3.0 CUDA 12.4.0",
-        "OpenCL 3.0 of another kind-generic",
+        version_of("generic").replace("PoCL", "of another kind"),
     ],
 )
-def test_other_devices_are_left_alone(version: str) -> None:
+def test_other_devices_are_left_alone(version: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(pocl, "_processor", lambda: ("AuthenticAMD", AVX2))
     record = record_of(b"generic")
     pocl.name_processor(version, "3.0-rc2", ctypes.addressof(record))
     assert record.processor == b"generic"
