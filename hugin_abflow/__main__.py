@@ -28,7 +28,8 @@ def _run(program: str, module: str) -> int:
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     gc.disable()  # what is loaded stays: there is nothing to be found, now or later
     try:
-        with interruptible(), deferred():  # what is written in C++ does not survive it in the middle
+        # deferred: modules in C++, such as pyopencl, abort the process if an import of theirs is broken off
+        with interruptible(), deferred():
             command = import_module(module).main
     except KeyboardInterrupt:
         print(f"{program}: interrupted", file=sys.stderr)

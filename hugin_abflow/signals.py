@@ -52,9 +52,10 @@ def interruptible() -> Iterator[None]:
 
 @contextmanager
 def deferred() -> Iterator[None]:
-    """Have signals of `interruptible` wait for the end of the ``with`` block: what is made in it, as a
-    process, would be lost if it were broken off before it has a name. Unlike `held`, what is started gets
-    the signals.
+    """Have signals of `interruptible` wait for the end of the ``with`` block, for work that must not be
+    broken off in the middle: a process that was just started would go on with nobody who knows it.
+
+    Unlike in `held` they are not blocked: what is started in the block gets them.
     """
     global _waiting
     if threading.current_thread() is not threading.main_thread():

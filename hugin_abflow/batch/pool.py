@@ -222,7 +222,7 @@ class Pool:
         for worker in self._workers:
             if worker.task is None:
                 return worker
-        with deferred():  # one that is half started, or that nobody knows, could not be told to end
+        with deferred():  # `__exit__` ends those in the list: one that is started, and not in it, would go on
             self._workers.append(_Worker(self._level, self._jobs))
         return self._workers[-1]
 
@@ -249,13 +249,15 @@ class Alone:
 
 @contextmanager
 def _deaf() -> Iterator[None]:
-    """Let processes that are started meanwhile not get Ctrl-C, of which the pool tells them: they inherit
-    that it is held back. Were it ignored instead, one that comes meanwhile would be lost.
+    """Keep Ctrl-C from processes that are started in the ``with`` block; the pool tells them of it.
+
+    SIGINT is blocked, which they inherit, and not ignored: so one that comes to us meanwhile is not lost, but
+    comes after the block.
     """
     if os.name == "nt":
-        yield  # where nothing of that kind is inherited
+        yield  # blocked signals are not inherited there
         return
-    resource_tracker.ensure_running()  # the start of which would end what follows
+    resource_tracker.ensure_running()  # starts with the first process, and then unblocks SIGINT
     before = signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT])
     try:
         yield

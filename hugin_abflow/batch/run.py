@@ -58,7 +58,7 @@ class Run:
 
     @property
     def files(self) -> dict[str, Path]:
-        """What is written beside panoramas, by the options that name it."""
+        """The files that are wanted beside panoramas, by the options that name them."""
         named = {"--report": self.report, "--log": self.log, "--profile": self.profile}
         return {option: file for option, file in named.items() if file}
 
@@ -118,7 +118,9 @@ def run(tasks: Iterable[Task | str | None], how: Run, lone: bool = False) -> Exi
 
 
 def _print_files(record: Record) -> OutputError | None:
-    """Print the names of a project's panoramas; returns an error: they are there, and others wait."""
+    """Print the names of a project's panoramas. An error is returned, not raised: it must not keep the run
+    from the projects that are left.
+    """
     try:
         for file in record.files:
             print_path(file)
@@ -128,7 +130,9 @@ def _print_files(record: Record) -> OutputError | None:
 
 
 def _report(how: Run, records: Sequence[Record], complete: bool) -> None:
-    """Write the report, if one is wanted. complete: whether nothing ended the run before its end."""
+    """Write the report, if one is wanted. complete: whether the run came to its end; else something is being
+    raised, and an error of ours is only told.
+    """
     if not how.report:
         return
     try:
@@ -136,7 +140,7 @@ def _report(how: Run, records: Sequence[Record], complete: bool) -> None:
     except OutputError as error:
         if complete:
             raise
-        complain(str(error))  # beside what ended the run, not instead of it
+        complain(str(error))
 
 
 def _rest(tasks: Sequence[Task | str | None], done: int, interrupted: bool) -> str:
