@@ -17,11 +17,12 @@ from hugin_abflow.errors import DeviceError
 
 _log = logging.getLogger(__name__)
 
-# Seconds from which on a program was compiled; where a driver has kept what it compiled before it takes less.
+# A build that takes more seconds than this compiled the program; one that takes less found it in the driver's
+# cache.
 _COMPILED = 0.5
 
-# Modules whose kernels are built for a kind of pixels. All others are built at once: PoCL keeps what it has
-# compiled, but reads OpenCL's headers each time, which takes longer than all of ours.
+# Modules whose kernels are built for a kind of pixels, each alone. All others are built as one program: PoCL
+# keeps what it compiled, but for each program it reads OpenCL's headers, which takes longer than all of ours.
 _OF_PIXELS = frozenset({"blend", "working"})
 
 
@@ -34,15 +35,15 @@ def _kernel_files() -> dict[str, str]:
 
 
 def kernel_source(*modules: str) -> str:
-    """Source of ``kernels/<module>.cl``, in front of it common.cl, and in front of both what is their own, as
-    blend_rows.cl of blend.cl; #line keeps messages true.
+    """The source of modules as one text: common.cl, then each ``kernels/<module>.cl``; in front of each file
+    its parts, as blend_rows.cl in front of blend.cl. By #line compilers name the file and line that is meant.
     """
     names = [name for one in ("common", *modules) for name in (*_parts(one), one)]
     return "".join(f'#line 1 "{name}.cl"\n{_kernel_files()[name]}\n' for name in names)
 
 
 def _parts(module: str) -> list[str]:
-    """The files that are in front of a module's own, whose names begin with its name."""
+    """The parts of a module's file, which are told by their names: "blend_rows" is one of "blend"."""
     return sorted(name for name in _kernel_files() if name.startswith(f"{module}_"))
 
 
@@ -90,13 +91,15 @@ class Compiler:
         except DeviceError:
             if len(modules) == 1:
                 raise
-            self._one_by_one = True  # perhaps one fails that is not needed, else its name is told
+            # perhaps the one that fails is not needed; if it is, the error names it
+            self._one_by_one = True
             modules, kernels = (module,), self._build((module,), options)
         self._kernels |= {(one, options): kernels for one in modules}
 
     def _build(self, modules: Sequence[str], options: str) -> dict[str, cl.Kernel]:
         """The kernels of some modules, built as one program."""
-        file, began = f"kernels/{modules[0]}.cl", time.perf_counter()  # of several nobody is told
+        # the name is told where one module is built: errors of several are not told, but each is built again
+        file, began = f"kernels/{modules[0]}.cl", time.perf_counter()
         try:
             # compilers chat; errors come with the exception
             with warnings.catch_warnings(), signals.held():

@@ -20,20 +20,21 @@ _log = logging.getLogger(__name__)
 
 # Formats by the endings of files.
 ENDINGS = {".tif": "tiff", ".tiff": "tiff", ".jpg": "jpeg", ".jpeg": "jpeg", ".png": "png", ".exr": "openexr"}
-# Compressions that the documentation names; more is understood, since projects and other programs say it.
+# Compressions that the documentation names. `_KNOWN` has other names as well, which projects and other
+# programs use.
 COMPRESSIONS = {
     "TIFF": ("none", "packbits", "lzw", "deflate", "zstd", "jpeg"),
     "EXR": ("none", "rle", "zips", "zip", "piz"),
 }
 # Compressions by formats, and JPEG's quality, where nothing is said.
 DEFAULTS, JPEG_QUALITY = {"tiff": "lzw", "openexr": "zip", "jpeg": "jpeg", "png": "deflate"}, 90
-# All that is understood, and what is used then.
+# All names that are understood, by formats, and the compression that each of them means.
 _KNOWN = {
     "tiff": {name: name for name in tiffwriter.COMPRESSIONS} | {"zip": "deflate"},
     "openexr": {name: name for name in COMPRESSIONS["EXR"]},
     "jpeg": {"jpeg": "jpeg"}, "png": {"deflate": "deflate", "zip": "deflate"},
 }  # fmt: skip
-# Samples that are written, and such as TIFF holds beside them.
+# Types of samples that may be given, and one more as which TIFF may store them.
 _DTYPES = frozenset(map(np.dtype, (np.uint8, np.uint16, np.float16, np.float32)))
 _WIDE = np.dtype(np.float64)
 
@@ -70,7 +71,7 @@ def stored_dtype(path: Path, kind: str, dtype: np.dtype[Any], depth: npt.DTypeLi
 def used_compression(
     path: Path, kind: str, stored: np.dtype[Any], channels: int, name: str | None, jpeg_quality: int | None
 ) -> str:
-    """The compression that a file of a format really has, JPEG's with its quality: "lzw", "jpeg:90".
+    """The compression that a file of a format gets, JPEG's with its quality: "lzw", "jpeg:90".
 
     stored, channels    of its samples, alpha not counted. name, jpeg_quality: what is wanted, if anything.
 

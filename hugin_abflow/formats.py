@@ -26,7 +26,7 @@ _LONGEST = 16
 _RAW = frozenset(
     {".arw", ".cr2", ".cr3", ".dng", ".nef", ".nrw", ".orf", ".pef", ".raf", ".raw", ".rw2", ".srw"}
 )  # fmt: skip
-# A line of a project that no other text has: what Hugin and PTGui write first, a p- or i-line.
+# A line by which a text is told to be a project: the first one of Hugin's or PTGui's, or a p-, i- or o-line.
 _OF_PROJECTS = re.compile(rb"(?im)^(?:\xef\xbb\xbf)?(?:# (?:hugin|ptgui) project file|[pio] [fwh]\d)")
 _READ_BY_HUGIN = frozenset({"JPEG", "PNG", "TIFF", "OpenEXR"})
 

@@ -49,10 +49,10 @@ _NAMED = 5  # photos that a warning names
 # What to do where nona cannot make layers, beside mending that.
 _OTHERWISE = "or name layers that exist with --prefix or --layers"
 
-_STEPS = ("remapping ", "saving ")  # what nona -v says at the end of a photo's loading and remapping
-_LOADING = "loading "  # and at its beginning
-# What libjpeg says of a photo of which pixels may be missing, as which nona remaps it: some cameras leave out
-# no more than the mark of the end.
+# What nona -v says of each photo: before it loads it; after that, and after it has remapped it.
+_LOADING, _STEPS = "loading ", ("remapping ", "saving ")
+# What libjpeg says of a photo that may lack pixels. nona remaps what there is, and that may be all: some
+# cameras leave out nothing but the mark of the end. So we warn of these, and go on.
 _CUT = "Premature end of JPEG file"
 _DOUBTS = (_CUT, "Corrupt JPEG data")
 
@@ -194,7 +194,7 @@ def _run(
     except ProgramFailedError as error:
         raise NonaFailedError(str(error)) from None
     for doubt in sorted(doubts):
-        # libjpeg names no file, and what it says overtakes what nona does
+        # libjpeg names no file, and its lines need not be in order with nona's
         cut = [str(image.photo) for image in images if doubt.startswith(_CUT) and is_cut(image.photo)]
         _log.warning(
             "%s may be damaged (%s); look at the panorama", ", ".join(cut) or "one of the photos", doubt

@@ -115,12 +115,13 @@ class OldFile(click.Path):
 
 
 class NewFile(click.Path):
-    """A file to be written: no project and, unless `image`, no photo, as where its own name was forgotten
-    before ``*.pto``. Both are also told by what they hold: camera raws, hard links and Hugin's temporary
-    projects have other names.
+    """A file to be written, which must not be a project, nor a photo: somebody who writes ``--log *.pto``
+    forgot the log's name, and named a project. Both are told by their names and by what they hold, since
+    camera raws, hard links and Hugin's temporary projects have other names.
 
-    replaced        what is there goes, and has to be of the kind that is written, JSON: notes, sidecars of
-                    photos and settings are texts, too. Else it grows.
+    image           an image is written; that it takes no photo's place is seen to later.
+    replaced        JSON is written in place of what is there, which has to be JSON as well: notes, settings
+                    and sidecars of photos are texts, too. Else a text is written, to the end of the file.
     """
 
     def __init__(self, image: bool = False, replaced: bool = False) -> None:
@@ -128,7 +129,7 @@ class NewFile(click.Path):
         self.image, self.replaced = image, replaced
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Path:
-        """Its path; ends with click's message for none, or what is somebody's, also behind a link."""
+        """Its path; ends with click's message if it is empty, or what is there must stay."""
         _refuse_no_name(self, value, param, ctx)
         path = Path(os.fsdecode(super().convert(value, param, ctx)))
         for name in (str(path).lower(), os.path.realpath(path).lower()):
@@ -143,8 +144,8 @@ class NewFile(click.Path):
             self.fail(f"{value} holds a project, which is never written to; name another file", param, ctx)
         if self.replaced and data.strip() and not data.lstrip().startswith(b"{"):
             self.fail(
-                f"{value} is there, and would be replaced, but is no JSON: it is somebody's; name another "
-                "file, or remove it",
+                f"{value} is there, and would be replaced, but is no JSON, so another program wrote it; name "
+                "another file, or remove it",
                 param,
                 ctx,
             )
@@ -152,7 +153,7 @@ class NewFile(click.Path):
 
 
 def _beginning(path: Path) -> bytes:
-    """What a file begins with; nothing of one that cannot be looked into."""
+    """The first bytes of a file; none of one that is not there, or that cannot be looked into."""
     with suppress(OSError):  # writing will tell what is the matter
         if not is_special(path):  # who opens a pipe waits until somebody writes
             with path.open("rb") as file:

@@ -41,7 +41,7 @@ def test_what_is_replaced_was_written_by_us(tmp_path: Path) -> None:
     for name, text in (("photo.xmp", "<x:xmpmeta"), ("abflow.toml", "jobs = 2"), ("notes", "p 1")):
         file = tmp_path / name
         file.write_text(text)
-        with pytest.raises(click.BadParameter, match=f"{name} is there, and would be replaced, but is no JS"):
+        with pytest.raises(click.BadParameter, match=f"{name} is there, and would be replaced, but is no J"):
             NewFile(replaced=True).convert(str(file), None, None)
         assert NewFile().convert(str(file), None, None) == file
     for text in ("", "\n", '{\n  "schema": 1', '{"traceEvents": []}'):
