@@ -23,6 +23,7 @@ _log = logging.getLogger(__name__)
 
 _RDF = "{http://www.w3.org/1999/02/22-rdf-syntax-ns#}"
 _LANG = "{http://www.w3.org/XML/1998/namespace}lang"
+_OF_FORM = (_LANG, f"{_RDF}parseType")  # attributes that tell how to read values
 DC, XMP = "http://purl.org/dc/elements/1.1/", "http://ns.adobe.com/xap/1.0/"
 TIFF, EXIF = "http://ns.adobe.com/tiff/1.0/", "http://ns.adobe.com/exif/1.0/"
 _CORE = "http://iptc.org/std/Iptc4xmpCore/1.0/xmlns/"
@@ -79,7 +80,7 @@ def read_caption(photo: Path, packets: Packets) -> Properties:
     if packets.xmp:
         try:
             found |= _of_xmp(packets.xmp)
-        except (ElementTree.ParseError, ValueError, RecursionError) as error:
+        except (ElementTree.ParseError, LookupError, ValueError, RecursionError) as error:
             _log.info("%s: its XMP cannot be understood (%s), nothing of it is copied", photo, error)
     return found
 
@@ -142,16 +143,19 @@ def _of_xmp(packet: bytes) -> Properties:
         if f"{_RDF}about" not in description.keys() and "about" not in description.keys():  # noqa: SIM118
             continue  # a value within a property
         for name, value in description.items():  # the short form of simple properties
-            if name.startswith("{") and not name.startswith(_RDF):
+            if name.startswith("{") and not name.startswith(_RDF) and value.strip():
                 found[name] = _element(name, [value])
-        for element in description:
-            if isinstance(element.tag, str) and (len(element) or (element.text or "").strip()):
-                ElementTree.tostring(element)  # what is too deep is found here
-                element.tail = None
-                found[element.tag] = element
-            elif isinstance(element.tag, str) and element.attrib:
-                found[element.tag] = element
+        for element in filter(_tells, description):
+            ElementTree.tostring(element)  # what is too deep is found here
+            element.tail = None
+            found[element.tag] = element
     return found
+
+
+def _tells(element: Element) -> bool:
+    """Whether a property has a value; many programs write titles and authors that have none."""
+    told = (value for part in element.iter() for name, value in part.items() if name not in _OF_FORM)
+    return any(value.strip() for value in told) or any(value.strip() for value in element.itertext())
 
 
 def _of_iptc(block: bytes) -> Properties:

@@ -12,7 +12,7 @@ from conftest import ProjectMaker
 from pictures import one_device
 from test_exif import picture, shown
 
-from hugin_abflow.caption import DC, EXIF, packed, plain, read_caption, to_copy
+from hugin_abflow.caption import DC, EXIF, PHOTOSHOP, packed, plain, read_caption, to_copy
 from hugin_abflow.exif import Packets, comment_of, read_packets, text
 from hugin_abflow.merge import merge_project
 from hugin_abflow.metadata import describe
@@ -166,7 +166,8 @@ def test_short_form_and_packed_text_of_png(exiftool: str, tmp_path: Path) -> Non
         b"<a>",
         b'<!DOCTYPE a [<!ENTITY b "c">]>' + packet("<dc:title>&b;</dc:title>"),
         packet("<dc:title>x</dc:title>").decode().encode("utf-16"),
-        packet("<dc:title>" + "<dc:a>" * 100_000 + "</dc:a>" * 100_000 + "</dc:title>"),
+        b'<?xml version="1.0" encoding="none"?>' + packet("<dc:title>x</dc:title>"),
+        packet("<dc:title>" + "<dc:a>" * 100_000 + "x" + "</dc:a>" * 100_000 + "</dc:title>"),
     ],
 )
 def test_xmp_that_cannot_be_understood(content: bytes, caplog: pytest.LogCaptureFixture) -> None:
@@ -191,6 +192,17 @@ def test_what_is_too_long_is_left_out(caplog: pytest.LogCaptureFixture) -> None:
     text_ = packed(to_copy(read_caption(PHOTO, Packets(content)), place=False))
     assert "Ship" in text_ and len(text_) < 500
     assert "too long" in caplog.text and "description" in caplog.text
+
+
+def test_what_xmp_leaves_empty_iptc_tells() -> None:
+    """In the short form, an array, and a structure; an address alone is something."""
+    empty = '<dc:title><rdf:Alt><rdf:li xml:lang="x-default"/></rdf:Alt></dc:title>'
+    empty += '<dc:source rdf:parseType="Resource"/><dc:relation rdf:resource="https://example.org"/>'
+    short = f'xmlns:p="{PHOTOSHOP}" p:City=""'
+    iptc = b"\x1c\x02\x05\0\4Ship" + b"\x1c\x02\x5a\0\4Kiel"
+    found = read_caption(PHOTO, Packets(packet(empty, short), iptc))
+    assert [plain(element) for element in found.values()] == ["Ship", "Kiel", ""]
+    assert list(found)[2] == f"{{{DC}}}relation"
 
 
 def test_nothing_said_and_nothing_to_copy() -> None:
