@@ -20,6 +20,7 @@ from hugin_abflow.exif import (
     read_packets,
     software,
     text,
+    text_of,
 )
 from hugin_abflow.layer import Canvas
 from hugin_abflow.oneline import one_line
@@ -32,6 +33,7 @@ PROGRAM = "hugin-abflow"
 _log = logging.getLogger(__name__)
 
 _USER_COMMENT = 37510
+_LATITUDE = 2  # cameras without a receiver tell but the version of GPS's tags
 # What EXIF must have: versions of Exif and Flashpix, width and height, 150 dpi as enblend writes it.
 _VERSIONS = {36864: Value(UNDEFINED, b"0232"), 40960: Value(UNDEFINED, b"0100")}
 _SIZE = (40962, 40963)
@@ -125,8 +127,10 @@ def describe(plan: Plan) -> Metadata:
         for directory, tags in _COPIED.items()
     }
     for directory, tags in _IN_XMP.items():
-        told = {tag: _from_xmp(said_in_xmp, tag, names) for tag, names in tags.items()}
-        chosen[directory] = {tag: text(said) for tag, said in told.items() if said} | chosen[directory]
+        for tag, names in tags.items():
+            told = _from_xmp(said_in_xmp, tag, names)
+            if told and not text_of(chosen[directory].get(tag, text(""))):  # cameras leave blanks
+                chosen[directory][tag] = text(told)
     chosen[MAIN][SOFTWARE] = text(f"{PROGRAM} {version()}")
     said = comment_of(found.get(EXIF, {}).get(_USER_COMMENT))
     said = said or caption.plain(said_in_xmp.get(f"{{{caption.EXIF}}}UserComment"))
@@ -137,7 +141,7 @@ def describe(plan: Plan) -> Metadata:
         for tag, size in zip(_SIZE, (plan.canvas.crop.width, plan.canvas.crop.height), strict=True)
     }
     chosen[GPS] = dict(found.get(GPS, {}))
-    copied = caption.packed(caption.to_copy(said_in_xmp, place=not chosen[GPS]))
+    copied = caption.packed(caption.to_copy(said_in_xmp, place=_LATITUDE not in chosen[GPS]))
     parts = [part for part in (gpano(plan.canvas, len(plan.images)), copied) if part]
     return Metadata(chosen, _XMP.format("\n".join(parts)).encode() if parts else b"")
 

@@ -126,6 +126,19 @@ def test_xmp_stands_in_where_there_is_no_exif(exiftool: str, make_project: Proje
     assert metadata.exif[MAIN][315] == text("Bo") and b"48,30.0N" not in metadata.xmp
 
 
+def test_xmp_stands_in_where_a_camera_left_exif_blank(exiftool: str, make_project: ProjectMaker) -> None:
+    """Authors that nobody has entered, and GPS without a receiver: but for its version nothing."""
+    project = make_project(panorama='f0 w400 h300 v90 n"TIFF_m"')
+    told(
+        exiftool, project.parent / "photo 0.tif",
+        "-Artist=   ", "-Copyright= ", "-GPSVersionID=2.3.0.0",
+        "-XMP-dc:Creator=Al", "-XMP-exif:GPSLatitude=48.5",
+    )  # fmt: skip
+    metadata = describe(read_plan(project))
+    assert metadata.exif[MAIN][315] == text("Al") and b"48,30.0N" in metadata.xmp
+    assert not metadata.exif[MAIN][33432].data.strip(b" \0")  # XMP tells nothing, either
+
+
 # Photos
 
 
