@@ -216,12 +216,12 @@ def _packets_of_jpeg(file: BinaryIO) -> Packets:
 
 
 def _iptc_of_photoshop(blocks: bytes) -> bytes:
-    """The IPTC block among those that Photoshop writes one behind the other."""
+    """The IPTC block among those that Photoshop writes one behind the other; empty: none, or they are cut."""
     at = 0
     while blocks[at : at + 4] == b"8BIM" and at + 12 <= len(blocks):
-        (number,) = struct.unpack_from(">H", blocks, at + 4)
+        number = int.from_bytes(blocks[at + 4 : at + 6])
         start = at + 6 + (blocks[at + 6] + 2 & ~1)  # behind a name, with its length of even size
-        (length,) = struct.unpack_from(">I", blocks, start)
+        length = int.from_bytes(blocks[start : start + 4])
         if number == _IPTC:
             return blocks[start + 4 : start + 4 + length]
         at = start + 4 + (length + 1 & ~1)

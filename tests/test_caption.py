@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import struct
 import subprocess
 from pathlib import Path
 
@@ -198,6 +199,17 @@ def test_files_that_are_cut(exiftool: str, tmp_path: Path, ending: str) -> None:
     for length in range(0, len(whole), 97):
         cut.write_bytes(whole[:length])
         read_caption(cut, read_packets(cut))
+
+
+def test_blocks_of_photoshop_that_are_cut_do_not_hide_xmp(tmp_path: Path) -> None:
+    photo = tmp_path / "photo.jpg"
+    picture(photo)
+    xmp = b"http://ns.adobe.com/xap/1.0/\0" + packet("<dc:title>Ship</dc:title>")
+    segments = (0xE1, xmp), (0xED, b"Photoshop 3.0\0" + b"8BIM\4\4\x09somewhere")
+    added = b"".join(struct.pack(">BBH", 0xFF, kind, len(one) + 2) + one for kind, one in segments)
+    photo.write_bytes(b"\xff\xd8" + added + photo.read_bytes()[2:])
+    (title,) = read_caption(photo, read_packets(photo)).values()
+    assert plain(title) == "Ship"
 
 
 def test_what_is_too_long_is_left_out(caplog: pytest.LogCaptureFixture) -> None:
