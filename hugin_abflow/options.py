@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
@@ -19,6 +20,8 @@ from hugin_abflow.settings import MOST_MEMORY, Settings
 
 # Enough of a file's beginning to tell a text from a picture, and a project from other texts.
 _BEGINNING = 4096
+# How JSON that we write begins, be it cut; RTF and other things have a brace, too.
+_JSON = re.compile(rb'\s*\{\s*(?:["}]|$)')
 
 # Where a context keeps the arguments as they were given.
 ARGUMENTS = "hugin_abflow.arguments"
@@ -142,7 +145,7 @@ class NewFile(click.Path):
             self.fail(f"{value} is there, and may be a photo: it is no text; name another file", param, ctx)
         if holds_project(data):
             self.fail(f"{value} holds a project, which is never written to; name another file", param, ctx)
-        if self.replaced and data.strip() and not data.lstrip().startswith(b"{"):
+        if self.replaced and data.strip() and not _JSON.match(data):
             self.fail(
                 f"{value} is there, and would be replaced, but is no JSON, so another program wrote it; name "
                 "another file, or remove it",

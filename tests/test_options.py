@@ -38,13 +38,14 @@ def test_no_project_is_written_to_whatever_its_name(tmp_path: Path) -> None:
 
 def test_what_is_replaced_was_written_by_us(tmp_path: Path) -> None:
     """Or may have been; a text to the end of which something is added loses nothing."""
-    for name, text in (("photo.xmp", "<x:xmpmeta"), ("abflow.toml", "jobs = 2"), ("notes", "p 1")):
+    texts = {"photo.xmp": "<x:xmpmeta", "abflow.toml": "jobs = 2", "notes": "p 1", "notes.rtf": r"{\rtf1"}
+    for name, text in texts.items():
         file = tmp_path / name
         file.write_text(text)
         with pytest.raises(click.BadParameter, match=f"{name} is there, and would be replaced, but is no J"):
             NewFile(replaced=True).convert(str(file), None, None)
         assert NewFile().convert(str(file), None, None) == file
-    for text in ("", "\n", '{\n  "schema": 1', '{"traceEvents": []}'):
+    for text in ("", "\n", "{\n", "{}", '{\n  "schema": 1', '{"traceEvents": []}'):
         file.write_text(text)
         assert NewFile(replaced=True).convert(str(file), None, None) == file
 
