@@ -196,8 +196,9 @@ def grown(mask: Mask, by: int, wraps: bool) -> Mask:
 def across_border(
     function: Callable[[npt.NDArray[Any]], npt.ArrayLike], values: npt.NDArray[Any], by: int, wraps: bool
 ) -> npt.NDArray[Any]:
-    """What a function of SciPy that knows no columns which wrap makes of values (height, width): where they
-    do, it gets `by` columns of the other side on each, and what it makes of these is left out.
+    """The result of a function of SciPy, which takes no account of columns that wrap, for values (height,
+    width). If they wrap, `by` columns of either side are first put beyond the other one, and then left out of
+    the result.
     """
     if not wraps:
         return np.asarray(function(values))

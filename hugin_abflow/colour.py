@@ -6,9 +6,9 @@ the layers differ (gains.py). A difference counts the more the better it can be 
 (dark samples tell little), and the more both layers are seen.
 
 Most cameras' curves level off towards white; there log odds change colours as exposure does. Others run
-straight into white. The scale has a shoulder that lies between both, and the one is used that leaves least
-of the differences: with a wrong one a gain is too large for bright things and too small for dark ones beside
-them, and steps remain.
+straight into white: for them the scale has a lower shoulder, and is log odds of a share of full scale. Of a
+few shoulders the one is taken that explains the differences clearly best. With a wrong one a gain is too
+large for bright things and too small for dark ones beside them, and steps remain.
 """
 
 from __future__ import annotations

@@ -32,8 +32,8 @@ from hugin_abflow.grid import Grid
 _ROUNDS = ((0.1, 4.0), (1.0, 3.0), (100.0, 2.5))
 # The same, slower and stricter: what lies far from it is no exposure but something that only one layer shows.
 _STRICT = ((0.01, 4.0), (0.03, 2.5), (0.3, 1.6), (3.0, 1.2), (100.0, 1.0))
-# Cells across a block that shares one gain in rough rounds: nearly all of a round's time goes into
-# eliminating unknowns.
+# Cells across a block that shares one gain in rough rounds: fewer unknowns take much less time, nearly all of
+# which goes into eliminating them.
 _BLOCK = 2
 # Weight of the differences up to which a round is rough: they weigh hardly more than smoothness there, so
 # that gains are smooth anyway.
@@ -107,7 +107,8 @@ def solve(
     agreement, bounds = _Agreement(measured, numbering), _Bounds(measured, numbering)
     smooth = _smoothness(measured, numbering, unknown)
     blocks = _blocks(measured.inside)
-    # a step between blocks stands for _BLOCK steps, each of that part of it: their squares are less by that
+    # from a block to the next one gains change in one step, between cells in _BLOCK smaller ones, the squares
+    # of which sum to so much less
     smooth_blocks = blocks.T @ smooth @ blocks / _BLOCK
     solution, solver, rough_solver = np.zeros((numbering.count, 3)), _Solver(), _Solver()
     rounds = _STRICT if strict else _ROUNDS
@@ -258,8 +259,12 @@ class _Agreement:
     def active(
         self, solution: npt.NDArray[np.float64], data: float, limit: float
     ) -> tuple[scipy.sparse.csr_array, npt.NDArray[np.float64]]:
-        """Matrix (count, count) and right side (count, 3) of the normal equations of a round, in which
-        differences weigh `data`, and nothing if a solution is off by `limit`.
+        """What a round adds to the normal equations: to the matrix (count, count), and to the right side
+        (count, 3).
+
+        solution    of the round before: a difference that it misses by `limit` or more weighs nothing. One of
+                    zeros stands for none: then all weigh.
+        data        the most that a difference weighs, against smoothness.
         """
         link, difference = self._link, self._difference
         off = link @ solution + difference if solution.any() else np.zeros_like(difference)
@@ -285,7 +290,10 @@ class _Bounds:
     def active(
         self, solution: npt.NDArray[np.float64], limit: float
     ) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
-        """How strongly each unknown of a solution is held, (count,), and pulled, (count, 3)."""
+        """What a round adds likewise: to the matrix's diagonal (count,), and to the right side (count, 3).
+
+        A gain that is as high as its bound, or misses it by `limit` or more, is left alone.
+        """
         short = self._targets - solution[self._unknowns]
         weight = _BOUND * self._weights * (short.mean(1) > 0) * _biweight(short, limit)
         held, pull = np.zeros(self._count), np.zeros((self._count, 3))

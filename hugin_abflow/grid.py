@@ -147,8 +147,8 @@ class Grid:
         return self.reduced(max(1, round(self.width / pixels)), max(1, round(self.height / pixels)))
 
     def reduced(self, width: int, height: int) -> Grid:
-        """The same region on fewer pixels; where it wraps, a column more if that makes them even. Crossing a
-        pole goes half of them further, and sweeps take every other one.
+        """The same region on fewer pixels. Where columns wrap their number is made even: a line over a pole
+        goes on half of the columns further, and solvers' sweeps take every other column.
         """
         wider = self.wraps and width < self.width
         return self.resized(width + width % 2 if wider else width, height)
@@ -191,8 +191,9 @@ def working_grid(full: Grid, settings: Settings) -> Grid:
 
 
 def on_cells(values: npt.NDArray[_Kind], cells: Grid, rule: np.ufunc) -> npt.NDArray[_Kind]:
-    """What any finer grid over the region of `cells` has, (n, height, width), per cell. Of masks
-    `np.logical_or` tells cells that they reach into, `np.logical_and` those that they cover whole.
+    """Values of any finer grid over the same region, (n, height, width), united by a rule in each of `cells`.
+
+    Of masks, `np.logical_or` gives the cells that they reach into, `np.logical_and` those that they cover.
     """
     values = _on_rows(values, cells.height, rule).transpose(0, 2, 1)
     return np.ascontiguousarray(_on_rows(np.ascontiguousarray(values), cells.width, rule).transpose(0, 2, 1))
@@ -206,7 +207,9 @@ def _on_rows(values: npt.NDArray[_Kind], count: int, rule: np.ufunc) -> npt.NDAr
 
 
 def connected(mask: npt.NDArray[np.bool_], wraps: bool) -> npt.NDArray[np.int32]:
-    """The connected parts of a mask over a grid, numbered from 1 on, not all numbers in use; 0 elsewhere."""
+    """The connected parts of a mask, each with a number of its own above 0 (some numbers are left out); 0
+    elsewhere.
+    """
     if not mask.any():  # OpenCV takes no mask without pixels
         return np.zeros(mask.shape, np.int32)
     labels = np.asarray(cv2.connectedComponents(mask.astype(np.uint8), connectivity=8)[1], np.int32)
@@ -221,15 +224,15 @@ def connected(mask: npt.NDArray[np.bool_], wraps: bool) -> npt.NDArray[np.int32]
 
 
 def cells_under(box: Box, grid: Grid, cells: Grid) -> Box:
-    """What a box of `grid` reaches into of `cells`, into which kernels part the same region."""
+    """The box of those `cells` into which a box of `grid`, over the same region, reaches."""
     left, right = _cells(box.left, box.right, grid.width, cells.width)
     top, bottom = _cells(box.top, box.bottom, grid.height, cells.height)
     return Box(left, top, right, bottom)
 
 
 def any_around(mask: npt.NDArray[np.bool_], place: Place, grid: Grid, cells: Grid) -> bool:
-    """Whether a mask on `cells` has any that a place of `grid` reaches into, or beside these, from where what
-    lies between cells is read.
+    """Whether a mask on `cells` is set anywhere that a kernel may read it for a place of `grid`: in the cells
+    that the place reaches into, or in those next to them, between which values are interpolated.
     """
     its = cells_under(Box.at(*place), grid, cells)
     rows, columns = np.arange(its.top - 1, its.bottom + 1), np.arange(its.left - 1, its.right + 1)

@@ -86,10 +86,10 @@ def doubts(places: Points, moves: Points, radius: float, period: float = math.in
 
 
 def by_pair(guides: Iterable[Guide], numbers: Sequence[int]) -> dict[tuple[int, int], list[Guide]]:
-    """The guides of each two of some layers, a < b, with their indices among these; such as are about others
-    are left out.
+    """Guides by the pairs of layers (a, b) that they connect, a < b. Layers are counted anew in the result:
+    by their places in `numbers`. Guides of layers that are not among them are left out.
 
-    numbers     what guides call each of the layers.
+    numbers     the number by which guides call each layer.
     """
     index = {number: k for k, number in enumerate(numbers)}
     pairs: dict[tuple[int, int], list[Guide]] = {}

@@ -31,7 +31,7 @@ _BYTES = 8 << 20
 # Strips of a layer that a part has at least.
 _PART_STRIPS = 8
 
-# Samples brighter than this, of what a layer shows white, may be clipped.
+# Samples may be clipped from this share of a layer's white (`WorkingLayer.clips_at`) on.
 CLIPPED = 0.98
 
 # OpenCL type and full-scale value of each depth; half is widened on the host.
@@ -43,10 +43,11 @@ class WorkingLayer:
     """A layer on the working grid.
 
     box         its place on the grid.
-    pixels      float32 (height, width, 4), r, g, b (full scale is 1) and valid. Of floats light as it is
-                stored, up to unit.py, which codes it in place: all that follows sees it coded.
+    pixels      float32 (height, width, 4), r, g, b (full scale is 1) and valid. Floats are light as it was
+                stored until unit.py codes them, in place, before anything else looks at them.
     checksum    of the stored pixels: tells layers of one size and place apart.
-    white       r, g, b of what is clipped, of full scale; None: of integers that, of floats nothing.
+    white       r, g, b at which it is clipped, of full scale (saturation.py). None: not looked for yet, or
+                nothing is found; then integers are clipped at full scale, and floats are not.
     """
 
     layer: Layer

@@ -11,8 +11,8 @@
 #endif
 #endif
 
-/* PoCL's compiler converts 16 numbers itself: its functions would take them in another way than a kernel hands them on
-   that is compiled for shorter vectors (pocl.py), and each would be a call. */
+/* PoCL's own functions that convert 16 numbers are compiled for AVX-512, and kernels may be compiled for shorter
+   vectors (pocl.py), which are passed in another way. So its compiler converts these itself, which also saves calls. */
 #ifdef POCL_DEVICE_ADDRESS_BITS
 #undef convert_float16
 #undef convert_int16
