@@ -1,4 +1,4 @@
-"""What kind of picture a file is, by its first bytes, and what Hugin's programs read of it."""
+"""What a file is, by its first bytes: which kind of picture, a text, a project; what Hugin reads of these."""
 
 from __future__ import annotations
 

@@ -125,6 +125,19 @@ def test_photos_whose_compression_nona_does_not_know(make_project, nona):
         pass
 
 
+@pytest.mark.parametrize(
+    ("line", "lost"),
+    [
+        ("JPEGLib: Warning, Premature end of JPEG file.", False),
+        ("TIFFReadDirectory: Warning, Unknown field with tag 37724 (0x935c) encountered.", False),
+        ("JPEGLib: Not a JPEG file: starts with 0x00 0x00.", True),
+        ("a.tif: Read error on strip 7; got 0 bytes, expected 9.", True),
+    ],
+)
+def test_warnings_of_libtiff_are_no_loss(line, lost):
+    assert (loss(Path("a.tif"), line) is not None) == lost
+
+
 def test_a_codec_that_nona_was_built_without_is_no_damage():
     """As Zstandard's on some systems: libtiff names the file first."""
     said = str(loss(Path("a.tif"), "a.tif: ZSTD compression support is not configured"))

@@ -8,12 +8,16 @@ from pathlib import Path
 import click
 import pytest
 
+from hugin_abflow import cli
+from hugin_abflow.errors import ExitCode
 from hugin_abflow.options import NewFile, OldFile
 
 JPEG, RAW, MOVED = b"\xff\xd8\xff\xe0\0\x10JFIF\0", b"II*\0\x10\0\0\0CR\2\0", b"\0\0\0\x18ftypheic"
 
 
-@pytest.mark.parametrize("photo", [JPEG, RAW, MOVED, b"FUJIFILMCCD-RAW 0201" + b"FF383501\0\0"])
+@pytest.mark.parametrize(
+    "photo", [JPEG, b"\xff\xd8\xff\xfe\x20\x20no NUL so far", RAW, MOVED, b"FUJIFILMCCD-RAW 0201FF383501\0\0"]
+)
 def test_no_photo_is_written_to_whatever_its_name(tmp_path: Path, photo: bytes) -> None:
     """Camera raw has many endings, and a hard link may have none; -o looks at photos itself."""
     for name in ("photo.CR2", "log"):
@@ -30,7 +34,8 @@ def test_no_project_is_written_to_whatever_its_name(tmp_path: Path) -> None:
     """Hugin's temporary ones have no ending; hard links and backups may have any."""
     (tmp_path / "project").write_text('p f2 w90 h30 v130\ni w48 h36 f0 v60 n"a.jpg"\n')
     (tmp_path / "windows.bak").write_bytes(b"\xef\xbb\xbf# Hugin project file\r\n")
-    for name in ("project", "windows.bak"):
+    (tmp_path / "lines.txt").write_text('# made by a script\ni w48 h36 f0 v60 n"a.jpg"\n')
+    for name in ("project", "windows.bak", "lines.txt"):
         for kind in (NewFile(), NewFile(replaced=True)):
             with pytest.raises(click.BadParameter, match=f"{name} holds a project, which is never"):
                 kind.convert(str(tmp_path / name), None, None)
@@ -48,6 +53,19 @@ def test_what_is_replaced_was_written_by_us(tmp_path: Path) -> None:
     for text in ("", "\n", "{\n", "{}", '{\n  "schema": 1', '{"traceEvents": []}'):
         file.write_text(text)
         assert NewFile(replaced=True).convert(str(file), None, None) == file
+
+
+@pytest.mark.parametrize(("option", "kept"), [("--report", True), ("--profile", True), ("--log", False)])
+def test_reports_and_profiles_replace_no_notes(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str], option: str, kept: bool
+) -> None:
+    """To which a log may be added."""
+    notes = tmp_path / "notes"
+    notes.write_text("of somebody\n")
+    assert cli.main([str(tmp_path / "none.pto"), option, str(notes)]) != ExitCode.OK
+    assert notes.read_text().startswith("of somebody\n")
+    assert (f"Invalid value for '{option}': {notes} is there, and would" in capfd.readouterr().err) == kept
+    assert (notes.read_text() == "of somebody\n") == kept
 
 
 def test_a_name_that_no_file_can_have_is_refused() -> None:
