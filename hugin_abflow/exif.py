@@ -10,10 +10,11 @@ from __future__ import annotations
 import logging
 import struct
 import zlib
+from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import lru_cache
-from io import SEEK_CUR, SEEK_END, BytesIO
+from io import SEEK_END, BytesIO
 from pathlib import Path
 from stat import S_ISREG
 from typing import BinaryIO
@@ -195,13 +196,21 @@ def _find_in_jpeg(file: BinaryIO) -> bytes:
 
 def _find_in_png(file: BinaryIO, wanted: bytes = b"eXIf") -> bytes:
     """The content of a PNG file's chunk, EXIF's by default, behind which the file is then."""
-    file.seek(len(_PNG))
-    while head := file.read(8):
-        length, kind = struct.unpack(">I4s", head)
+    for kind, length in _chunks(file):
         if kind == wanted:
             return file.read(length)
-        file.seek(length + 4, SEEK_CUR)
     return b""
+
+
+def _chunks(file: BinaryIO) -> Iterator[tuple[bytes, int]]:
+    """Kind and length of each chunk of a PNG file, which is where the chunk's content begins meanwhile."""
+    at = len(_PNG)
+    file.seek(at)
+    while head := file.read(8):
+        length, kind = struct.unpack(">I4s", head)
+        yield kind, length
+        at += len(head) + length + 4  # behind a checksum
+        file.seek(at)
 
 
 def _packets_of_jpeg(file: BinaryIO) -> Packets:
@@ -230,18 +239,14 @@ def _iptc_of_photoshop(blocks: bytes) -> bytes:
 
 def _xmp_of_png(file: BinaryIO) -> bytes:
     """Before or behind the pixels."""
-    file.seek(len(_PNG))
-    while head := file.read(8):
-        length, kind = struct.unpack(">I4s", head)
-        if kind == b"iTXt" and length <= _MOST_XMP:
-            content = file.read(length)
-            if content.startswith(_XMP_KEY):
-                is_packed = content[len(_XMP_KEY)]
-                packet = content[len(_XMP_KEY) + 2 :].split(b"\0", 2)[2]  # behind languages
-                return zlib.decompressobj().decompress(packet, _MOST_XMP) if is_packed else packet
-            file.seek(4, SEEK_CUR)
-        else:
-            file.seek(length + 4, SEEK_CUR)
+    for kind, length in _chunks(file):
+        if kind != b"iTXt" or length > _MOST_XMP:
+            continue
+        content = file.read(length)
+        if content.startswith(_XMP_KEY):
+            is_packed = content[len(_XMP_KEY)]
+            packet = content[len(_XMP_KEY) + 2 :].split(b"\0", 2)[2]  # behind languages
+            return zlib.decompressobj().decompress(packet, _MOST_XMP) if is_packed else packet
     return b""
 
 
@@ -301,7 +306,7 @@ def _insert_in_png(path: Path, metadata: Metadata) -> None:
     """Before the pixels: behind them, readers may overlook it."""
     chunks = _chunk(b"eXIf", tifftags.pack_directories(metadata.exif))
     if metadata.xmp:
-        chunks += _chunk(b"iTXt", b"XML:com.adobe.xmp\0\0\0\0\0" + metadata.xmp)
+        chunks += _chunk(b"iTXt", _XMP_KEY + bytes(4) + metadata.xmp)
     with path.open("r+b") as file:
         empty = len(_find_in_png(file))
         at = file.tell() - empty - 8 if empty else len(_PNG) + 25
