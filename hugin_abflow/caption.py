@@ -28,27 +28,31 @@ DC, XMP = "http://purl.org/dc/elements/1.1/", "http://ns.adobe.com/xap/1.0/"
 TIFF, EXIF = "http://ns.adobe.com/tiff/1.0/", "http://ns.adobe.com/exif/1.0/"
 _CORE = "http://iptc.org/std/Iptc4xmpCore/1.0/xmlns/"
 PHOTOSHOP = "http://ns.adobe.com/photoshop/1.0/"
-# What is taken over, by namespace; all but these of those that begin with "not".
-_WANTED: dict[str, str] = {
-    DC: "contributor coverage creator description language publisher rights subject title",
-    PHOTOSHOP: "AuthorsPosition CaptionWriter City Country Credit Headline Instructions Source State "
-    "TransmissionReference",
-    _CORE: "not",
-    "http://iptc.org/std/Iptc4xmpExt/2008-02-29/": "not DigImageGUID DigitalSourceFileType DigitalSourceType "
-    "ImageRegion MaxAvailHeight MaxAvailWidth",
-    "http://ns.adobe.com/xap/1.0/rights/": "not",
-    "http://ns.useplus.org/ldf/xmp/1.0/": "not",
-    "http://creativecommons.org/ns#": "not",
-    "http://ns.adobe.com/lightroom/1.0/": "hierarchicalSubject",
-    "http://www.digikam.org/ns/1.0/": "TagsList",
-}
-_PREFIXES = {
-    "dc": DC, "photoshop": PHOTOSHOP, "Iptc4xmpCore": _CORE, "exif": EXIF,
-    "Iptc4xmpExt": "http://iptc.org/std/Iptc4xmpExt/2008-02-29/",
-    "xmpRights": "http://ns.adobe.com/xap/1.0/rights/", "plus": "http://ns.useplus.org/ldf/xmp/1.0/",
-    "cc": "http://creativecommons.org/ns#", "lr": "http://ns.adobe.com/lightroom/1.0/",
-    "digiKam": "http://www.digikam.org/ns/1.0/",
-}  # fmt: skip
+# Namespaces that are known, by the prefixes with which they are written, and the names that are taken over of
+# each; all but these of those that begin with "not".
+_KNOWN: tuple[tuple[str, str, str], ...] = (
+    ("dc", DC, "contributor coverage creator description language publisher rights subject title"),
+    (
+        "photoshop",
+        PHOTOSHOP,
+        "AuthorsPosition CaptionWriter City Country Credit Headline Instructions Source State "
+        "TransmissionReference",
+    ),
+    ("Iptc4xmpCore", _CORE, "not"),
+    (
+        "Iptc4xmpExt",
+        "http://iptc.org/std/Iptc4xmpExt/2008-02-29/",
+        "not DigImageGUID DigitalSourceFileType DigitalSourceType ImageRegion MaxAvailHeight MaxAvailWidth",
+    ),
+    ("xmpRights", "http://ns.adobe.com/xap/1.0/rights/", "not"),
+    ("plus", "http://ns.useplus.org/ldf/xmp/1.0/", "not"),
+    ("cc", "http://creativecommons.org/ns#", "not"),
+    ("lr", "http://ns.adobe.com/lightroom/1.0/", "hierarchicalSubject"),
+    ("digiKam", "http://www.digikam.org/ns/1.0/", "TagsList"),
+    ("exif", EXIF, ""),
+    ("rdf", _RDF[1:-1], ""),
+)
+_WANTED = {namespace: names.split() for _, namespace, names in _KNOWN}
 # What IPTC's second record holds is in XMP; arrays with their kind.
 _OF_IPTC: dict[int, tuple[str, str]] = {
     5: (f"{{{DC}}}title", "Alt"),
@@ -101,9 +105,8 @@ def packed(properties: Mapping[str, Element]) -> str:
     """As a description within an XMP packet; empty if there are none. The longest that are too long are left
     out, with a warning.
     """
-    for prefix, namespace in _PREFIXES.items():
+    for prefix, namespace, _ in _KNOWN:
         ElementTree.register_namespace(prefix, namespace)
-    ElementTree.register_namespace("rdf", _RDF[1:-1])
     texts = {name: ElementTree.tostring(element, encoding="unicode") for name, element in properties.items()}
     while sum(len(text.encode()) for text in texts.values()) > _MOST:
         longest = max(texts, key=lambda name: len(texts[name]))
@@ -127,7 +130,7 @@ def plain(element: Element | None) -> str:
 
 def _is_wanted(name: str) -> bool:
     namespace, _, local = name[1:].partition("}")
-    names = _WANTED.get(namespace, "").split()
+    names = _WANTED.get(namespace, [])
     return (local in names) != (names[:1] == ["not"])
 
 

@@ -114,13 +114,14 @@ def describe(plan: Plan) -> Metadata:
 
     EXIF of the first active photo, Software, and a UserComment that goes on from the photo's; what people say
     of it in XMP and IPTC, which Hugin loses (see `caption`); GPano (Google's Photo Sphere XMP) where the
-    panorama is equirectangular. A photo that is not there or tells nothing leaves
-    only what the project tells. Raises `pto.PtoError` as `pto.load` does.
+    panorama is equirectangular. A photo that is not there or tells nothing leaves only what the project
+    tells. Raises `pto.PtoError` as `pto.load` does.
     """
     photo = plan.images[0].photo
-    found = read_exif(photo) if is_file(photo) else {}
-    said_in_xmp = caption.read_caption(photo, read_packets(photo)) if is_file(photo) else {}
-    if not found and is_file(photo):
+    is_there = is_file(photo)
+    found = read_exif(photo) if is_there else {}
+    said_in_xmp = caption.read_caption(photo, read_packets(photo)) if is_there else {}
+    if is_there and not found:
         _log.info("%s: no EXIF to copy into the panorama", photo)
     chosen = {
         directory: {tag: found[directory][tag] for tag in tags if tag in found.get(directory, {})}

@@ -14,7 +14,7 @@ from pictures import one_device
 from test_exif import picture, shown
 
 from hugin_abflow.caption import DC, EXIF, PHOTOSHOP, packed, plain, read_caption, to_copy
-from hugin_abflow.exif import Packets, comment_of, read_packets, text
+from hugin_abflow.exif import Metadata, Packets, comment_of, read_packets, text
 from hugin_abflow.merge import merge_project
 from hugin_abflow.metadata import describe
 from hugin_abflow.project import read_plan
@@ -79,6 +79,12 @@ def told(exiftool: str, path: Path, *tags: str) -> Path:
     return path
 
 
+def described(exiftool: str, project: Path, *tags: str) -> Metadata:
+    """What is written of a project's panorama, in whose first photo exiftool has written that."""
+    told(exiftool, project.parent / "photo 0.tif", *tags)
+    return describe(read_plan(project))
+
+
 def packet(inside: str, attributes: str = "") -> bytes:
     return (
         f'<x:xmpmeta xmlns:x="adobe:ns:meta/"><rdf:RDF xmlns:rdf="http://www.w3.org/1999/02/22-rdf-syntax-ns#">'
@@ -110,32 +116,29 @@ def test_panorama_carries_what_is_said_of_its_first_photo(
 def test_xmp_stands_in_where_there_is_no_exif(exiftool: str, make_project: ProjectMaker) -> None:
     """As Hugin has exiftool copy it; and the place, which it does not."""
     project = make_project(panorama='f0 w400 h300 v90 n"TIFF_m"')
-    told(
-        exiftool, project.parent / "photo 0.tif",
+    metadata = described(
+        exiftool, project,
         "-XMP-tiff:Artist=Zoë", "-XMP-tiff:Make=Acme", "-XMP-exif:UserComment=windy",
         "-XMP-exif:DateTimeOriginal=2020:01:02 03:04:05", "-XMP-xmp:CreateDate=2020:01:02 03:04",
         "-XMP-exif:GPSLatitude=48.5", "-XMP-dc:Creator=Al",
     )  # fmt: skip
-    metadata = describe(read_plan(project))
     assert metadata.exif[MAIN][315] == text("Zoë") and metadata.exif[MAIN][271] == text("Acme")
     assert metadata.exif[EXIF_TAGS][36867] == text("2020:01:02 03:04:05")
     assert metadata.exif[EXIF_TAGS][36868] == text("2020:01:02 03:04:00")
     assert comment_of(metadata.exif[EXIF_TAGS][37510]).startswith("windy\nProjection")
     assert b"48,30.0N" in metadata.xmp
-    told(exiftool, project.parent / "photo 0.tif", "-Artist=Bo", "-GPSLatitude=1", "-GPSLatitudeRef=N")
-    metadata = describe(read_plan(project))
+    metadata = described(exiftool, project, "-Artist=Bo", "-GPSLatitude=1", "-GPSLatitudeRef=N")
     assert metadata.exif[MAIN][315] == text("Bo") and b"48,30.0N" not in metadata.xmp
 
 
 def test_xmp_stands_in_where_a_camera_left_exif_blank(exiftool: str, make_project: ProjectMaker) -> None:
     """Authors that nobody has entered, and GPS without a receiver: but for its version nothing."""
     project = make_project(panorama='f0 w400 h300 v90 n"TIFF_m"')
-    told(
-        exiftool, project.parent / "photo 0.tif",
+    metadata = described(
+        exiftool, project,
         "-Artist=   ", "-Copyright= ", "-GPSVersionID=2.3.0.0",
         "-XMP-dc:Creator=Al", "-XMP-exif:GPSLatitude=48.5",
     )  # fmt: skip
-    metadata = describe(read_plan(project))
     assert metadata.exif[MAIN][315] == text("Al") and b"48,30.0N" in metadata.xmp
     assert not metadata.exif[MAIN][33432].data.strip(b" \0")  # XMP tells nothing, either
 
