@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 import scipy
 
-from hugin_abflow.cells import averaged, grown
+from hugin_abflow.cells import Mask, averaged, grown
 from hugin_abflow.grid import Grid, any_around
 from hugin_abflow.opencl import Buffer, Device
 from hugin_abflow.working import WorkingLayer
@@ -26,22 +26,20 @@ _HARDLY, _CLEARLY = 0.02, 0.06
 # How many times as quick the change is at most.
 _QUICKEST = 3.0
 
-Cells = npt.NDArray[np.bool_]  # (height, width)
-
 
 def sharpen(
     device: Device,
     layers: Sequence[WorkingLayer],
     fields: Sequence[Buffer],
     fine: npt.NDArray[np.float64],
-    whole: Cells | None,
+    whole: Mask | None,
     grid: Grid,
     cells: Grid,
 ) -> None:
     """Make layers change over quickly where they differ: weights of fields, in place.
 
     fine        how far aligned layers differ in fine detail, (height, width) on `cells`.
-    whole       cells that are taken from one layer already; None: none are.
+    whole       cells that are taken from one layer already, (height, width); None: none are.
     """
     power = powers(fine, whole, cells.wraps)
     quicker = power > 1
@@ -56,7 +54,7 @@ def sharpen(
             )  # fmt: skip
 
 
-def powers(fine: npt.NDArray[np.float64], whole: Cells | None, wraps: bool) -> npt.NDArray[np.float32]:
+def powers(fine: npt.NDArray[np.float64], whole: Mask | None, wraps: bool) -> npt.NDArray[np.float32]:
     """To which power weights are raised, 1 or more; the arguments are those of `sharpen`.
 
     Around each cell as well: an outline ends beside it.

@@ -226,7 +226,8 @@ def _alike(path: Path) -> Path | None:
             found /= part
             continue
         try:
-            others = [name for name in os.listdir(found) if _folded(name) == _folded(part)]  # noqa: PTH208
+            wanted = _folded(part)
+            others = [name for name in os.listdir(found) if _folded(name) == wanted]  # noqa: PTH208
         except (OSError, ValueError):
             return None
         if len(others) != 1:
